@@ -23,11 +23,9 @@ from photoplan.products.adjust.figures import (
 )
 from photoplan.products.adjust.geometry import FoundParameter
 from photoplan.report.adjust.page import adjust_page
-from photoplan.report.adjust.plots import AdjustPlots
-from photoplan.report.drawing import load_matplotlib
+from photoplan.report.adjust.plots import draw_control
 
 pytest.importorskip("matplotlib")
-MPL = load_matplotlib("a report")
 
 HOSTILE = '<script>alert("1")</script><img src=x onerror=alert(1)>\u202e $\\frac{1}{0}$ ]]>'
 NAN = float("nan")
@@ -165,7 +163,7 @@ def facts(name: str = "p") -> AdjustFigures:
 
 
 def test_it_holds_everything_and_reaches_for_nothing() -> None:
-    document = adjust_page(facts(), MPL)
+    document = adjust_page(facts())
     page = Page(document)
     assert all(address and address.startswith("data:image/png;base64,") for address in page.addresses)
     assert page.tags.count("img") == 7
@@ -184,13 +182,12 @@ def test_gross_errors_of_control_do_not_set_the_scale_in_which_the_others_are_dr
     given = facts()
     wrong = replace(given.ground[2], residual=(2.0, -1.5, 2.5), rejected=(True, True, True))
     changed = replace(given, ground=(*given.ground[:2], wrong, *given.ground[3:]))
-    plots = AdjustPlots(MPL)
-    assert plots.control(changed, check=False)[1] == plots.control(given, check=False)[1]
-    assert "What was taken out as a gross error has no arrow." in " ".join(Page(adjust_page(changed, MPL)).words)
+    assert draw_control(changed, check=False)[1] == draw_control(given, check=False)[1]
+    assert "What was taken out as a gross error has no arrow." in " ".join(Page(adjust_page(changed)).words)
 
 
 def test_fault_11_hostile_names_are_shown_and_not_obeyed() -> None:
-    document = adjust_page(facts(HOSTILE), MPL)
+    document = adjust_page(facts(HOSTILE))
     page = Page(document)
     assert "script" not in page.tags
     assert page.tags.count("img") == 7
@@ -218,12 +215,12 @@ def test_a_block_with_nothing_but_images() -> None:
         point_sigma=(NAN,) * 3,
         images=tuple(replace(i, sigma_center=(NAN,) * 3, sigma_angles=(NAN,) * 3, worst=NAN) for i in facts().images),
     )
-    document = adjust_page(poor, MPL)
+    document = adjust_page(poor)
     assert "nan" not in " ".join(Page(document).words).lower()
     assert "Check points" not in document
     assert "None was found." in document
     one = replace(poor, images=poor.images[:1])
-    assert adjust_page(one, MPL)
+    assert adjust_page(one)
 
 
 def test_check_points_after_the_standard() -> None:

@@ -10,11 +10,10 @@ import pytest
 
 from photoplan.errors import ResourceError, UsageError
 from photoplan.kernels.collocation import correlation
-from photoplan.report.drawing import load_matplotlib
 from photoplan.report.dtm import covariance as dtm_covariance
 from photoplan.report.dtm import samples
 from photoplan.report.dtm.page import build_page, open_build_report
-from photoplan.report.dtm.plots import Plots
+from photoplan.report.dtm.plots import draw_covariance, draw_filter_histograms, draw_heights
 from photoplan.report.page import ReportFile, text
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.terrain.build import build_terrain, plan_build
@@ -74,7 +73,7 @@ def facts(built, measured):
 
 @pytest.fixture(scope="module")
 def document(facts):
-    return build_page(facts, load_matplotlib("a report"))
+    return build_page(facts)
 
 
 def test_nothing_outside_the_document_is_asked_for(document):
@@ -147,7 +146,7 @@ def test_many_findings_are_counted(document):
 
 
 def test_the_same_model_has_the_same_report(facts, document):
-    assert build_page(facts, load_matplotlib("a report")) == document
+    assert build_page(facts) == document
 
 
 def test_every_plot_names_its_units(facts):
@@ -155,7 +154,6 @@ def test_every_plot_names_its_units(facts):
     import matplotlib.axes
 
     seen = []
-    plots = Plots(load_matplotlib("a report"))
     original = matplotlib.axes.Axes.set
 
     def spy(self, **options):
@@ -164,7 +162,7 @@ def test_every_plot_names_its_units(facts):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(matplotlib.axes.Axes, "set", spy)
-        plots.heights(facts.map), plots.covariance(facts.covariance), plots.filter_histograms(facts.effects)
+        draw_heights(facts.map), draw_covariance(facts.covariance), draw_filter_histograms(facts.effects)
     assert {"X m", "Y m", "distance m", "covariance cm²", "measured − filtered cm"} <= set(seen)
 
 
@@ -229,7 +227,7 @@ def test_covariances_that_differ_from_what_is_expected_are_told(facts):
         assert bad.ratio == pytest.approx(1 / factor)
         assert f"{good.expected[0]:.3g} m²" in bad.warning and bad.warning.endswith(word)
         assert replace(bad, noise=1e3).warning == ""
-    page = Page(build_page(replace(facts, covariance=bad), load_matplotlib("", "")))
+    page = Page(build_page(replace(facts, covariance=bad)))
     assert bad.warning in page.words
     nothing = replace(good, empirical=good.empirical * np.nan, pairs=0 * good.pairs)
     assert np.isnan(nothing.ratio) and nothing.warning == ""
@@ -283,9 +281,8 @@ def test_file_is_named_and_titled_after_the_model(built, measured, tmp_path):
     path = tmp_path / "dam.report.html"
     source = tmp_path / "survey <1>.csv"
     source.write_text("x")
-    mpl = load_matplotlib("a report")
     facts = samples.build_facts("dam", built, measured, (), (source,), 1.0)
-    ReportFile(path, mpl).write(build_page(facts, mpl))
+    ReportFile(path).write(build_page(facts))
     page = path.read_text("utf-8")
     assert re.search("<h1>dam</h1>", page)
     assert "survey &lt;1&gt;.csv" in page

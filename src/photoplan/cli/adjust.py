@@ -53,7 +53,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
             report = adjust_project(request, events)
         written = report.written
         if page is not None:
-            written = (page.write(adjust_page(report.figures, page.mpl)), *written)
+            written = (page.write(adjust_page(report.figures)), *written)
     if as_json:
         show_json(report, files=written)
     else:

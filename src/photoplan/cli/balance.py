@@ -36,7 +36,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     from photoplan.cli.telling import Telling
     from photoplan.io.naming import together
     from photoplan.products.balance.run import BalanceRequest, balance_project
-    from photoplan.report.balance import BalancePlots
+    from photoplan.report.balance import draw_balance
     from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture
 
@@ -47,7 +47,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     with together():
         with Telling(quiet) as events:
             found = balance_project(request, events)
-        picture = None if drawing is None else drawing.write(BalancePlots(drawing.mpl).balance(found))
+        picture = None if drawing is None else drawing.write(draw_balance(found))
     if as_json:
         show_json(found, picture=picture)
     elif found.pairs is None:

@@ -41,18 +41,18 @@ def command(tables: bool, picture: Path | None, overwrite: bool, as_json: bool, 
         return
     options["images"] = options["images"] or None
     request = BudgetRequest(**options)
-    write = None
     if picture is not None:
         from photoplan.io.product import check_output
-        from photoplan.report.budget import BudgetPlots
+        from photoplan.report.drawing import load_matplotlib
 
         check_output(picture, [request.project] if request.project else [], overwrite=overwrite)
-        write = BudgetPlots.ready()
+        load_matplotlib("a picture of a budget", "leave `picture` out")
     found = make_budget(request)
-    if write is not None and picture is not None:
+    if picture is not None:
         from photoplan.io.naming import write_atomically
+        from photoplan.report.budget import draw_picture
 
-        write_atomically(picture, write.picture(found.typical))
+        write_atomically(picture, draw_picture(found.typical))
     tell(found)
     for note in () if quiet else found.notes:
         say(f"note: {note}")

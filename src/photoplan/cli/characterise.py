@@ -41,7 +41,7 @@ def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
             report = characterise(request, events)
         written = report.written
         if page is not None and not options["dry_run"]:
-            written = (page.write(characterise_page(report, page.mpl)), *written)
+            written = (page.write(characterise_page(report)), *written)
         record((*report.written, *written[: len(written) - len(report.written)]), report)
     if as_json:
         show_json(report, written=written)

@@ -81,7 +81,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
         if page is not None:
             title, seconds = request.output.stem, built.figures["seconds"]
             facts = build_facts(title, built.built, built.measured, built.findings, request.inputs, seconds)
-            report, warning = page.write(build_page(facts, page.mpl)), facts.covariance.warning
+            report, warning = page.write(build_page(facts)), facts.covariance.warning
     if as_json:
         show_json(built, report=report)
         return

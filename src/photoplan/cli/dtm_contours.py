@@ -53,7 +53,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         with Telling(quiet) as events:
             facts = make_contours(request, events)
         if drawing is not None:
-            drawing.write(contours_picture(facts, drawing.mpl))
+            drawing.write(contours_picture(facts))
         record([*facts.files, preview], facts)
     if as_json:
         show_json(facts, preview=preview)

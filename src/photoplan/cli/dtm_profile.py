@@ -55,7 +55,7 @@ def command(
         found = dtm_profile(request)
         for drawing in drawings:
             if drawing is not None:
-                drawing.write(profile_picture(found, drawing.mpl))
+                drawing.write(profile_picture(found))
         record(outputs, [pick(p, "name", "length") for p in found])
     if as_json:
         show_json({"files": outputs, "profiles": found})

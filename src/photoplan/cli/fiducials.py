@@ -57,11 +57,11 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
         drawn = {}
         for image in report.images:
             picture = pictures.get(image.name)
-            drawn[image.name] = None if picture is None else picture.write(marks_picture(image, picture.mpl))
+            drawn[image.name] = None if picture is None else picture.write(marks_picture(image))
         for lost in report.unfound:
             picture = pictures.get(lost.name)
             if picture is not None:
-                say(f"{lost.name}: where its marks were sought: {picture.write(unfound_picture(lost, picture.mpl))}")
+                say(f"{lost.name}: where its marks were sought: {picture.write(unfound_picture(lost))}")
     if as_json:
         images = [{**plain(image), "picture": drawn[image.name]} for image in report.images]
         show_json(report, images=images)

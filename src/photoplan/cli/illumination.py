@@ -34,7 +34,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, correct: tuple[str, ..
     from photoplan.io.naming import together
     from photoplan.products.illumination import IlluminationRequest, correct_illumination
     from photoplan.report.drawing import has_matplotlib
-    from photoplan.report.illumination import IlluminationPlots
+    from photoplan.report.illumination import draw_light
     from photoplan.report.page import open_picture
 
     request = IlluminationRequest(correct=correct or ("c",), **options)
@@ -46,7 +46,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, correct: tuple[str, ..
         with Telling(quiet) as events:
             found = correct_illumination(request, events)
         if drawing is not None:
-            picture = drawing.write(IlluminationPlots(drawing.mpl).light(found))
+            picture = drawing.write(draw_light(found))
     if as_json:
         show_json(found, picture=picture)
         return

@@ -31,7 +31,7 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
     """
     from photoplan.io.run_record import recording
     from photoplan.products.interior import InteriorRequest, interior_orientations
-    from photoplan.report.interior import InteriorPlots, interior_page
+    from photoplan.report.interior import draw_residuals, interior_page
     from photoplan.report.page import open_picture, open_report
 
     project, overwrite = options["project"], options.pop("overwrite")
@@ -43,9 +43,9 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
         report = picture = None
         if page is not None and found.images:
             title = f"Interior orientation · {project.resolve().parent.name}"
-            report = page.write(interior_page(found, title, page.mpl))
+            report = page.write(interior_page(found, title))
         if plot is not None and found.images:
-            picture = plot.write(InteriorPlots(plot.mpl).residuals(found.images))
+            picture = plot.write(draw_residuals(found.images))
         record([project if found.written else None, report, picture], found)
     if as_json:
         show_json(found, report=report, plot=picture)

@@ -103,7 +103,7 @@ def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: 
     request = PatternRequest(images, **kept)
     with recording("mtf", request, inputs) as record:
         report = measure_patterns(request, talk)
-        written = page.write(pattern_page(report, page.mpl)) if page is not None and report.images else None
+        written = page.write(pattern_page(report)) if page is not None and report.images else None
         record([report.csv, written], report)
     say_images(report, written, as_json, talk)
     if not as_json:
@@ -167,7 +167,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
     with recording("mtf", request, inputs) as record:
         with Telling(quiet) as events:
             report = measure_mtf(request, events)
-        written = page.write(mtf_page(report, page.mpl)) if page is not None and report.images else None
+        written = page.write(mtf_page(report)) if page is not None and report.images else None
         record([report.csv, written], report)
     say_images(report, written, as_json, talk)
     if len(report.images) > 1:

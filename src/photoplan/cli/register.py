@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, dry_run_option, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, ending
 
 if TYPE_CHECKING:
     from photoplan.products.register.run import RegisterReport
@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 @click.option("--sigma", type=float, default=0.2, show_default=True, help="Largest standard deviation, pixels.")
 @click.option("--model", default="affine", show_default=True, metavar="KIND", help="none, shift or affine.")
 @click.option("--no-picture", is_flag=True, help="Do not write NAME.png.")
-@workers_option
-@dry_run_option("Open both images, say how many patches there are, and stop.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending("Open both images, say how many patches there are, and stop.", workers=True)
 def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> None:
     """Find by how much SECOND lies beside FIRST, patch by patch, to a small part of a pixel.
 
@@ -37,14 +33,12 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     """
     from photoplan.cli.output import say, show, show_json
     from photoplan.cli.telling import Telling
-    from photoplan.engine.executors import available_cpus
     from photoplan.io.naming import together
     from photoplan.products.register.run import RegisterRequest, register
     from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture
-    from photoplan.report.register import RegisterPlots
+    from photoplan.report.register import draw_vectors
 
-    options["workers"] = options["workers"] or available_cpus()
     request = RegisterRequest(**options)
     wanted = not no_picture and not request.dry_run and has_matplotlib()
     place: Path | None = request.output.with_suffix(".png") if wanted else None
@@ -52,7 +46,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     with together():
         with Telling(quiet) as events:
             report = register(request, events)
-        picture = None if drawing is None else drawing.write(RegisterPlots(drawing.mpl).vectors(report))
+        picture = None if drawing is None else drawing.write(draw_vectors(report))
     if not quiet:
         for note in report.pair.notes:
             say(note)

@@ -48,7 +48,7 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
     with Telling(quiet) as events:
         events.begin("resection", 0, "images")
         result = resect_project(request, events)
-    report = None if page is None or not result.images else page.write(resect_page(result, page.mpl))
+    report = None if page is None or not result.images else page.write(resect_page(result))
     if as_json:
         show_json(result, report=report)
     else:

@@ -151,7 +151,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
         report = restore_images(request, events)
     written = None
     if page is not None and report.images:
-        written = page.write(restore_page(found, plan.jobs, report, page.mpl))
+        written = page.write(restore_page(found, plan.jobs, report))
     if as_json:
         show_json(report, report=written)
     elif written is not None:

@@ -27,7 +27,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     request = SensorRequest(**options)
     with recording("sensor", request, [request.file]) as record:
         found = describe_sensor(request)
-        report = None if page is None or options["dry_run"] else page.write(sensor_page(found, page.mpl))
+        report = None if page is None or options["dry_run"] else page.write(sensor_page(found))
         written = [path for path in (report, found.csv) if path is not None]
         record(reversed(written), found)
     if as_json:

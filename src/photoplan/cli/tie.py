@@ -36,7 +36,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     from photoplan.products.tie.run import TieRequest, find_ties
     from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture
-    from photoplan.report.tie import TiePlots
+    from photoplan.report.tie import draw_ties
 
     options["refine"] = not options.pop("no_refine")
     options["use_orientation"] = not options.pop("ignore_orientation")
@@ -49,7 +49,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
             found = find_ties(request, events)
         picture = None
         if drawing is not None and found.found is not None:
-            picture = drawing.write(TiePlots(drawing.mpl).ties(found.sources, found.found))
+            picture = drawing.write(draw_ties(found.sources, found.found))
     if as_json:
         show_json(found, picture=picture)
     elif found.output is None:

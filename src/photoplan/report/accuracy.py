@@ -8,7 +8,7 @@ import numpy as np
 
 from photoplan.io.naming import write_atomically
 from photoplan.io.quicklook import read_reduced
-from photoplan.report.drawing import INK, STYLE, load_matplotlib, png, round_down
+from photoplan.report.drawing import INK, STYLE, axes_of, load_matplotlib, png, round_down
 
 #: Longest side of what is drawn, pixels; ellipses along it; length of the largest of them, part of their distance.
 _SIDE, _ELLIPSES, _LARGEST = 900, 16, 0.8
@@ -31,8 +31,7 @@ def draw_accuracy(raster: Path) -> Path:
     low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 1.0)
     with mpl.rc_context(STYLE):
         size = 8.0, float(np.clip(7.0 * (top - bottom) / (right - left), 3.0, 12.0))
-        fig = mpl.figure.Figure(figsize=size, layout="constrained")
-        ax = fig.subplots()
+        fig, ax = axes_of(*size)
         ax.grid(visible=False)
         shown = ax.imshow(radial, cmap="cividis", vmin=low, vmax=max(high, low + 1e-9),
                           extent=(left, right, bottom, top), interpolation="nearest")  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from photoplan.products.balance.run import BalanceReport
 from photoplan.radiometry.balance import Balanced, Pairs
 from photoplan.radiometry.cells import SIDE
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, png
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, figure_of, png, styled
 
 _BANDS = (RED, GREEN, BLUE, ORANGE)
 #: Pairs and images that are shown.
@@ -19,34 +18,28 @@ _PAIRS, _TRENDS = 30, 4
 _SIDE = 60
 
 
-@dataclass(frozen=True, eq=False)
-class BalancePlots:
-    """Draws what `photoplan balance` has found."""
-
-    mpl: Any
-
-    def balance(self, report: BalanceReport) -> bytes:
-        """Overlaps, tables, maps and trends, as PNG."""
-        pairs, found = report.pairs, report.balanced
-        assert pairs is not None and found is not None
-        shown = np.argsort(-pairs.before.mean(axis=1))[:_PAIRS]
-        images = _spread(found)
-        trends = bool(images) and bool(found.tones[0][0].terms)
-        bands = min(len(found.tones[0]), len(_BANDS))
-        with self.mpl.rc_context(STYLE):
-            heights = [1.1 + 0.2 * len(shown), 3.0, 3.6, *([2.6] if trends else [])]
-            fig = self.mpl.figure.Figure(figsize=(10.0, sum(heights) + 0.6), layout="constrained")
-            rows = fig.add_gridspec(len(heights), 1, height_ratios=heights)
-            _overlaps(fig.add_subplot(rows[0]), report, pairs, shown.tolist())
-            cells = rows[1].subgridspec(1, bands)
-            for band in range(bands):
-                _tables(fig.add_subplot(cells[band]), found, band)
-            _maps(fig, rows[2], pairs)
-            if trends:
-                cells = rows[3].subgridspec(1, len(images))
-                for column, k in enumerate(images):
-                    _trend(fig, fig.add_subplot(cells[column]), report, found, k)
-            return png(fig)
+@styled
+def draw_balance(report: BalanceReport) -> bytes:
+    """Overlaps, tables, maps and trends, as PNG."""
+    pairs, found = report.pairs, report.balanced
+    assert pairs is not None and found is not None
+    shown = np.argsort(-pairs.before.mean(axis=1))[:_PAIRS]
+    images = _spread(found)
+    trends = bool(images) and bool(found.tones[0][0].terms)
+    bands = min(len(found.tones[0]), len(_BANDS))
+    heights = [1.1 + 0.2 * len(shown), 3.0, 3.6, *([2.6] if trends else [])]
+    fig = figure_of(10.0, sum(heights) + 0.6)
+    rows = fig.add_gridspec(len(heights), 1, height_ratios=heights)
+    _overlaps(fig.add_subplot(rows[0]), report, pairs, shown.tolist())
+    cells = rows[1].subgridspec(1, bands)
+    for band in range(bands):
+        _tables(fig.add_subplot(cells[band]), found, band)
+    _maps(fig, rows[2], pairs)
+    if trends:
+        cells = rows[3].subgridspec(1, len(images))
+        for column, k in enumerate(images):
+            _trend(fig, fig.add_subplot(cells[column]), report, found, k)
+    return png(fig)
 
 
 def _overlaps(axes: Any, report: BalanceReport, pairs: Pairs, shown: list[int]) -> None:

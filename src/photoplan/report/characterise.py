@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.products.characterise.result import MOST_PIXELS, Chart, Figure, Findings, Plate, Trace, block_means
 from photoplan.products.characterise.run import CharacteriseReport
-from photoplan.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, png, round_down
+from photoplan.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED, SKY, SOFT, axes_of, mpl, png, round_down, styled
 from photoplan.report.page import Cell, figure, headline, page, section, table, text
 
 Array = NDArray[np.float64]
@@ -27,70 +26,63 @@ def _columns(labels: list[str]) -> int:
     return len(labels) if sum(wide) <= _LEGEND else max(1, min(4, len(labels), _LEGEND // max(wide)))
 
 
-@dataclass(frozen=True, eq=False)
-class ChartDrawer:
-    """Draws charts and pictures."""
+@styled
+def draw_plot(plot: Chart | Plate) -> bytes:
+    """A plot as PNG."""
+    return _chart(plot) if isinstance(plot, Chart) else _picture(plot)
 
-    mpl: Any
 
-    def draw(self, plot: Chart | Plate) -> bytes:
-        """A plot as PNG."""
-        with self.mpl.rc_context(STYLE):
-            return self._chart(plot) if isinstance(plot, Chart) else self._picture(plot)
+def _chart(chart: Chart) -> bytes:
+    fig, axes = axes_of(*_SIZE)
+    for k, curve in enumerate(chart.curves):
+        _draw_curve(axes, curve, COLOURS[(k if curve.colour is None else curve.colour) % len(COLOURS)])
+    for name, wanted in (("x", chart.log_x), ("y", chart.log_y)):
+        if wanted:
+            _logarithmic(axes, name)
+    for where, what in chart.marks:
+        axes.axvline(where, color=SOFT, linewidth=0.9, linestyle=":")
+        axes.annotate(what, (where, 0.98), (3, 0), xycoords=("data", "axes fraction"), textcoords="offset points",
+                      fontsize=7.5, color=SOFT, va="top", rotation=90)  # fmt: skip
+    axes.set(xlabel=chart.x_label, ylabel=chart.y_label)
+    labelled = sum(bool(curve.label) for curve in chart.curves)
+    if labelled > 1 or (labelled and len(chart.curves) > 1):
+        fig.legend(
+            loc="outside upper left", ncols=_columns([curve.label for curve in chart.curves if curve.label]), fontsize=8
+        )
+    return png(fig)
 
-    def _chart(self, chart: Chart) -> bytes:
-        fig = self.mpl.figure.Figure(figsize=_SIZE, layout="constrained")
-        axes = fig.subplots()
-        for k, curve in enumerate(chart.curves):
-            _draw_curve(axes, curve, COLOURS[(k if curve.colour is None else curve.colour) % len(COLOURS)])
-        for name, wanted in (("x", chart.log_x), ("y", chart.log_y)):
-            if wanted:
-                self._logarithmic(axes, name)
-        for where, what in chart.marks:
-            axes.axvline(where, color=SOFT, linewidth=0.9, linestyle=":")
-            axes.annotate(what, (where, 0.98), (3, 0), xycoords=("data", "axes fraction"), textcoords="offset points",
-                          fontsize=7.5, color=SOFT, va="top", rotation=90)  # fmt: skip
-        axes.set(xlabel=chart.x_label, ylabel=chart.y_label)
-        labelled = sum(bool(curve.label) for curve in chart.curves)
-        if labelled > 1 or (labelled and len(chart.curves) > 1):
-            fig.legend(
-                loc="outside upper left",
-                ncols=_columns([curve.label for curve in chart.curves if curve.label]),
-                fontsize=8,
-            )
-        return png(fig)
 
-    def _logarithmic(self, axes: Any, name: str) -> None:
-        """A logarithmic axis with plain numbers; 2 and 5 are named too where it covers few decades."""
-        getattr(axes, f"set_{name}scale")("log")
-        low, high = getattr(axes, f"get_{name}lim")()
-        axis = getattr(axes, f"{name}axis")
-        steps = (1.0, 2.0, 5.0) if high < 400 * low else (1.0,)
-        ticker = self.mpl.ticker
-        axis.set_major_locator(ticker.LogLocator(base=10.0, subs=steps))
-        axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(ticker.NullFormatter())
+def _logarithmic(axes: Any, name: str) -> None:
+    """A logarithmic axis with plain numbers; 2 and 5 are named too where it covers few decades."""
+    getattr(axes, f"set_{name}scale")("log")
+    low, high = getattr(axes, f"get_{name}lim")()
+    axis = getattr(axes, f"{name}axis")
+    steps = (1.0, 2.0, 5.0) if high < 400 * low else (1.0,)
+    ticker = mpl.ticker
+    axis.set_major_locator(ticker.LogLocator(base=10.0, subs=steps))
+    axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(ticker.NullFormatter())
 
-    def _picture(self, picture: Plate) -> bytes:
-        values = np.asarray(picture.values, np.float64)
-        factor = max(1, -(-max(values.shape) // MOST_PIXELS))
-        known = values[np.isfinite(values)]
-        low, high = picture.limits or _limits(known)
-        small = block_means(values, factor)
-        height, width = values.shape[0] * picture.factor, values.shape[1] * picture.factor
-        left, right, bottom, top = picture.extent or (-0.5, width - 0.5, height - 0.5, -0.5)
-        tall = float(np.clip((_SIZE[0] - 1.6) * height / width, 1.2, 7.0)) if picture.extent is None else 3.6
-        fig = self.mpl.figure.Figure(figsize=(_SIZE[0], tall + 0.6), layout="constrained")
-        axes = fig.subplots()
-        aspect = "equal" if picture.extent is None else "auto"
-        options = {"cmap": "gray", "vmin": low, "vmax": high, "interpolation": "nearest"}
-        shown = axes.imshow(small, extent=(left, right, bottom, top), aspect=aspect, **options)
-        axes.grid(False)
-        if picture.points:
-            axes.scatter(*np.array(picture.points).T, s=40, facecolors="none", edgecolors=RED, linewidths=1.1)
-        fig.colorbar(shown, ax=axes, label=picture.label, shrink=0.8)
-        axes.set(xlabel="column px", ylabel="row px")
-        return png(fig)
+
+def _picture(picture: Plate) -> bytes:
+    values = np.asarray(picture.values, np.float64)
+    factor = max(1, -(-max(values.shape) // MOST_PIXELS))
+    known = values[np.isfinite(values)]
+    low, high = picture.limits or _limits(known)
+    small = block_means(values, factor)
+    height, width = values.shape[0] * picture.factor, values.shape[1] * picture.factor
+    left, right, bottom, top = picture.extent or (-0.5, width - 0.5, height - 0.5, -0.5)
+    tall = float(np.clip((_SIZE[0] - 1.6) * height / width, 1.2, 7.0)) if picture.extent is None else 3.6
+    fig, axes = axes_of(_SIZE[0], tall + 0.6)
+    aspect = "equal" if picture.extent is None else "auto"
+    options = {"cmap": "gray", "vmin": low, "vmax": high, "interpolation": "nearest"}
+    shown = axes.imshow(small, extent=(left, right, bottom, top), aspect=aspect, **options)
+    axes.grid(False)
+    if picture.points:
+        axes.scatter(*np.array(picture.points).T, s=40, facecolors="none", edgecolors=RED, linewidths=1.1)
+    fig.colorbar(shown, ax=axes, label=picture.label, shrink=0.8)
+    axes.set(xlabel="column px", ylabel="row px")
+    return png(fig)
 
 
 def _draw_curve(axes: Any, curve: Trace, colour: str) -> None:
@@ -135,9 +127,9 @@ def _limits(known: NDArray[np.float64]) -> tuple[float, float]:
 _ROWS = 25
 
 
-def characterise_page(made: CharacteriseReport, mpl: Any) -> str:
+def characterise_page(made: CharacteriseReport) -> str:
     """The report as one HTML document."""
-    drawer, series = ChartDrawer(mpl), made.series
+    series = made.series
     done = [(run.analysis.title, run.outcome) for run in made.runs if run.outcome is not None]
     kinds = dict.fromkeys(frame.kind for frame in series.frames)
     frames = ", ".join(f"{len(series.of(kind))} {kind}" for kind in kinds) or f"{len(series.reduced)} reduced figures"
@@ -159,7 +151,7 @@ def characterise_page(made: CharacteriseReport, mpl: Any) -> str:
         ]
     )
     remarks = [f"<p>{text(note)}</p>" for note in made.notes]
-    sections = [_section(title, outcome, drawer) for title, outcome in done]
+    sections = [_section(title, outcome) for title, outcome in done]
     others = [[run.analysis.title, run.state, run.missing or run.failed or ""] for run in made.runs if not run.outcome]
     if others:
         sections.append(section("Not done", [table(("analysis", "state", "why"), others)]))
@@ -167,7 +159,7 @@ def characterise_page(made: CharacteriseReport, mpl: Any) -> str:
     return page(title, f"From the image series {series.path.name}", [head, *remarks, *sections])
 
 
-def _section(title: str, outcome: Findings, drawer: ChartDrawer) -> str:
+def _section(title: str, outcome: Findings) -> str:
     found: list[str] = []
     if outcome.figures:
         found.append(
@@ -178,7 +170,7 @@ def _section(title: str, outcome: Findings, drawer: ChartDrawer) -> str:
         )
     found += [f"<p><b>Not known.</b> {text(f'{what}: {why}')}</p>" for what, why in outcome.refused.items()]
     found += [f"<p>{text(note)}</p>" for note in outcome.notes]
-    found += [figure(drawer.draw(plot), plot.title, plot.caption) for plot in outcome.plots]
+    found += [figure(draw_plot(plot), plot.title, plot.caption) for plot in outcome.plots]
     for name, each in outcome.tables.items():
         shown = [k for k in range(len(each.head)) if any(row[k] != "" for row in each.rows)]
         rows = [[_cell(row[k]) for k in shown] for row in each.rows[:_ROWS]]

@@ -5,13 +5,16 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import io
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
 from photoplan.errors import UsageError
 
+P = ParamSpec("P")
+T = TypeVar("T")
 #: Colours of Okabe and Ito.
 BLUE, RED, ORANGE, GREEN, PURPLE, SKY = "#0072B2", "#D55E00", "#E69F00", "#009E73", "#CC79A7", "#56B4E9"
 INK, SOFT = "#1c2730", "#5c6b77"
@@ -72,9 +75,35 @@ def load_matplotlib(what: str, otherwise: str = "") -> Any:
         ) from None
 
 
-def axes_of(mpl: Any, width: float, height: float) -> tuple[Any, Any]:
+class _Matplotlib:
+    """``matplotlib``, which is imported when the first thing of it is used."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(load_matplotlib("a picture"), name)
+
+
+mpl: Any = _Matplotlib()
+
+
+def styled(draw: Callable[P, T]) -> Callable[P, T]:
+    """What draws, in the style of all plots."""
+
+    @wraps(draw)
+    def drawing(*args: P.args, **options: P.kwargs) -> T:
+        with mpl.rc_context(STYLE):
+            return draw(*args, **options)
+
+    return drawing
+
+
+def figure_of(width: float, height: float) -> Any:
+    """A new figure of a size in inches."""
+    return mpl.figure.Figure(figsize=(width, height), layout="constrained")
+
+
+def axes_of(width: float, height: float) -> tuple[Any, Any]:
     """A new figure of a size in inches, and its only axes."""
-    fig = mpl.figure.Figure(figsize=(width, height), layout="constrained")
+    fig = figure_of(width, height)
     return fig, fig.subplots()
 
 

@@ -15,7 +15,7 @@ from photoplan.orientation.marks.search import Scan
 from photoplan.orientation.marks.template import Template, draw
 from photoplan.products.fiducials import ImageFiducials, UnfoundFiducials
 from photoplan.project.camera_marks import ScanImage
-from photoplan.report.drawing import png
+from photoplan.report.drawing import figure_of, png
 
 _ACROSS = 2
 """Marks in a row."""
@@ -28,13 +28,13 @@ _AROUND = 1.5
 _CROSS, _LOST = "#d81b60", "#b03000"
 
 
-def marks_picture(image: ImageFiducials, mpl: Any) -> bytes:
+def marks_picture(image: ImageFiducials) -> bytes:
     """The marks of an image as PNG; the scan is opened again."""
     found, scan = image.found, ScanImage(image.file, image.band)
     marks: list[LocatedMark | MissingMark] = [*found.marks, *found.missing]
     across = min(_ACROSS, len(marks))
     down = math.ceil(len(marks) / across)
-    figure = mpl.figure.Figure(figsize=(4.6 * across, 0.6 + 3.0 * down), layout="constrained")
+    figure = figure_of(4.6 * across, 0.6 + 3.0 * down)
     figure.suptitle(image.name, fontsize=11)
     panels = figure.subplots(down, 2 * across, squeeze=False).ravel()
     for panel in panels:
@@ -44,12 +44,12 @@ def marks_picture(image: ImageFiducials, mpl: Any) -> bytes:
     return png(figure, dpi=110)
 
 
-def unfound_picture(image: UnfoundFiducials, mpl: Any) -> bytes:
+def unfound_picture(image: UnfoundFiducials) -> bytes:
     """A scan on which marks were not found, as PNG: the places looked at, each enlarged, beside what was sought."""
     scan, layout, sought = ScanImage(image.file, image.band), image.layout, image.sought
     px_per_mm = float(np.ptp([(m.x, m.y) for m in sought], axis=0).max()) / layout.extent
     rows = max(2, len(sought))
-    figure = mpl.figure.Figure(figsize=(9.5, 0.6 + 1.9 * rows), layout="constrained")
+    figure = figure_of(9.5, 0.6 + 1.9 * rows)
     figure.suptitle(f"{image.name}: {sum(m.found for m in sought)} of {len(sought)} marks found, three are needed")
     left, right = figure.subfigures(1, 2, width_ratios=(1.3, 1))
     overview, panels = left.subplots(), right.subplots(rows, 2, squeeze=False)

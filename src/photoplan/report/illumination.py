@@ -2,43 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from photoplan.products.illumination import IlluminationReport
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, png
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, figure_of, png, styled
 
 _BANDS = (RED, GREEN, BLUE, ORANGE)
 #: Points that are drawn, and classes of cos i of which the mean is.
 _POINTS, _CLASSES = 4000, 20
 
 
-@dataclass(frozen=True, eq=False)
-class IlluminationPlots:
-    """Draws what `photoplan illumination` has found."""
-
-    mpl: Any
-
-    def light(self, report: IlluminationReport) -> bytes:
-        """A row of plots before, a row after, as PNG."""
-        bands = min(len(report.before), len(_BANDS))
-        lit = np.flatnonzero(report.sample.lit)
-        some = lit[np.linspace(0, len(lit) - 1, min(_POINTS, len(lit))).astype(int)]
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(1.0 + 3.2 * bands, 5.6), layout="constrained")
-            axes = fig.subplots(2, bands, sharex=True, sharey="col", squeeze=False)
-            rows = zip(("before", "after"), (report.before, report.after), report.correlations, axes)
-            for word, values, correlations, row in rows:
-                for band, at in enumerate(row):
-                    _cloud(at, report, values[band], some, band)
-                    at.set_title(f"Band {band + 1} {word}: correlation {correlations[band]:+.3f}")
-            for at in axes[1]:
-                at.set_xlabel("cos i: 1 faces the sun")
-            axes[0, 0].set_ylabel("grey value")
-            axes[1, 0].set_ylabel("grey value")
-            return png(fig)
+@styled
+def draw_light(report: IlluminationReport) -> bytes:
+    """A row of plots before, a row after, as PNG."""
+    bands = min(len(report.before), len(_BANDS))
+    lit = np.flatnonzero(report.sample.lit)
+    some = lit[np.linspace(0, len(lit) - 1, min(_POINTS, len(lit))).astype(int)]
+    fig = figure_of(1.0 + 3.2 * bands, 5.6)
+    axes = fig.subplots(2, bands, sharex=True, sharey="col", squeeze=False)
+    rows = zip(("before", "after"), (report.before, report.after), report.correlations, axes)
+    for word, values, correlations, row in rows:
+        for band, at in enumerate(row):
+            _cloud(at, report, values[band], some, band)
+            at.set_title(f"Band {band + 1} {word}: correlation {correlations[band]:+.3f}")
+    for at in axes[1]:
+        at.set_xlabel("cos i: 1 faces the sun")
+    axes[0, 0].set_ylabel("grey value")
+    axes[1, 0].set_ylabel("grey value")
+    return png(fig)
 
 
 def _cloud(axes: Any, report: IlluminationReport, values: Any, some: Any, band: int) -> None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from photoplan.products.interior import ImageInterior, InteriorResult
-from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, png, round_down, shortened
+from photoplan.report.drawing import BLUE, INK, RED, SOFT, figure_of, png, round_down, shortened, styled
 from photoplan.report.page import cells, figure, headline, number, page, section, table
 
 #: In the units of the axes; heads in widths of their shafts.
@@ -38,77 +37,72 @@ def vector_scale(scans: Sequence[ImageInterior]) -> float:
     return round_down(_LENGTH * side / max(longest, 1e-5), _STEPS)
 
 
-@dataclass(frozen=True, eq=False)
-class InteriorPlots:
-    """Draws residuals at the marks."""
+@styled
+def draw_residuals(scans: Sequence[ImageInterior]) -> bytes:
+    """Residual vectors of all scans, one panel each at the same scale, and all in one; PNG.
 
-    mpl: Any
-
-    def residuals(self, scans: Sequence[ImageInterior]) -> bytes:
-        """Residual vectors of all scans, one panel each at the same scale, and all in one; PNG.
-
-        Of more than 24 scans those with the longest vectors have a panel.
-        """
-        scale = vector_scale(scans)
-        several = len(scans) > 1
-        shown = list(scans)
-        if len(shown) > _PANELS:
-            shown.sort(key=lambda p: -float(np.linalg.norm(p.residuals_um, axis=1).max()))
-            shown = shown[:_PANELS]
-        columns = min(_COLUMNS, len(shown) + several)
-        rows = -(-(len(shown) + several) // columns)
-        with self.mpl.rc_context(STYLE):
-            width = 7.2 if columns > 1 else 5.2
-            side = width / columns
-            fig = self.mpl.figure.Figure(figsize=(width, rows * (side + 0.25) + 0.3), layout="constrained")
-            axes = fig.subplots(rows, columns, squeeze=False).ravel()
-            if several:
-                self._panel(axes[0], f"all {len(scans)} scans", scans, scale, single=False)
-            for ax, panel in zip(axes[several:], shown):
-                self._panel(ax, panel.image, [panel], scale, single=not several)
-            for ax in axes[len(shown) + several :]:
-                ax.set_axis_off()
-            left_out = f", {len(shown)} of {len(scans)} scans shown" if len(shown) < len(scans) else ""
-            fig.suptitle(f"residuals at the fiducial marks, vectors × {scale:.0f}{left_out}", fontsize=10)
-            return png(fig)
-
-    def _panel(self, ax: Any, title: str, scans: Sequence[ImageInterior], scale: float, single: bool) -> None:
-        named = len(scans) == 1
-        low = np.min([p.plane_mm.min(axis=0) for p in scans], axis=0)
-        high = np.max([p.plane_mm.max(axis=0) for p in scans], axis=0)
-        middle, half = (low + high) / 2, float((high - low).max()) / 2
-        # Parts of the panel's width: thin where many vectors lie on each other.
-        width = 0.007 if single else 0.012 if named else 0.006
-        for panel in scans:
-            x, y = panel.plane_mm.T
-            u, v = panel.residuals_um.T * scale / 1000
-            ax.plot(x, y, "+", color=SOFT, markersize=7, zorder=2)
-            ax.quiver(x, y, u, v, color=RED, width=width, zorder=3, **_VECTORS)
-            if named:
-                for name, px, py in zip(panel.fit.names, x, y):
-                    # Towards the middle, where a vector does not often go.
-                    dx, dy = -np.sign(px - middle[0]) * 0.13 * half, -np.sign(py - middle[1]) * 0.13 * half
-                    ax.annotate(shortened(name), (px + dx, py + dy), ha="center", va="center", color=INK, fontsize=8)
-        length = round_down(0.3 * half / scale * 1000, _STEPS)
-        left, base = middle[0] - 0.15 * half, middle[1]
-        ax.quiver(left, base, length * scale / 1000, 0, color=BLUE, width=width, **_VECTORS)
-        ax.annotate(f"{length:g} µm", (left, base), (0, 5), textcoords="offset points", color=BLUE, fontsize=8)
-        reach = 1.55 * half
-        ax.set(
-            title=shortened(title, 30),
-            aspect="equal",
-            xlim=(middle[0] - reach, middle[0] + reach),
-            ylim=(middle[1] - reach, middle[1] + reach),
-        )
-        if single:
-            ax.set(xlabel="x mm", ylabel="y mm")
-        else:
-            ax.tick_params(labelbottom=False, labelleft=False, length=0)
+    Of more than 24 scans those with the longest vectors have a panel.
+    """
+    scale = vector_scale(scans)
+    several = len(scans) > 1
+    shown = list(scans)
+    if len(shown) > _PANELS:
+        shown.sort(key=lambda p: -float(np.linalg.norm(p.residuals_um, axis=1).max()))
+        shown = shown[:_PANELS]
+    columns = min(_COLUMNS, len(shown) + several)
+    rows = -(-(len(shown) + several) // columns)
+    width = 7.2 if columns > 1 else 5.2
+    side = width / columns
+    fig = figure_of(width, rows * (side + 0.25) + 0.3)
+    axes = fig.subplots(rows, columns, squeeze=False).ravel()
+    if several:
+        _panel(axes[0], f"all {len(scans)} scans", scans, scale, single=False)
+    for ax, panel in zip(axes[several:], shown):
+        _panel(ax, panel.image, [panel], scale, single=not several)
+    for ax in axes[len(shown) + several :]:
+        ax.set_axis_off()
+    left_out = f", {len(shown)} of {len(scans)} scans shown" if len(shown) < len(scans) else ""
+    fig.suptitle(f"residuals at the fiducial marks, vectors × {scale:.0f}{left_out}", fontsize=10)
+    return png(fig)
 
 
-def interior_page(made: InteriorResult, title: str, mpl: Any) -> str:
+def _panel(ax: Any, title: str, scans: Sequence[ImageInterior], scale: float, single: bool) -> None:
+    named = len(scans) == 1
+    low = np.min([p.plane_mm.min(axis=0) for p in scans], axis=0)
+    high = np.max([p.plane_mm.max(axis=0) for p in scans], axis=0)
+    middle, half = (low + high) / 2, float((high - low).max()) / 2
+    # Parts of the panel's width: thin where many vectors lie on each other.
+    width = 0.007 if single else 0.012 if named else 0.006
+    for panel in scans:
+        x, y = panel.plane_mm.T
+        u, v = panel.residuals_um.T * scale / 1000
+        ax.plot(x, y, "+", color=SOFT, markersize=7, zorder=2)
+        ax.quiver(x, y, u, v, color=RED, width=width, zorder=3, **_VECTORS)
+        if named:
+            for name, px, py in zip(panel.fit.names, x, y):
+                # Towards the middle, where a vector does not often go.
+                dx, dy = -np.sign(px - middle[0]) * 0.13 * half, -np.sign(py - middle[1]) * 0.13 * half
+                ax.annotate(shortened(name), (px + dx, py + dy), ha="center", va="center", color=INK, fontsize=8)
+    length = round_down(0.3 * half / scale * 1000, _STEPS)
+    left, base = middle[0] - 0.15 * half, middle[1]
+    ax.quiver(left, base, length * scale / 1000, 0, color=BLUE, width=width, **_VECTORS)
+    ax.annotate(f"{length:g} µm", (left, base), (0, 5), textcoords="offset points", color=BLUE, fontsize=8)
+    reach = 1.55 * half
+    ax.set(
+        title=shortened(title, 30),
+        aspect="equal",
+        xlim=(middle[0] - reach, middle[0] + reach),
+        ylim=(middle[1] - reach, middle[1] + reach),
+    )
+    if single:
+        ax.set(xlabel="x mm", ylabel="y mm")
+    else:
+        ax.tick_params(labelbottom=False, labelleft=False, length=0)
+
+
+def interior_page(made: InteriorResult, title: str) -> str:
     """The report as one HTML document."""
-    plots, scans, refused = InteriorPlots(mpl), made.images, made.failed
+    scans, refused = made.images, made.failed
     every = np.concatenate([scan.residuals_um for scan in scans])
     sigmas = [scan.sigma0_um for scan in scans if math.isfinite(scan.sigma0_um)]
     parts = [
@@ -127,7 +121,7 @@ def interior_page(made: InteriorResult, title: str, mpl: Any) -> str:
         "Transformed minus measured place of each mark, on the film, at one scale. Where all scans show the same "
         "vectors, the calibration of the marks is in doubt; a single long vector is a badly measured mark."
     )
-    drawing = figure(plots.residuals(scans), "Residual vectors", caption)
+    drawing = figure(draw_residuals(scans), "Residual vectors", caption)
     parts.append(section("Residuals", [drawing, _mark_table(scans)]))
     return page(title, "Transformation from calibrated fiducial marks to the scans", parts)
 

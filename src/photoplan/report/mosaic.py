@@ -11,7 +11,19 @@ import numpy as np
 import shapely
 
 from photoplan.io.naming import write_atomically
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, load_matplotlib, png, shortened
+from photoplan.report.drawing import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    axes_of,
+    load_matplotlib,
+    png,
+    shortened,
+)
 
 #: Images of smaller regions get no name in the picture, part of the whole.
 _NAMED = 0.005
@@ -32,10 +44,7 @@ def draw_regions(path: Path, shapes: Mapping[str, Any], title: str) -> Path:
     """
     mpl = load_matplotlib("a picture of the regions", "leave `sources` out")
     left, bottom, right, top = shapely.total_bounds(list(shapes.values())).tolist()
-    fig = mpl.figure.Figure(
-        figsize=(9.0, float(np.clip(9.0 * (top - bottom) / (right - left), 3.0, 14.0))), layout="constrained"
-    )
-    ax = fig.subplots()
+    fig, ax = axes_of(9.0, float(np.clip(9.0 * (top - bottom) / (right - left), 3.0, 14.0)))
     area = sum(shape.area for shape in shapes.values())
     for (name, shape), colour in zip(shapes.items(), cycle((BLUE, ORANGE, GREEN, RED, SKY, PURPLE))):
         rings = [np.array(ring.coords) for part in shape.geoms for ring in (part.exterior, *part.interiors)]

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any
 
 from photoplan.errors import UsageError
 from photoplan.io.disk import disk_error
@@ -141,8 +140,6 @@ class ReportFile:
     """A report or picture that can be written: seen before any work."""
 
     path: Path
-    mpl: Any
-    """``matplotlib``, with which plots are drawn."""
 
     def write(self, content: str | bytes) -> Path:
         """Write it whole or not at all; its folder is made. Returns its path.
@@ -208,4 +205,5 @@ def open_picture(
         return None
     files = [] if project is None else [project, *input_files(load_project(project))]
     check_output(path, [*files, *(source for source in inputs if source is not None)], overwrite=overwrite)
-    return ReportFile(path, load_matplotlib(what, f"leave {what.replace('a ', 'the ')} out"))
+    load_matplotlib(what, f"leave {what.replace('a ', 'the ')} out")
+    return ReportFile(path)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.io.naming import write_atomically
-from photoplan.report.drawing import BLUE, INK, load_matplotlib, png
+from photoplan.report.drawing import BLUE, INK, axes_of, load_matplotlib, png
 
 
 def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:
@@ -22,8 +22,7 @@ def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:
     mpl = load_matplotlib("a picture of the squares", "leave `show_quadtree` out")
     (left, bottom), (right, top) = bounds[:, :2].min(axis=0).tolist(), bounds[:, 2:].max(axis=0).tolist()
     shape = (9.0, float(np.clip(9.0 * (top - bottom) / (right - left), 2.0, 14.0)))
-    fig = mpl.figure.Figure(figsize=shape, layout="constrained")
-    ax = fig.subplots()
+    fig, ax = axes_of(*shape)
     x0, y0, x1, y1 = bounds.T
     corners = np.stack([np.stack([x0, x1, x1, x0], axis=1), np.stack([y0, y0, y1, y1], axis=1)], axis=-1)
     ax.add_collection(

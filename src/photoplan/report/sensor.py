@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +11,7 @@ from photoplan.io.sensor_file import Chip, SensorDescription
 from photoplan.products.sensor import SensorReport, noise_budget, short_number
 from photoplan.quality import sensor
 from photoplan.quality.sensor import NoiseBudget
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SOFT, STYLE, axes_of, png
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SOFT, axes_of, png, styled
 from photoplan.report.page import Cell, figure, page, section, table
 
 Array = NDArray[np.float64]
@@ -31,82 +29,79 @@ _TITLES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class SensorPlots:
-    """Draws charge transfer, Nyquist frequency, noise and transfer functions."""
-
-    mpl: Any
-
-    def transfer(self, product: float) -> bytes:
-        """Modulation against signal through clock frequency, for some transfer inefficiency products (fig. 3.15)."""
-        ratio = np.linspace(0.0, 0.5, 201)
-        with self.mpl.rc_context(STYLE):
-            fig, axes = axes_of(self.mpl, _WIDTH, 3.4)
-            for others in (0.01, 0.1, 0.3, 0.7, 2.0):
-                curve = np.exp(-others * (1.0 - np.cos(2.0 * np.pi * ratio)))
-                axes.plot(ratio, curve, color=SOFT, linewidth=0.9)
-                axes.annotate(f"{others:g}", (0.5, curve[-1]), (4, 0), textcoords="offset points", fontsize=8,
-                              color=SOFT, va="center", annotation_clip=False)  # fmt: skip
-            curve = np.exp(-product * (1.0 - np.cos(2.0 * np.pi * ratio)))
-            axes.plot(ratio, curve, color=BLUE, linewidth=2.0, label=f"this sensor, nε = {product:.3g}")
-            axes.set(xlim=(0, 0.5), ylim=(0, 1.05), xlabel="signal frequency through clock frequency",
-                     ylabel="modulation that is left")  # fmt: skip
-            fig.legend(loc="outside upper left")
-            return png(fig)
-
-    def nyquist(self, periods: Mapping[str, float]) -> bytes:
-        """Nyquist frequency against the period of sampling (fig. 3.17), with the periods of this sensor."""
-        low, high = min(periods.values()) / 2.0, max(periods.values()) * 2.0
-        period = np.geomspace(low, high, 200)
-        with self.mpl.rc_context(STYLE):
-            fig, axes = axes_of(self.mpl, _WIDTH, 3.4)
-            axes.plot(period, 500.0 / period, color=INK, linewidth=1.2)
-            same = {value: [n for n, v in periods.items() if v == value] for value in periods.values()}
-            for (value, names), colour in zip(same.items(), _COLOURS):
-                axes.plot([value, value, low], [0, 500.0 / value, 500.0 / value], color=colour, linewidth=0.8)
-                label = "\n".join([*names, f"{value:.4g} µm, {500.0 / value:.1f} LP/mm"])  # one line is too wide
-                axes.plot([value], [500.0 / value], "o", color=colour, label=label)
-            axes.set(xlim=(low, high), ylim=(0, 500.0 / min(periods.values()) * 1.3), xlabel="period of sampling µm",
-                     ylabel="Nyquist frequency LP/mm")  # fmt: skip
-            axes.legend(loc="upper right")
-            return png(fig)
-
-    def noise(self, budget: NoiseBudget) -> bytes:
-        """Noise of each source as bars, and the total."""
-        sources = budget.sources()
-        with self.mpl.rc_context(STYLE):
-            fig, axes = axes_of(self.mpl, _WIDTH, 0.75 + 0.36 * (len(sources) + 1))
-            names = [*sources, "total"]
-            values = [*sources.values(), budget.total]
-            axes.barh(names, values, color=[BLUE] * len(sources) + [INK], height=0.62)
-            for k, value in enumerate(values):
-                label = f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
-                axes.annotate(label, (value, k), (4, 0), textcoords="offset points", va="center", fontsize=8.5)
-            axes.invert_yaxis()
-            axes.grid(visible=False, axis="y")
-            axes.set(xlim=(0, 1.14 * max(values)), xlabel="electrons")
-            return png(fig)
-
-    def curves(self, curves: Mapping[str, tuple[Array, Array]], chip: Chip) -> bytes:
-        """Transfer functions of lens and sensitive width."""
-        with self.mpl.rc_context(STYLE):
-            fig, axes = axes_of(self.mpl, _WIDTH, 3.4)
-            for (name, (frequency, modulation)), colour in zip(curves.items(), _COLOURS):
-                wide = 2.0 if name.startswith("both") else 1.2
-                axes.plot(frequency, modulation, color=colour, linewidth=wide, label=name)
-            for pitch in dict.fromkeys(chip.pitch):
-                limit = 500.0 / pitch
-                axes.axvline(limit, color=SOFT, linewidth=0.9, linestyle="--")
-                axes.annotate("Nyquist", (limit, 1.02), (3, 0), textcoords="offset points", fontsize=8, color=SOFT)
-            longest = max(frequency[-1] for frequency, _ in curves.values())
-            axes.set(xlim=(0, longest), ylim=(0, 1.09), xlabel="spatial frequency LP/mm", ylabel="modulation")
-            fig.legend(loc="outside upper left", ncols=3)
-            return png(fig)
+@styled
+def draw_transfer(product: float) -> bytes:
+    """Modulation against signal through clock frequency, for some transfer inefficiency products (fig. 3.15)."""
+    ratio = np.linspace(0.0, 0.5, 201)
+    fig, axes = axes_of(_WIDTH, 3.4)
+    for others in (0.01, 0.1, 0.3, 0.7, 2.0):
+        curve = np.exp(-others * (1.0 - np.cos(2.0 * np.pi * ratio)))
+        axes.plot(ratio, curve, color=SOFT, linewidth=0.9)
+        axes.annotate(f"{others:g}", (0.5, curve[-1]), (4, 0), textcoords="offset points", fontsize=8,
+                      color=SOFT, va="center", annotation_clip=False)  # fmt: skip
+    curve = np.exp(-product * (1.0 - np.cos(2.0 * np.pi * ratio)))
+    axes.plot(ratio, curve, color=BLUE, linewidth=2.0, label=f"this sensor, nε = {product:.3g}")
+    axes.set(xlim=(0, 0.5), ylim=(0, 1.05), xlabel="signal frequency through clock frequency",
+             ylabel="modulation that is left")  # fmt: skip
+    fig.legend(loc="outside upper left")
+    return png(fig)
 
 
-def sensor_page(found: SensorReport, mpl: Any) -> str:
+@styled
+def draw_nyquist(periods: Mapping[str, float]) -> bytes:
+    """Nyquist frequency against the period of sampling (fig. 3.17), with the periods of this sensor."""
+    low, high = min(periods.values()) / 2.0, max(periods.values()) * 2.0
+    period = np.geomspace(low, high, 200)
+    fig, axes = axes_of(_WIDTH, 3.4)
+    axes.plot(period, 500.0 / period, color=INK, linewidth=1.2)
+    same = {value: [n for n, v in periods.items() if v == value] for value in periods.values()}
+    for (value, names), colour in zip(same.items(), _COLOURS):
+        axes.plot([value, value, low], [0, 500.0 / value, 500.0 / value], color=colour, linewidth=0.8)
+        label = "\n".join([*names, f"{value:.4g} µm, {500.0 / value:.1f} LP/mm"])  # one line is too wide
+        axes.plot([value], [500.0 / value], "o", color=colour, label=label)
+    axes.set(xlim=(low, high), ylim=(0, 500.0 / min(periods.values()) * 1.3), xlabel="period of sampling µm",
+             ylabel="Nyquist frequency LP/mm")  # fmt: skip
+    axes.legend(loc="upper right")
+    return png(fig)
+
+
+@styled
+def draw_noise(budget: NoiseBudget) -> bytes:
+    """Noise of each source as bars, and the total."""
+    sources = budget.sources()
+    fig, axes = axes_of(_WIDTH, 0.75 + 0.36 * (len(sources) + 1))
+    names = [*sources, "total"]
+    values = [*sources.values(), budget.total]
+    axes.barh(names, values, color=[BLUE] * len(sources) + [INK], height=0.62)
+    for k, value in enumerate(values):
+        label = f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
+        axes.annotate(label, (value, k), (4, 0), textcoords="offset points", va="center", fontsize=8.5)
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set(xlim=(0, 1.14 * max(values)), xlabel="electrons")
+    return png(fig)
+
+
+@styled
+def draw_curves(curves: Mapping[str, tuple[Array, Array]], chip: Chip) -> bytes:
+    """Transfer functions of lens and sensitive width."""
+    fig, axes = axes_of(_WIDTH, 3.4)
+    for (name, (frequency, modulation)), colour in zip(curves.items(), _COLOURS):
+        wide = 2.0 if name.startswith("both") else 1.2
+        axes.plot(frequency, modulation, color=colour, linewidth=wide, label=name)
+    for pitch in dict.fromkeys(chip.pitch):
+        limit = 500.0 / pitch
+        axes.axvline(limit, color=SOFT, linewidth=0.9, linestyle="--")
+        axes.annotate("Nyquist", (limit, 1.02), (3, 0), textcoords="offset points", fontsize=8, color=SOFT)
+    longest = max(frequency[-1] for frequency, _ in curves.values())
+    axes.set(xlim=(0, longest), ylim=(0, 1.09), xlabel="spatial frequency LP/mm", ylabel="modulation")
+    fig.legend(loc="outside upper left", ncols=3)
+    return png(fig)
+
+
+def sensor_page(found: SensorReport) -> str:
     """The report as one HTML document."""
-    pictures = _pictures(found, SensorPlots(mpl))
+    pictures = _pictures(found)
     parts = []
     for key, title in _TITLES.items():
         figures = [f for f in found.figures if f.section == key]
@@ -131,28 +126,28 @@ def _value(value: float | None, unit: str) -> str:
     return "" if value is None else f"{short_number(value)} {unit}".rstrip()
 
 
-def _pictures(made: SensorReport, plots: SensorPlots) -> dict[str, list[str]]:
+def _pictures(made: SensorReport) -> dict[str, list[str]]:
     """Pictures of each section."""
     found: dict[str, list[str]] = {}
     described = made.described
     if described.transfer is not None:
         text = "Grey: other transfer inefficiency products nε. 0.5 is the Nyquist frequency. Behr 1989, eq. 3.15."
         product = described.transfer.inefficiency * described.transfer.transfers
-        found["transfer"] = [figure(plots.transfer(product), "Modulation after charge transfer", text)]
+        found["transfer"] = [figure(draw_transfer(product), "Modulation after charge transfer", text)]
     periods = _periods(made)
     if periods:
         text = "Half the reciprocal of the period. Behr 1989, eq. 3.23."
         place = "image" if any(name.startswith("pixel") for name in periods) else "sensor"
-        found[place] = [figure(plots.nyquist(periods), "Nyquist frequency", text)]
+        found[place] = [figure(draw_nyquist(periods), "Nyquist frequency", text)]
     budget = noise_budget(described)
     if budget is not None and budget.sources():
         text = "The total is the root of the sum of squares, since the sources are independent."
-        found["noise"] = [figure(plots.noise(budget), "Noise budget", text)]
+        found["noise"] = [figure(draw_noise(budget), "Noise budget", text)]
     curves = _curves(described)
     if curves and described.sensor is not None:
         text = "The sensor can do no better than both together."
         key = "optics" if described.optics is not None else "sensor"
-        found.setdefault(key, []).append(figure(plots.curves(curves, described.sensor), "Modulation transfer", text))
+        found.setdefault(key, []).append(figure(draw_curves(curves, described.sensor), "Modulation transfer", text))
     return found
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from photoplan.io.naming import write_atomically
 from photoplan.io.quicklook import read_reduced
-from photoplan.report.drawing import STYLE, load_matplotlib, png
+from photoplan.report.drawing import STYLE, figure_of, load_matplotlib, png
 
 #: Longest side of what is drawn, pixels.
 _SIDE = 700
@@ -36,7 +36,7 @@ def draw_surface(heights: Path, picture: Path) -> Path:
     extent = left, right, bottom, top
     with mpl.rc_context(STYLE):
         size = 13.0, float(np.clip(4.0 * (top - bottom) / (right - left) + 1.0, 2.8, 9.0))
-        fig = mpl.figure.Figure(figsize=size, layout="constrained")
+        fig = figure_of(*size)
         axes = fig.subplots(1, 3, sharex=True, sharey=True)
         shown = axes[0].imshow(z, cmap="terrain", extent=extent, interpolation="nearest")
         fig.colorbar(shown, ax=axes[0], shrink=0.8, label="m")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from photoplan.geometry.grid import Window
 from photoplan.matching.grey import to_bytes
 from photoplan.matching.tracks import Tracks
 from photoplan.products.tie.inputs import TieImage
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SKY, SOFT, STYLE, png
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SKY, SOFT, figure_of, png, styled
 
 #: Colours of points in two, three, four, and five or more images.
 RAY_COLOURS = {2: ORANGE, 3: SKY, 4: BLUE, 5: GREEN}
@@ -24,50 +23,45 @@ _NAMES = 60
 _SIDE = 700
 
 
-@dataclass(frozen=True, eq=False)
-class TiePlots:
-    """Draws the network of images, and tie points in some of them."""
+@styled
+def draw_ties(images: Sequence[TieImage], tracks: Tracks) -> bytes:
+    """Network and views, as PNG; images are read again for small copies."""
+    points = np.bincount(tracks.image, minlength=len(images))
+    shown = _spread(points)
+    rows = -(-len(shown) // 2)
+    fig = figure_of(9.0, 6.2 + 2.8 * rows)
+    grid = fig.add_gridspec(rows + 1, 2, height_ratios=[6.0, *([2.8] * rows)])
+    _network(fig.add_subplot(grid[0, :]), images, tracks, points)
+    for k, number in enumerate(shown):
+        _view(fig.add_subplot(grid[1 + k // 2, k % 2]), images[number], tracks, number)
+    return png(fig)
 
-    mpl: Any
 
-    def ties(self, images: Sequence[TieImage], tracks: Tracks) -> bytes:
-        """Network and views, as PNG; images are read again for small copies."""
-        points = np.bincount(tracks.image, minlength=len(images))
-        shown = _spread(points)
-        rows = -(-len(shown) // 2)
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(9.0, 6.2 + 2.8 * rows), layout="constrained")
-            grid = fig.add_gridspec(rows + 1, 2, height_ratios=[6.0, *([2.8] * rows)])
-            self._network(fig.add_subplot(grid[0, :]), images, tracks, points)
-            for k, number in enumerate(shown):
-                _view(fig.add_subplot(grid[1 + k // 2, k % 2]), images[number], tracks, number)
-            return png(fig)
-
-    def _network(self, axes: Any, images: Sequence[TieImage], tracks: Tracks, points: NDArray[np.int64]) -> None:
-        joined, common = _common(tracks)
-        positions = [image.position for image in images if image.position is not None]
-        on_map = len(positions) == len(images)
-        place = np.array(positions)[:, :2] if on_map else _places(len(images), joined, common)
-        most = max(1, int(common.max(initial=1)))
-        for k in np.argsort(common, kind="stable"):
-            part = common[k] / most
-            axes.plot(*place[joined[k]].T, color=BLUE, linewidth=0.3 + 4.0 * part, alpha=0.25 + 0.6 * part, zorder=1)
-        alone = points == 0
-        axes.scatter(*place[~alone].T, s=26, color=INK, zorder=2)
-        if alone.any():
-            axes.scatter(*place[alone].T, s=60, color=RED, marker="x", zorder=3, label="without connection")
-            axes.legend(loc="upper right")
-        if len(images) <= _NAMES:
-            for image, at in zip(images, place):
-                axes.annotate(image.name, at, (4, 4), textcoords="offset points", fontsize=7, color=INK)
-        where = "by position on the map" if on_map else "by what they have in common"
-        axes.set_title(f"Images, {where}; lines: common points, the widest {most}")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.ticklabel_format(useOffset=False, style="plain")
-        if on_map:
-            axes.set(xlabel="X, m", ylabel="Y, m")
-        else:
-            axes.set(xticks=[], yticks=[])
+def _network(axes: Any, images: Sequence[TieImage], tracks: Tracks, points: NDArray[np.int64]) -> None:
+    joined, common = _common(tracks)
+    positions = [image.position for image in images if image.position is not None]
+    on_map = len(positions) == len(images)
+    place = np.array(positions)[:, :2] if on_map else _places(len(images), joined, common)
+    most = max(1, int(common.max(initial=1)))
+    for k in np.argsort(common, kind="stable"):
+        part = common[k] / most
+        axes.plot(*place[joined[k]].T, color=BLUE, linewidth=0.3 + 4.0 * part, alpha=0.25 + 0.6 * part, zorder=1)
+    alone = points == 0
+    axes.scatter(*place[~alone].T, s=26, color=INK, zorder=2)
+    if alone.any():
+        axes.scatter(*place[alone].T, s=60, color=RED, marker="x", zorder=3, label="without connection")
+        axes.legend(loc="upper right")
+    if len(images) <= _NAMES:
+        for image, at in zip(images, place):
+            axes.annotate(image.name, at, (4, 4), textcoords="offset points", fontsize=7, color=INK)
+    where = "by position on the map" if on_map else "by what they have in common"
+    axes.set_title(f"Images, {where}; lines: common points, the widest {most}")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.ticklabel_format(useOffset=False, style="plain")
+    if on_map:
+        axes.set(xlabel="X, m", ylabel="Y, m")
+    else:
+        axes.set(xticks=[], yticks=[])
 
 
 def _view(axes: Any, image: TieImage, tracks: Tracks, number: int) -> None:

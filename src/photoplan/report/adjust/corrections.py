@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from photoplan.products.adjust.figures import CorrectionFigures
 from photoplan.report.adjust.tables import Row, cell, number, paragraph, plain
-from photoplan.report.drawing import BLUE, GREEN, ORANGE, RED, STYLE, png
+from photoplan.report.drawing import BLUE, GREEN, ORANGE, RED, figure_of, png, styled
 from photoplan.report.page import figure, table
 
 
-def correction_parts(corrections: tuple[CorrectionFigures, ...], mpl: Any) -> list[str]:
+def correction_parts(corrections: tuple[CorrectionFigures, ...]) -> list[str]:
     """Residuals and corrections image by image; of strips, over time too."""
     rows: list[Row] = []
     for image in corrections:
@@ -34,7 +32,7 @@ def correction_parts(corrections: tuple[CorrectionFigures, ...], mpl: Any) -> li
         if len(image.seconds):
             parts.append(
                 figure(
-                    _over_time(image, mpl),
+                    _over_time(image),
                     f"{image.name} over time",
                     "Residuals of the image points at the moment of their line, and the corrections of the trajectory. "
                     "A wave that is left in the residuals asks for knots that are closer together.",
@@ -43,23 +41,23 @@ def correction_parts(corrections: tuple[CorrectionFigures, ...], mpl: Any) -> li
     return parts
 
 
-def _over_time(image: CorrectionFigures, mpl: Any) -> bytes:
-    with mpl.rc_context(STYLE):
-        count = 1 if image.over_time is None else 3
-        fig = mpl.figure.Figure(figsize=(7.2, 1.2 + 1.5 * count), layout="constrained")
-        panels = np.atleast_1d(fig.subplots(count, 1, sharex=True))
-        for k, (name, colour) in enumerate((("across (columns)", BLUE), ("along (rows)", ORANGE))):
-            panels[0].scatter(image.seconds, image.residuals[:, k], s=6, color=colour, linewidths=0, label=name)
-        panels[0].set_ylabel("residual px")
-        panels[0].legend(loc="upper right", fontsize=8, ncols=2)
-        if image.over_time is not None:
-            t, values = image.over_time
-            kinds = (("position m", values[:, :3], ("east", "north", "up")),
-                     ("attitude °", np.degrees(values[:, 3:]), ("about x", "about y", "about z")))  # fmt: skip
-            for axes, (label, rows, names) in zip(panels[1:], kinds):
-                for column, name, colour in zip(rows.T, names, (BLUE, GREEN, RED)):
-                    axes.plot(t, column, color=colour, marker=".", linewidth=1.0, label=name)
-                axes.set_ylabel(label)
-                axes.legend(loc="upper right", fontsize=8, ncols=3)
-        panels[-1].set_xlabel("seconds of the flight")
-        return png(fig)
+@styled
+def _over_time(image: CorrectionFigures) -> bytes:
+    count = 1 if image.over_time is None else 3
+    fig = figure_of(7.2, 1.2 + 1.5 * count)
+    panels = np.atleast_1d(fig.subplots(count, 1, sharex=True))
+    for k, (name, colour) in enumerate((("across (columns)", BLUE), ("along (rows)", ORANGE))):
+        panels[0].scatter(image.seconds, image.residuals[:, k], s=6, color=colour, linewidths=0, label=name)
+    panels[0].set_ylabel("residual px")
+    panels[0].legend(loc="upper right", fontsize=8, ncols=2)
+    if image.over_time is not None:
+        t, values = image.over_time
+        kinds = (("position m", values[:, :3], ("east", "north", "up")),
+                 ("attitude °", np.degrees(values[:, 3:]), ("about x", "about y", "about z")))  # fmt: skip
+        for axes, (label, rows, names) in zip(panels[1:], kinds):
+            for column, name, colour in zip(rows.T, names, (BLUE, GREEN, RED)):
+                axes.plot(t, column, color=colour, marker=".", linewidth=1.0, label=name)
+            axes.set_ylabel(label)
+            axes.legend(loc="upper right", fontsize=8, ncols=3)
+    panels[-1].set_xlabel("seconds of the flight")
+    return png(fig)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from photoplan.orientation.check_points import CheckAccuracy
 from photoplan.products.adjust.figures import AdjustFigures
 from photoplan.report.adjust.corrections import correction_parts
-from photoplan.report.adjust.plots import AdjustPlots
+from photoplan.report.adjust.plots import draw_control, draw_field, draw_network, draw_normalised, draw_sigmas
 from photoplan.report.adjust.tables import (
     Row,
     camera_parts,
@@ -29,24 +27,23 @@ from photoplan.report.adjust.tables import (
 from photoplan.report.page import figure, headline, page, section, table
 
 
-def adjust_page(facts: AdjustFigures, mpl: Any) -> str:
+def adjust_page(facts: AdjustFigures) -> str:
     """The report as one HTML document without links to anything outside it.
 
     Names and texts are escaped; what they contain is shown and never obeyed.
     """
-    plots = AdjustPlots(mpl)
     parts = [headline(_headline(facts))]
     if facts.notes:
         parts.append("".join(paragraph(note) for note in facts.notes))
-    parts.append(section("Network", _network(facts, plots)))
-    parts.append(section("Observations and their accuracy", _groups(facts, plots)))
+    parts.append(section("Network", _network(facts)))
+    parts.append(section("Observations and their accuracy", _groups(facts)))
     parts.append(section("Gross errors", _gross(facts)))
     if any(not g.check for g in facts.ground):
-        parts.append(section("Control points", _control(facts, plots)))
+        parts.append(section("Control points", _control(facts)))
     if facts.check is not None:
-        parts.append(section("Check points", _check(facts, facts.check, plots)))
+        parts.append(section("Check points", _check(facts, facts.check)))
     if facts.fields:
-        parts.append(section("Systematic image errors", _fields(facts, plots)))
+        parts.append(section("Systematic image errors", _fields(facts)))
     if facts.cameras:
         parts.append(section("Calibration", [part for camera in facts.cameras for part in camera_parts(camera)]))
     if facts.strips:
@@ -54,7 +51,7 @@ def adjust_page(facts: AdjustFigures, mpl: Any) -> str:
     if facts.images:
         parts.append(section("Images", image_parts(facts)))
     if facts.corrections:
-        parts.append(section("Satellites and strips", correction_parts(facts.corrections, mpl)))
+        parts.append(section("Satellites and strips", correction_parts(facts.corrections)))
     if facts.left_out:
         parts.append(section("Left out", left_out_parts(facts)))
     parts.append(section("Inputs and settings", _record(facts)))
@@ -86,11 +83,7 @@ def _headline(facts: AdjustFigures) -> list[tuple[str, str, str]]:
             (f"{plain(float(np.hypot(m[0], m[1])))} · {plain(float(m[2]))} m", "projection centres", spread)
             for m in ([mean] if len(sigma) else [])
         ),
-        (
-            f"{plain(float(np.hypot(*facts.point_sigma[:2])))} · {plain(facts.point_sigma[2])} m",
-            "tie points",
-            spread,
-        ),
+        (f"{plain(float(np.hypot(*facts.point_sigma[:2])))} · {plain(facts.point_sigma[2])} m", "tie points", spread),
     ]
     if facts.check is not None:
         c = facts.check
@@ -109,19 +102,19 @@ def _headline(facts: AdjustFigures) -> list[tuple[str, str, str]]:
     return boxes
 
 
-def _network(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
+def _network(facts: AdjustFigures) -> list[str]:
     control = [g for g in facts.ground if not g.check]
     check = len(facts.ground) - len(control)
     return [
         figure(
-            plots.network(facts),
+            draw_network(facts),
             "Network",
             f"{len(facts.images) + len(facts.corrections)} images, {number(facts.points)} points, {len(control)} "
             f"control and {check} check points.",
         ),
         *(
             figure(
-                plots.sigmas(facts),
+                draw_sigmas(facts),
                 "Standard deviations of the projection centres",
                 "They grow at the edges of the block, and where images hang on few points or little control.",
             )
@@ -130,7 +123,7 @@ def _network(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
     ]
 
 
-def _groups(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
+def _groups(facts: AdjustFigures) -> list[str]:
     rows: list[Row] = []
     for g in facts.groups:
         share = g.redundancy / g.count if g.count else np.nan
@@ -156,7 +149,7 @@ def _groups(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
             "where the redundancy is more than about 30."
         ),
         figure(
-            plots.normalised(facts.normalised, facts.critical),
+            draw_normalised(facts.normalised, facts.critical),
             "Normalised residuals of image points",
             "Each residual divided by its own standard deviation, beside the normal curve; dotted: the limit beyond "
             "which "
@@ -183,8 +176,8 @@ def _gross(facts: AdjustFigures) -> list[str]:
     return parts
 
 
-def _control(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
-    picture, scale = plots.control(facts, check=False)
+def _control(facts: AdjustFigures) -> list[str]:
+    picture, scale = draw_control(facts, check=False)
     out = any(any(g.rejected) for g in facts.ground if not g.check)
     return [
         figure(
@@ -197,7 +190,7 @@ def _control(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
     ]
 
 
-def _check(facts: AdjustFigures, check: CheckAccuracy, plots: AdjustPlots) -> list[str]:
+def _check(facts: AdjustFigures, check: CheckAccuracy) -> list[str]:
     rows: list[Row] = []
     for name, k in (("X", 0), ("Y", 1), ("Z", 2)):
         count = check.vertical if k == 2 else check.horizontal
@@ -207,7 +200,7 @@ def _check(facts: AdjustFigures, check: CheckAccuracy, plots: AdjustPlots) -> li
         ["vertical (RMSE_V)", cell(plain(check.fit_v)), cell(plain(check.survey_v)), cell(plain(check.rmse_v))],
         ["in space (RMSE_3D)", cell(""), cell(""), cell(plain(check.rmse_3d))],
     ]
-    picture, scale = plots.control(facts, check=True)
+    picture, scale = draw_control(facts, check=True)
     return [
         paragraph(
             "After the ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2 (2023). Check "
@@ -227,7 +220,7 @@ def _check(facts: AdjustFigures, check: CheckAccuracy, plots: AdjustPlots) -> li
     ]
 
 
-def _fields(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
+def _fields(facts: AdjustFigures) -> list[str]:
     parts = [
         paragraph(
             "Mean residuals (computed minus measured) of all images in cells of the image format. A pattern that hangs "
@@ -236,7 +229,7 @@ def _fields(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
         )
     ]
     for field in facts.fields:
-        picture, key = plots.field(field)
+        picture, key = draw_field(field)
         parts.append(
             figure(
                 picture,

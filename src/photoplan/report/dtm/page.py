@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from photoplan.io.product import check_output
 from photoplan.report.drawing import has_matplotlib, load_matplotlib
-from photoplan.report.dtm.plots import LINE_WORDS, Plots
+from photoplan.report.dtm.plots import (
+    LINE_WORDS,
+    draw_covariance,
+    draw_filter_histograms,
+    draw_filter_map,
+    draw_gross,
+    draw_heights,
+    draw_normalised,
+    draw_sigmas,
+)
 from photoplan.report.dtm.samples import BuildFacts, PlottedError
 from photoplan.report.page import Cell, ReportFile, figure, headline, page, section, table, text
 from photoplan.terrain.calibration import ClassFigures
@@ -35,21 +43,21 @@ def open_build_report(output: Path, wanted: bool | None, overwrite: bool) -> Rep
     check_output(path, overwrite=overwrite)
     if wanted is None and not has_matplotlib():
         return None
-    return ReportFile(path, load_matplotlib("the report", "give `report=False`"))
+    load_matplotlib("the report", "give `report=False`")
+    return ReportFile(path)
 
 
-def build_page(facts: BuildFacts, mpl: Any) -> str:
+def build_page(facts: BuildFacts) -> str:
     """The report as one HTML document without links to anything outside it.
 
     Names and texts are escaped; what they contain is shown and never obeyed.
     """
-    plots = Plots(mpl)
     parts = [
         headline(_headline(facts)),
-        section("The surface", _surface(facts, plots)),
-        section("How well the model fits its points", _fit(facts, plots)),
-        section("What the filter did", _effect(facts, plots)),
-        section("Gross errors", _gross(facts, plots)),
+        section("The surface", _surface(facts)),
+        section("How well the model fits its points", _fit(facts)),
+        section("What the filter did", _effect(facts)),
+        section("Gross errors", _gross(facts)),
         section("What was found in the measurements", _notes(facts)),
         section("Inputs and settings", _record(facts)),
     ]
@@ -82,34 +90,34 @@ def _headline(facts: BuildFacts) -> list[tuple[str, str, str]]:
     ]
 
 
-def _surface(facts: BuildFacts, plots: Plots) -> list[str]:
+def _surface(facts: BuildFacts) -> list[str]:
     kinds = [LINE_WORDS.get(kind, kind) for kind in sorted({kind for kind, _ in facts.map.lines})]
     return [
         figure(
-            plots.heights(facts.map),
+            draw_heights(facts.map),
             "Map of heights",
             f"Heights, shaded as if lit from the north-west. {'Lines: ' + ', '.join(kinds) + '. ' if kinds else ''}"
             "White: no surface, outside the border lines or too far from data.",
         ),
         figure(
-            plots.sigmas(facts.map),
+            draw_sigmas(facts.map),
             "Map of standard deviations",
             "Standard deviation of the predicted height. It grows where points are sparse and towards the edges.",
         ),
     ]
 
 
-def _fit(facts: BuildFacts, plots: Plots) -> list[str]:
+def _fit(facts: BuildFacts) -> list[str]:
     return [
         figure(
-            plots.normalised(facts.normalised, facts.limit),
+            draw_normalised(facts.normalised, facts.limit),
             "Histogram of normalised residuals",
             "Difference of each point from what its neighbours predict, in its standard deviations, beside the normal "
             "curve. A narrower histogram means that standard deviations are too large, a wider one that they are too "
             "small. The model's standard deviations follow the spread around each place, and what held-out blocks say.",
         ),
         figure(
-            plots.covariance(facts.covariance),
+            draw_covariance(facts.covariance),
             "Covariance functions",
             "Left: the fitted function of the whole area, and the range of eight in ten units. Right: covariance of "
             "the heights above a plane through each neighbourhood (dots), and what the fitted functions let expect of "
@@ -137,7 +145,7 @@ def _held_out(classes: Sequence[ClassFigures]) -> list[str]:
     ]
 
 
-def _effect(facts: BuildFacts, plots: Plots) -> list[str]:
+def _effect(facts: BuildFacts) -> list[str]:
     effects = [effect for effect in facts.effects if np.isfinite(effect.differences).any()]
     if not effects:
         return ["<p>No point or line with heights lies on the surface.</p>"]
@@ -158,12 +166,12 @@ def _effect(facts: BuildFacts, plots: Plots) -> list[str]:
     return [
         table(["class", "number", "filter value m", "mean m", "root mean square m", "largest m"], rows),
         figure(
-            plots.filter_histograms(effects),
+            draw_filter_histograms(effects),
             "Histograms of measured minus filtered heights",
             f"Measured minus filtered heights by class; gross errors are not among them.{sample}",
         ),
         figure(
-            plots.filter_map(effects, facts.map),
+            draw_filter_map(effects, facts.map),
             "Map of measured minus filtered heights",
             "Places of one colour that hang together are features that the filter took for noise, or errors of a whole "
             "series of measurements.",
@@ -171,13 +179,13 @@ def _effect(facts: BuildFacts, plots: Plots) -> list[str]:
     ]
 
 
-def _gross(facts: BuildFacts, plots: Plots) -> list[str]:
+def _gross(facts: BuildFacts) -> list[str]:
     if not facts.gross and not facts.suspects:
         return ["<p>None were sought.</p>" if facts.limit == 0 else "<p>None was found.</p>"]
     order = sorted(facts.gross, key=lambda g: -abs(g.normalised))
     parts = [
         figure(
-            plots.gross(order, facts.suspects, facts.map),
+            draw_gross(order, facts.suspects, facts.map),
             "Map of gross errors",
             "Where gross errors lie; the largest have the numbers of the list. Circles: suspects.",
         )

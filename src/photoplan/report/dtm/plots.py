@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.drawing import BLUE, INK, PURPLE, RED, SKY, SOFT, STYLE, png
+from photoplan.report.drawing import BLUE, INK, PURPLE, RED, SKY, SOFT, axes_of, figure_of, mpl, png, styled
 from photoplan.report.dtm.covariance import CovarianceTest
 from photoplan.report.dtm.samples import FilterEffect, PlottedError, ReportMap
 
@@ -24,187 +23,174 @@ _NUMBERED = 30
 _DOTS = 60_000
 
 
-@dataclass(frozen=True, eq=False)
-class Plots:
-    """Draws maps, histograms and covariances of a terrain model."""
+@styled
+def draw_heights(area: ReportMap) -> bytes:
+    """Heights as shaded tints, with lines."""
+    fig, axes = _map(area)
+    low, high = _limits(area.heights, 0.5)
+    norm = mpl.colors.Normalize(low, high)
+    tints = _lighter("cividis")
+    rgb = tints(norm(np.nan_to_num(area.heights, nan=low)))[..., :3] * _shade(area)[..., None]
+    rgb[~np.isfinite(area.heights)] = 1.0
+    axes.imshow(np.clip(rgb, 0, 1), extent=area.extent, interpolation="nearest")
+    _lines(axes, area)
+    _bar(fig, axes, tints, norm, "height m")
+    return png(fig)
 
-    mpl: Any
 
-    def heights(self, area: ReportMap) -> bytes:
-        """Heights as shaded tints, with lines."""
-        with self.mpl.rc_context(STYLE):
-            fig, axes = self._map(area)
-            low, high = _limits(area.heights, 0.5)
-            norm = self.mpl.colors.Normalize(low, high)
-            tints = _lighter(self.mpl, "cividis")
-            rgb = tints(norm(np.nan_to_num(area.heights, nan=low)))[..., :3] * _shade(area)[..., None]
-            rgb[~np.isfinite(area.heights)] = 1.0
-            axes.imshow(np.clip(rgb, 0, 1), extent=area.extent, interpolation="nearest")
-            self._lines(axes, area)
-            self._bar(fig, axes, tints, norm, "height m")
-            return png(fig)
+@styled
+def draw_sigmas(area: ReportMap) -> bytes:
+    """Standard deviations."""
+    fig, axes = _map(area)
+    low, high = _limits(area.sigmas, 1.0)
+    norm = mpl.colors.Normalize(max(0.0, low), high)
+    tints = mpl.colormaps["viridis_r"]
+    axes.imshow(area.sigmas, extent=area.extent, cmap=tints, norm=norm, interpolation="nearest")
+    _bar(fig, axes, tints, norm, "standard deviation m", extend="both")
+    return png(fig)
 
-    def sigmas(self, area: ReportMap) -> bytes:
-        """Standard deviations."""
-        with self.mpl.rc_context(STYLE):
-            fig, axes = self._map(area)
-            low, high = _limits(area.sigmas, 1.0)
-            norm = self.mpl.colors.Normalize(max(0.0, low), high)
-            tints = self.mpl.colormaps["viridis_r"]
-            axes.imshow(area.sigmas, extent=area.extent, cmap=tints, norm=norm, interpolation="nearest")
-            self._bar(fig, axes, tints, norm, "standard deviation m", extend="both")
-            return png(fig)
 
-    def normalised(self, values: NDArray[np.float64], limit: float) -> bytes:
-        """Histogram of normalised residuals with the normal curve."""
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 2.9), layout="constrained")
-            axes = fig.subplots()
-            z = values[np.isfinite(values)]
-            edge = 5.0
-            bins = np.linspace(-edge, edge, 81 if len(z) > 2000 else 41)
-            if len(z):
-                weight = np.full(len(z), 1 / (len(z) * (bins[1] - bins[0])))
-                axes.hist(np.clip(z, -edge, edge), bins=bins, weights=weight, color=SKY, label="points")
-                axes.text(0.01, 0.93, f"mean {z.mean():+.2f}, spread {z.std():.2f}", transform=axes.transAxes, va="top")
-            t = np.linspace(-edge, edge, 301)
-            axes.plot(t, np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi), color=RED, linewidth=1.5, label="normal curve")
-            if 0 < limit < edge:
-                for side in (-limit, limit):
-                    axes.axvline(side, color=SOFT, linestyle=":", linewidth=1.0)
-                axes.annotate("limit", (limit, 0.3), (3, 0), textcoords="offset points", color=SOFT, fontsize=8)
-            axes.set(
-                xlim=(-edge, edge), xlabel="normalised residual (all beyond ±5 in the last class)", ylabel="density"
+@styled
+def draw_normalised(values: NDArray[np.float64], limit: float) -> bytes:
+    """Histogram of normalised residuals with the normal curve."""
+    fig, axes = axes_of(_WIDTH, 2.9)
+    z = values[np.isfinite(values)]
+    edge = 5.0
+    bins = np.linspace(-edge, edge, 81 if len(z) > 2000 else 41)
+    if len(z):
+        weight = np.full(len(z), 1 / (len(z) * (bins[1] - bins[0])))
+        axes.hist(np.clip(z, -edge, edge), bins=bins, weights=weight, color=SKY, label="points")
+        axes.text(0.01, 0.93, f"mean {z.mean():+.2f}, spread {z.std():.2f}", transform=axes.transAxes, va="top")
+    t = np.linspace(-edge, edge, 301)
+    axes.plot(t, np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi), color=RED, linewidth=1.5, label="normal curve")
+    if 0 < limit < edge:
+        for side in (-limit, limit):
+            axes.axvline(side, color=SOFT, linestyle=":", linewidth=1.0)
+        axes.annotate("limit", (limit, 0.3), (3, 0), textcoords="offset points", color=SOFT, fontsize=8)
+    axes.set(xlim=(-edge, edge), xlabel="normalised residual (all beyond ±5 in the last class)", ylabel="density")
+    axes.legend(loc="upper right")
+    return png(fig)
+
+
+@styled
+def draw_covariance(facts: CovarianceTest) -> bytes:
+    """Fitted functions, and the test by the covariance of residuals."""
+    fig = figure_of(_WIDTH, 3.1)
+    fitted, test = fig.subplots(1, 2)
+    square = 1e4
+    fitted.fill_between(
+        facts.distance, facts.low * square, facts.high * square, color=SKY, alpha=0.4, linewidth=0, label="units"
+    )
+    fitted.plot(facts.distance, facts.whole * square, color=BLUE, linewidth=1.8, label="whole area")
+    fitted.set(title="fitted functions", xlabel="distance m", ylabel="covariance cm²")
+    fitted.set(xlim=(0, facts.distance[-1]), ylim=(0, None))
+    fitted.legend(loc="upper right")
+    known = facts.pairs > 0
+    size = 12 + 40 * facts.pairs[known] / max(1, facts.pairs.max())
+    test.axhline(0, color=SOFT, linewidth=0.8)
+    test.plot(facts.classes[known], facts.expected[known] * square, color=BLUE, linewidth=1.8, label="expected")
+    test.scatter(facts.classes[known], facts.empirical[known] * square, s=size, color=RED, zorder=3, label="measured")
+    test.set(title="heights above local planes", xlabel="distance m", xlim=(0, None))
+    test.legend(loc="upper right")
+    return png(fig)
+
+
+@styled
+def draw_filter_histograms(effects: Sequence[FilterEffect]) -> bytes:
+    """A histogram for each class, all in one scale."""
+    columns = min(3, len(effects))
+    rows = -(-len(effects) // columns)
+    fig = figure_of(_WIDTH, 0.4 + 2.0 * rows)
+    panels = fig.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    reach = 100 * _reach(effects)
+    for panel, effect in zip(panels, effects):
+        d = 100 * effect.differences[np.isfinite(effect.differences)]
+        bins = np.linspace(-reach, reach, 51)
+        weights = np.full(len(d), 100 / len(d))
+        panel.hist(np.clip(d, -reach, reach), bins=bins, weights=weights, color=BLUE)
+        panel.axvline(0, color=INK, linewidth=0.8)
+        panel.set_title(effect.name)
+        panel.set(xlabel="measured − filtered cm", xlim=(-reach, reach))
+    for panel in panels[::columns]:
+        panel.set_ylabel("share %")
+    for panel in panels[len(effects) :]:
+        panel.set_visible(False)
+    return png(fig)
+
+
+@styled
+def draw_filter_map(effects: Sequence[FilterEffect], area: ReportMap) -> bytes:
+    """Where heights were changed, and which way."""
+    fig, axes = _map(area)
+    _grey_relief(axes, area)
+    xy = np.concatenate([effect.xy for effect in effects])
+    d = 100 * np.concatenate([effect.differences for effect in effects])
+    step = max(1, -(-len(d) // _DOTS))
+    known = np.flatnonzero(np.isfinite(d))[::step]
+    reach = 100 * _reach(effects)
+    norm = mpl.colors.Normalize(-reach, reach)
+    tints = mpl.colormaps["RdBu"]
+    size = float(np.clip(3e4 / max(1, len(known)), 0.6, 14))
+    axes.scatter(*xy[known].T, c=d[known], cmap=tints, norm=norm, s=size, linewidths=0, rasterized=True, zorder=3)
+    _bar(fig, axes, tints, norm, "measured − filtered cm", extend="both")
+    return png(fig)
+
+
+@styled
+def draw_gross(errors: Sequence[PlottedError], suspects: Sequence[PlottedError], area: ReportMap) -> bytes:
+    """Gross errors on the relief; those above the model point up, those below it down; suspects are circles."""
+    fig, axes = _map(area)
+    _grey_relief(axes, area)
+    xy = np.array([(error.X, error.Y) for error in errors]).reshape(-1, 2)
+    up = np.array([error.normalised > 0 for error in errors], bool)
+    for some, marker, colour, name in ((up, "^", RED, "too high"), (~up, "v", BLUE, "too low")):
+        if some.any():
+            axes.scatter(*xy[some].T, marker=marker, s=28, color=colour, edgecolor="white", linewidth=0.5, label=name)
+    if suspects:
+        places = np.array([(error.X, error.Y) for error in suspects])
+        axes.scatter(*places.T, s=30, facecolor="none", edgecolor=PURPLE, linewidth=1.1, label="suspects")
+    for k, (x, y) in enumerate(xy[:_NUMBERED], 1):
+        axes.annotate(str(k), (x, y), (4, 3), textcoords="offset points", fontsize=7.5, color=INK, zorder=5)
+    fig.legend(loc="outside lower center", ncols=3)
+    return png(fig)
+
+
+def _map(area: ReportMap) -> tuple[Any, Any]:
+    """A figure with one panel of the map's proportions and map coordinates along it."""
+    left, right, bottom, top = area.extent
+    ratio = (top - bottom) / (right - left)
+    height = float(np.clip(5.9 * ratio, 2.2, 8.2)) + 0.7
+    fig, axes = axes_of(_WIDTH, height)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="X m", ylabel="Y m")
+    axes.grid(False)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(mpl.ticker.FuncFormatter(lambda v, _: f"{v:.12g}"))
+    return fig, axes
+
+
+def _bar(fig: Any, axes: Any, tints: Any, norm: Any, label: str, extend: str = "neither") -> None:
+    colours = mpl.cm.ScalarMappable(norm, tints)
+    bar = fig.colorbar(colours, ax=axes, shrink=0.8, aspect=28, pad=0.02, extend=extend)
+    bar.set_label(label)
+    bar.outline.set_visible(False)
+
+
+def _lines(axes: Any, area: ReportMap) -> None:
+    for kind in sorted({kind for kind, _ in area.lines}):
+        some = [xy for k, xy in area.lines if k == kind]
+        dashes = {"formline": "--", "hole": ":"}.get(kind, "-")
+        axes.add_collection(
+            mpl.collections.LineCollection(
+                some,
+                colors=LINE_COLOURS.get(kind, INK),
+                linewidths=0.5,
+                linestyles=dashes,
+                label=LINE_WORDS.get(kind, kind),
             )
-            axes.legend(loc="upper right")
-            return png(fig)
-
-    def covariance(self, facts: CovarianceTest) -> bytes:
-        """Fitted functions, and the test by the covariance of residuals."""
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 3.1), layout="constrained")
-            fitted, test = fig.subplots(1, 2)
-            square = 1e4
-            fitted.fill_between(
-                facts.distance,
-                facts.low * square,
-                facts.high * square,
-                color=SKY,
-                alpha=0.4,
-                linewidth=0,
-                label="units",
-            )
-            fitted.plot(facts.distance, facts.whole * square, color=BLUE, linewidth=1.8, label="whole area")
-            fitted.set(title="fitted functions", xlabel="distance m", ylabel="covariance cm²")
-            fitted.set(xlim=(0, facts.distance[-1]), ylim=(0, None))
-            fitted.legend(loc="upper right")
-            known = facts.pairs > 0
-            size = 12 + 40 * facts.pairs[known] / max(1, facts.pairs.max())
-            test.axhline(0, color=SOFT, linewidth=0.8)
-            test.plot(facts.classes[known], facts.expected[known] * square, color=BLUE, linewidth=1.8, label="expected")
-            test.scatter(
-                facts.classes[known], facts.empirical[known] * square, s=size, color=RED, zorder=3, label="measured"
-            )
-            test.set(title="heights above local planes", xlabel="distance m", xlim=(0, None))
-            test.legend(loc="upper right")
-            return png(fig)
-
-    def filter_histograms(self, effects: Sequence[FilterEffect]) -> bytes:
-        """A histogram for each class, all in one scale."""
-        with self.mpl.rc_context(STYLE):
-            columns = min(3, len(effects))
-            rows = -(-len(effects) // columns)
-            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 0.4 + 2.0 * rows), layout="constrained")
-            panels = fig.subplots(rows, columns, squeeze=False, sharex=True).ravel()
-            reach = 100 * _reach(effects)
-            for panel, effect in zip(panels, effects):
-                d = 100 * effect.differences[np.isfinite(effect.differences)]
-                bins = np.linspace(-reach, reach, 51)
-                weights = np.full(len(d), 100 / len(d))
-                panel.hist(np.clip(d, -reach, reach), bins=bins, weights=weights, color=BLUE)
-                panel.axvline(0, color=INK, linewidth=0.8)
-                panel.set_title(effect.name)
-                panel.set(xlabel="measured − filtered cm", xlim=(-reach, reach))
-            for panel in panels[::columns]:
-                panel.set_ylabel("share %")
-            for panel in panels[len(effects) :]:
-                panel.set_visible(False)
-            return png(fig)
-
-    def filter_map(self, effects: Sequence[FilterEffect], area: ReportMap) -> bytes:
-        """Where heights were changed, and which way."""
-        with self.mpl.rc_context(STYLE):
-            fig, axes = self._map(area)
-            _grey_relief(axes, area)
-            xy = np.concatenate([effect.xy for effect in effects])
-            d = 100 * np.concatenate([effect.differences for effect in effects])
-            step = max(1, -(-len(d) // _DOTS))
-            known = np.flatnonzero(np.isfinite(d))[::step]
-            reach = 100 * _reach(effects)
-            norm = self.mpl.colors.Normalize(-reach, reach)
-            tints = self.mpl.colormaps["RdBu"]
-            size = float(np.clip(3e4 / max(1, len(known)), 0.6, 14))
-            axes.scatter(
-                *xy[known].T, c=d[known], cmap=tints, norm=norm, s=size, linewidths=0, rasterized=True, zorder=3
-            )
-            self._bar(fig, axes, tints, norm, "measured − filtered cm", extend="both")
-            return png(fig)
-
-    def gross(self, errors: Sequence[PlottedError], suspects: Sequence[PlottedError], area: ReportMap) -> bytes:
-        """Gross errors on the relief; those above the model point up, those below it down; suspects are circles."""
-        with self.mpl.rc_context(STYLE):
-            fig, axes = self._map(area)
-            _grey_relief(axes, area)
-            xy = np.array([(error.X, error.Y) for error in errors]).reshape(-1, 2)
-            up = np.array([error.normalised > 0 for error in errors], bool)
-            for some, marker, colour, name in ((up, "^", RED, "too high"), (~up, "v", BLUE, "too low")):
-                if some.any():
-                    axes.scatter(
-                        *xy[some].T, marker=marker, s=28, color=colour, edgecolor="white", linewidth=0.5, label=name
-                    )
-            if suspects:
-                places = np.array([(error.X, error.Y) for error in suspects])
-                axes.scatter(*places.T, s=30, facecolor="none", edgecolor=PURPLE, linewidth=1.1, label="suspects")
-            for k, (x, y) in enumerate(xy[:_NUMBERED], 1):
-                axes.annotate(str(k), (x, y), (4, 3), textcoords="offset points", fontsize=7.5, color=INK, zorder=5)
-            fig.legend(loc="outside lower center", ncols=3)
-            return png(fig)
-
-    def _map(self, area: ReportMap) -> tuple[Any, Any]:
-        """A figure with one panel of the map's proportions and map coordinates along it."""
-        left, right, bottom, top = area.extent
-        ratio = (top - bottom) / (right - left)
-        height = float(np.clip(5.9 * ratio, 2.2, 8.2)) + 0.7
-        fig = self.mpl.figure.Figure(figsize=(_WIDTH, height), layout="constrained")
-        axes = fig.subplots()
-        axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="X m", ylabel="Y m")
-        axes.grid(False)
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(self.mpl.ticker.MaxNLocator(5, steps=[1, 2, 5, 10]))
-            axis.set_major_formatter(self.mpl.ticker.FuncFormatter(lambda v, _: f"{v:.12g}"))
-        return fig, axes
-
-    def _bar(self, fig: Any, axes: Any, tints: Any, norm: Any, label: str, extend: str = "neither") -> None:
-        colours = self.mpl.cm.ScalarMappable(norm, tints)
-        bar = fig.colorbar(colours, ax=axes, shrink=0.8, aspect=28, pad=0.02, extend=extend)
-        bar.set_label(label)
-        bar.outline.set_visible(False)
-
-    def _lines(self, axes: Any, area: ReportMap) -> None:
-        for kind in sorted({kind for kind, _ in area.lines}):
-            some = [xy for k, xy in area.lines if k == kind]
-            dashes = {"formline": "--", "hole": ":"}.get(kind, "-")
-            axes.add_collection(
-                self.mpl.collections.LineCollection(
-                    some,
-                    colors=LINE_COLOURS.get(kind, INK),
-                    linewidths=0.5,
-                    linestyles=dashes,
-                    label=LINE_WORDS.get(kind, kind),
-                )
-            )
-        if area.lines:
-            axes.figure.legend(loc="outside lower center", ncols=4)
+        )
+    if area.lines:
+        axes.figure.legend(loc="outside lower center", ncols=4)
 
 
 def _limits(values: NDArray[np.float32], percent: float) -> tuple[float, float]:
@@ -241,7 +227,7 @@ def _grey_relief(axes: Any, area: ReportMap) -> None:
     axes.imshow(grey, extent=area.extent, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
 
 
-def _lighter(mpl: Any, name: str) -> Any:
+def _lighter(name: str) -> Any:
     """A colour map mixed with white, as a ground for shading and lines."""
     colours = mpl.colormaps[name](np.linspace(0, 1, 256))
     colours[:, :3] = 0.62 * colours[:, :3] + 0.38

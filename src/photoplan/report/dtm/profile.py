@@ -10,14 +10,14 @@ import numpy as np
 from photoplan.errors import UsageError
 from photoplan.products.dtm.contours import ContourFacts
 from photoplan.products.dtm.profile import Profile
-from photoplan.report.drawing import png
+from photoplan.report.drawing import mpl, png
 
 MOST = 12
 """Profiles of one picture at most."""
 _GROUND, _BAND = "#5b4a33", "#d9a441"
 
 
-def profile_picture(profiles: Sequence[Profile], mpl: Any) -> bytes:
+def profile_picture(profiles: Sequence[Profile]) -> bytes:
     """A PNG: a panel for each profile, all in one scale.
 
     Raises
@@ -70,7 +70,7 @@ def _range(item: Profile) -> tuple[float, float]:
     return (low, high) if high - low > 0.1 else (low - 0.05, high + 0.05)
 
 
-def contours_picture(facts: ContourFacts, mpl: Any) -> bytes:
+def contours_picture(facts: ContourFacts) -> bytes:
     """Contours and their labels as PNG."""
     sketch = facts.sketch
     assert sketch is not None

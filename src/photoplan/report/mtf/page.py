@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +11,21 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.mtf.result import EdgeGroup, ImageMtf, MeasuredEdge, MtfReport, rejected_words
 from photoplan.quality.spread import gaussian_modulation
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, axes_of, png
+from photoplan.report.drawing import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    SOFT,
+    axes_of,
+    figure_of,
+    mpl,
+    png,
+    styled,
+)
 from photoplan.report.page import Cell, cells, figure, headline, number, page, section, table, text
 
 #: Images that get plots.
@@ -28,10 +40,9 @@ _EDGE_HEAD = ("no.", "channel", "column", "row", "direction", "angle °", "lengt
               "95 % interval", "FWHM px", "over %", "under %")  # fmt: skip
 
 
-def mtf_page(made: MtfReport, mpl: Any) -> str:
+def mtf_page(made: MtfReport) -> str:
     """The report as one HTML document; images are opened again for small copies."""
-    plots = MtfPlots(mpl)
-    parts = [_image(image, made.pixel_um, plots if k < _PLOTTED else None) for k, image in enumerate(made.images)]
+    parts = [_image(image, made.pixel_um, k < _PLOTTED) for k, image in enumerate(made.images)]
     if made.failed:
         rows = [[Cell(name), Cell(reason)] for name, reason in made.failed.items()]
         parts.append(section("Images without result", [table(("image", "reason"), rows)]))
@@ -39,14 +50,14 @@ def mtf_page(made: MtfReport, mpl: Any) -> str:
     return page(f"Sharpness: {title}", "Spread function and modulation transfer from edges", parts)
 
 
-def _image(image: ImageMtf, pixel_um: float | None, plots: MtfPlots | None) -> str:
+def _image(image: ImageMtf, pixel_um: float | None, drawn: bool) -> str:
     rejected = rejected_words(image.rejected) or "no edge"
     parts = [headline(_figures(image, pixel_um))]
     parts.append(f"<p>Linearisation: {text(image.linearisation)}. Rejected: {text(rejected)}.</p>")
     parts += [f"<p>{text(note)}</p>" for note in image.notes]
     whole = [g for g in image.groups if g.cell is None]
-    if plots is not None:
-        parts += _plots(image, whole, plots)
+    if drawn:
+        parts += _plots(image, whole)
     parts.append(table(_GROUP_HEAD, [cells(_group_row(group), 1) for group in whole]))
     if image.total.laboratory is not None:
         head = ("cycles per pixel", "laboratory", "measured", "difference")
@@ -60,7 +71,7 @@ def _image(image: ImageMtf, pixel_um: float | None, plots: MtfPlots | None) -> s
     return section(image.name, parts)
 
 
-def _plots(image: ImageMtf, whole: list[EdgeGroup], plots: MtfPlots) -> list[str]:
+def _plots(image: ImageMtf, whole: list[EdgeGroup]) -> list[str]:
     channel = image.total.channel
     first = [edge for edge in image.edges if edge.channel == channel]
     own = [g for g in whole if g.channel == channel]
@@ -68,29 +79,29 @@ def _plots(image: ImageMtf, whole: list[EdgeGroup], plots: MtfPlots) -> list[str
     channels = [g for g in whole if g.direction is None]
     parts = [
         figure(
-            plots.overview(_small(image), image.size, first),
+            draw_overview(_small(image), image.size, first),
             f"Edges in {image.name}",
             "Measured edges, coloured by the frequency at which their modulation has fallen to a half.",
         ),
         figure(
-            plots.curves(directions, image.total, first),
+            draw_curves(directions, image.total, first),
             "Modulation transfer",
             "Means of the edges with two standard deviations, single edges in grey. x: brightness changes along the "
             "rows; y: along the columns. Beyond the Nyquist frequency the image holds aliasing, not detail.",
         ),
         figure(
-            plots.profiles(_best(first)),
+            draw_profiles(_best(first)),
             "Spread functions",
             "The edge with the smallest interval in each direction. Points: means of the pixels; band: 95 % interval.",
         ),
     ]
     if len(channels) > 1:
         caption = "Means of each channel over all directions, with two standard deviations."
-        parts.insert(2, figure(plots.curves(channels, image.total), "Channels", caption))
+        parts.insert(2, figure(draw_curves(channels, image.total), "Channels", caption))
     cells_of = image.cells_of(channel)
     if cells_of:
         caption = "MTF50 by position in the image, half of its 95 % interval, and the number of edges."
-        parts.append(figure(plots.field(cells_of, image.grid), "Sharpness over the field", caption))
+        parts.append(figure(draw_field(cells_of, image.grid), "Sharpness over the field", caption))
     return parts
 
 
@@ -180,141 +191,136 @@ _SINGLE = 80
 _NORMAL_95 = 1.96
 
 
-@dataclass(frozen=True, eq=False)
-class MtfPlots:
-    """Draws edges, their profiles and curves, and the field."""
+@styled
+def draw_overview(small: NDArray[np.uint8], size: tuple[int, int], edges: Sequence[MeasuredEdge]) -> bytes:
+    """The image with its edges, coloured by their MTF50.
 
-    mpl: Any
+    Parameters
+    ----------
+    small : array
+        A small copy of the image, (rows, columns).
+    size : tuple of int
+        Width and height of the image, pixels.
+    edges : sequence of MeasuredEdge
+    """
+    width, height = size
+    # Beside the picture are its axis and the colours.
+    tall = float(np.clip((_WIDTH - 1.4) * height / width, 1.4, 9.0))
+    fig, axes = axes_of(_WIDTH, tall + 0.6)
+    box = (-0.5, width - 0.5, height - 0.5, -0.5)
+    axes.imshow(small, cmap="gray", vmin=-60, vmax=300, extent=box, interpolation="antialiased")
+    values = np.array([e.measured.mtf50 for e in edges])
+    known = np.isfinite(values)
+    low, high = (float(np.quantile(values[known], q)) for q in (0.05, 0.95)) if known.any() else (0.0, 0.5)
+    lines = mpl.collections.LineCollection(
+        [e.ends for e in edges], cmap="plasma", linewidths=2.4, capstyle="round", zorder=3
+    )
+    lines.set_array(np.where(known, values, low))
+    lines.set_clim(low, high if high > low else low + 0.01)
+    axes.add_collection(lines)
+    fig.colorbar(lines, ax=axes, label="MTF50, cycles per pixel", shrink=0.8, pad=0.01)
+    axes.set(xlim=box[:2], ylim=box[2:], xlabel="column px", ylabel="row px")
+    axes.set_aspect("equal")
+    axes.grid(False)
+    return png(fig)
 
-    def overview(self, small: NDArray[np.uint8], size: tuple[int, int], edges: Sequence[MeasuredEdge]) -> bytes:
-        """The image with its edges, coloured by their MTF50.
 
-        Parameters
-        ----------
-        small : array
-            A small copy of the image, (rows, columns).
-        size : tuple of int
-            Width and height of the image, pixels.
-        edges : sequence of MeasuredEdge
-        """
-        width, height = size
-        with self.mpl.rc_context(STYLE):
-            # Beside the picture are its axis and the colours.
-            tall = float(np.clip((_WIDTH - 1.4) * height / width, 1.4, 9.0))
-            fig, axes = axes_of(self.mpl, _WIDTH, tall + 0.6)
-            box = (-0.5, width - 0.5, height - 0.5, -0.5)
-            axes.imshow(small, cmap="gray", vmin=-60, vmax=300, extent=box, interpolation="antialiased")
-            values = np.array([e.measured.mtf50 for e in edges])
-            known = np.isfinite(values)
-            low, high = (float(np.quantile(values[known], q)) for q in (0.05, 0.95)) if known.any() else (0.0, 0.5)
-            lines = self.mpl.collections.LineCollection(
-                [e.ends for e in edges], cmap="plasma", linewidths=2.4, capstyle="round", zorder=3
-            )
-            lines.set_array(np.where(known, values, low))
-            lines.set_clim(low, high if high > low else low + 0.01)
-            axes.add_collection(lines)
-            fig.colorbar(lines, ax=axes, label="MTF50, cycles per pixel", shrink=0.8, pad=0.01)
-            axes.set(xlim=box[:2], ylim=box[2:], xlabel="column px", ylabel="row px")
-            axes.set_aspect("equal")
-            axes.grid(False)
-            return png(fig)
+@styled
+def draw_profiles(edges: Sequence[MeasuredEdge]) -> bytes:
+    """Edge and line spread function of some edges, with 95 % intervals and the pixels' means."""
+    fig = figure_of(_WIDTH, 2.5 * len(edges))
+    for row, edge in zip(fig.subplots(len(edges), 2, squeeze=False), edges):
+        m, title = edge.measured, f"{edge.direction}, edge {edge.number}"
+        for axes, spread, name in zip(row, (m.esf, m.lsf), ("edge", "line")):
+            at, value, reach = spread.positions, spread.values, _NORMAL_95 * spread.sigma
+            axes.fill_between(at, value - reach, value + reach, color=SKY, alpha=0.45, linewidth=0)
+            axes.plot(at, value, color=BLUE, linewidth=1.3)
+            axes.set(xlabel="distance from the edge px", title=f"{title}: {name} spread function")
+        row[0].plot(m.samples.positions, m.samples.values, ".", color=INK, markersize=2.5, zorder=3)
+        near = 1.1 * _extent(m.lsf.positions, m.lsf.values)
+        for axes in row:
+            axes.set_xlim(-near, near)
+    return png(fig)
 
-    def profiles(self, edges: Sequence[MeasuredEdge]) -> bytes:
-        """Edge and line spread function of some edges, with 95 % intervals and the pixels' means."""
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 2.5 * len(edges)), layout="constrained")
-            for row, edge in zip(fig.subplots(len(edges), 2, squeeze=False), edges):
-                m, title = edge.measured, f"{edge.direction}, edge {edge.number}"
-                for axes, spread, name in zip(row, (m.esf, m.lsf), ("edge", "line")):
-                    at, value, reach = spread.positions, spread.values, _NORMAL_95 * spread.sigma
-                    axes.fill_between(at, value - reach, value + reach, color=SKY, alpha=0.45, linewidth=0)
-                    axes.plot(at, value, color=BLUE, linewidth=1.3)
-                    axes.set(xlabel="distance from the edge px", title=f"{title}: {name} spread function")
-                row[0].plot(m.samples.positions, m.samples.values, ".", color=INK, markersize=2.5, zorder=3)
-                near = 1.1 * _extent(m.lsf.positions, m.lsf.values)
-                for axes in row:
-                    axes.set_xlim(-near, near)
-            return png(fig)
 
-    def curves(self, means: Sequence[EdgeGroup], total: EdgeGroup, edges: Sequence[MeasuredEdge] = ()) -> bytes:
-        """Mean MTF curves with two standard deviations, beside the Gaussian and laboratory values of `total`.
+@styled
+def draw_curves(means: Sequence[EdgeGroup], total: EdgeGroup, edges: Sequence[MeasuredEdge] = ()) -> bytes:
+    """Mean MTF curves with two standard deviations, beside the Gaussian and laboratory values of `total`.
 
-        Of `edges`, those of the directions are drawn behind.
-        """
-        with self.mpl.rc_context(STYLE):
-            fig, axes = axes_of(self.mpl, _WIDTH, 3.9)
-            for mean in means:
-                own = [e.measured.mtf for e in edges if mean.direction in (None, e.direction)]
-                for mtf in own[:_SINGLE]:
-                    axes.plot(mtf.frequency, mtf.modulation, color="#c9d2d8", linewidth=0.5, zorder=1)
-            for mean, colour in zip(means, _COLOURS):
-                curve = mean.curve
-                sigma = 0.0 if curve.sigma is None else np.nan_to_num(curve.sigma)
-                low, high = curve.modulation - 2 * sigma, curve.modulation + 2 * sigma
-                axes.fill_between(curve.frequency, low, high, color=colour, alpha=0.22, linewidth=0, zorder=2)
-                axes.plot(curve.frequency, curve.modulation, color=colour, linewidth=1.6, label=_label(mean), zorder=3)
-            frequency = np.linspace(0.0, float(total.curve.frequency[-1]), 200)
-            fwhm = total.gaussian.fwhm
-            gaussian = gaussian_modulation(fwhm, frequency)
-            label = f"Gaussian, FWHM {fwhm:.2f} px"
-            axes.plot(frequency, gaussian, "--", color=INK, linewidth=1.0, label=label, zorder=4)
-            if edges and total.laboratory is not None:
-                lab = total.laboratory
-                axes.plot(lab.frequency, lab.laboratory, "s", color=INK, markersize=5, label="laboratory", zorder=5)
-            axes.axvline(0.5, color=SOFT, linewidth=0.8, linestyle=":")
-            axes.annotate(
-                "Nyquist", (0.5, 1.0), (3, -3), textcoords="offset points", fontsize=7.5, color=SOFT, va="top"
-            )
-            axes.axhline(0.5, color=SOFT, linewidth=0.6, linestyle=":")
-            top = max(1.05, *(float(np.nanmax(m.curve.modulation)) for m in means)) + 0.03
-            axes.set(xlim=(0, max(0.6, *(float(m.curve.frequency[-1]) for m in means))), ylim=(0, top))
-            axes.set(xlabel="frequency, cycles per pixel", ylabel="modulation transfer")
-            axes.legend(loc="upper right", fontsize=8)
-            return png(fig)
+    Of `edges`, those of the directions are drawn behind.
+    """
+    fig, axes = axes_of(_WIDTH, 3.9)
+    for mean in means:
+        own = [e.measured.mtf for e in edges if mean.direction in (None, e.direction)]
+        for mtf in own[:_SINGLE]:
+            axes.plot(mtf.frequency, mtf.modulation, color="#c9d2d8", linewidth=0.5, zorder=1)
+    for mean, colour in zip(means, _COLOURS):
+        curve = mean.curve
+        sigma = 0.0 if curve.sigma is None else np.nan_to_num(curve.sigma)
+        low, high = curve.modulation - 2 * sigma, curve.modulation + 2 * sigma
+        axes.fill_between(curve.frequency, low, high, color=colour, alpha=0.22, linewidth=0, zorder=2)
+        axes.plot(curve.frequency, curve.modulation, color=colour, linewidth=1.6, label=_label(mean), zorder=3)
+    frequency = np.linspace(0.0, float(total.curve.frequency[-1]), 200)
+    fwhm = total.gaussian.fwhm
+    gaussian = gaussian_modulation(fwhm, frequency)
+    label = f"Gaussian, FWHM {fwhm:.2f} px"
+    axes.plot(frequency, gaussian, "--", color=INK, linewidth=1.0, label=label, zorder=4)
+    if edges and total.laboratory is not None:
+        lab = total.laboratory
+        axes.plot(lab.frequency, lab.laboratory, "s", color=INK, markersize=5, label="laboratory", zorder=5)
+    axes.axvline(0.5, color=SOFT, linewidth=0.8, linestyle=":")
+    axes.annotate("Nyquist", (0.5, 1.0), (3, -3), textcoords="offset points", fontsize=7.5, color=SOFT, va="top")
+    axes.axhline(0.5, color=SOFT, linewidth=0.6, linestyle=":")
+    top = max(1.05, *(float(np.nanmax(m.curve.modulation)) for m in means)) + 0.03
+    axes.set(xlim=(0, max(0.6, *(float(m.curve.frequency[-1]) for m in means))), ylim=(0, top))
+    axes.set(xlabel="frequency, cycles per pixel", ylabel="modulation transfer")
+    axes.legend(loc="upper right", fontsize=8)
+    return png(fig)
 
-    def field(self, groups: Sequence[EdgeGroup], grid: int) -> bytes:
-        """MTF50 in the cells of the field, with half intervals and numbers of edges: of all edges and each direction.
 
-        Parameters
-        ----------
-        groups : sequence of EdgeGroup
-            Of one channel, each with its cell.
-        grid : int
-            Cells in each direction.
-        """
-        known = np.array([g.mtf50.value for g in groups if np.isfinite(g.mtf50.value)])
-        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.5)
-        pad = max(0.02, 0.1 * (high - low))
-        step = _cell_size(groups[0])
-        frame = (-0.5, grid * step[0] - 0.5, grid * step[1] - 0.5, -0.5)
-        maps = [(way, own) for way in (None, "x", "y") if (own := [g for g in groups if g.direction == way])]
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 3.2), layout="constrained")
-            row = fig.subplots(1, len(maps), squeeze=False)[0]
-            shown = None
-            for axes, (way, own) in zip(row, maps):
-                values = np.full((grid, grid), np.nan)
-                for group in own:
-                    values[group.cell] = group.mtf50.value
-                limits = {"vmin": low - pad, "vmax": high + pad}
-                shown = axes.imshow(values, cmap="viridis", aspect="auto", extent=frame, **limits)
-                for group in own if grid <= 6 else ():
-                    assert group.cell is not None
-                    value, (first, last) = group.mtf50.value, group.mtf50.interval
-                    if np.isfinite(value):
-                        more = f"±{(last - first) / 2:.3f}\n" if np.isfinite(last - first) else ""
-                        words = f"{value:.3f}\n{more}n = {group.mtf50.edges}"
-                        colour = INK if value > (low + high) / 2 else "white"
-                        at = [(place + 0.5) * side - 0.5 for place, side in zip(group.cell[::-1], step)]
-                        axes.annotate(words, at, ha="center", va="center", fontsize=7, color=colour)
-                axes.set(xlabel="column, pixels", title=way or "all")
-                axes.xaxis.set_major_locator(self.mpl.ticker.MaxNLocator(4, integer=True))
-                axes.grid(False)
-            row[0].set_ylabel("row, pixels")
-            for axes in row[1:]:
-                axes.set_yticklabels([])
-            fig.colorbar(shown, ax=list(row), label="MTF50, cycles per pixel", shrink=0.85)
-            return png(fig)
+@styled
+def draw_field(groups: Sequence[EdgeGroup], grid: int) -> bytes:
+    """MTF50 in the cells of the field, with half intervals and numbers of edges: of all edges and each direction.
+
+    Parameters
+    ----------
+    groups : sequence of EdgeGroup
+        Of one channel, each with its cell.
+    grid : int
+        Cells in each direction.
+    """
+    known = np.array([g.mtf50.value for g in groups if np.isfinite(g.mtf50.value)])
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.5)
+    pad = max(0.02, 0.1 * (high - low))
+    step = _cell_size(groups[0])
+    frame = (-0.5, grid * step[0] - 0.5, grid * step[1] - 0.5, -0.5)
+    maps = [(way, own) for way in (None, "x", "y") if (own := [g for g in groups if g.direction == way])]
+    fig = figure_of(_WIDTH, 3.2)
+    row = fig.subplots(1, len(maps), squeeze=False)[0]
+    shown = None
+    for axes, (way, own) in zip(row, maps):
+        values = np.full((grid, grid), np.nan)
+        for group in own:
+            values[group.cell] = group.mtf50.value
+        limits = {"vmin": low - pad, "vmax": high + pad}
+        shown = axes.imshow(values, cmap="viridis", aspect="auto", extent=frame, **limits)
+        for group in own if grid <= 6 else ():
+            assert group.cell is not None
+            value, (first, last) = group.mtf50.value, group.mtf50.interval
+            if np.isfinite(value):
+                more = f"±{(last - first) / 2:.3f}\n" if np.isfinite(last - first) else ""
+                words = f"{value:.3f}\n{more}n = {group.mtf50.edges}"
+                colour = INK if value > (low + high) / 2 else "white"
+                at = [(place + 0.5) * side - 0.5 for place, side in zip(group.cell[::-1], step)]
+                axes.annotate(words, at, ha="center", va="center", fontsize=7, color=colour)
+        axes.set(xlabel="column, pixels", title=way or "all")
+        axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(4, integer=True))
+        axes.grid(False)
+    row[0].set_ylabel("row, pixels")
+    for axes in row[1:]:
+        axes.set_yticklabels([])
+    fig.colorbar(shown, ax=list(row), label="MTF50, cycles per pixel", shrink=0.85)
+    return png(fig)
 
 
 def _cell_size(group: EdgeGroup) -> tuple[float, float]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import isfinite
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +16,7 @@ from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.patterns.bar_curve import coltman_mtf
 from photoplan.quality.patterns.siemens import StarMtf
 from photoplan.quality.patterns.usaf import UsafBars, UsafResult
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, axes_of, png
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, axes_of, figure_of, mpl, png, styled
 from photoplan.report.page import cells, figure, page, section, table, text
 
 Array = NDArray[np.float64]
@@ -31,105 +29,100 @@ _LEVELS = (0.8, 0.5, 0.2, 0.1)
 _SIDE = 900
 
 
-@dataclass(frozen=True, eq=False)
-class PatternPlots:
-    """Draws a pattern and its transfer."""
-
-    mpl: Any
-
-    def curves(self, result: PatternResult) -> bytes:
-        """Transfer against frequency, with two standard deviations."""
-        curves = _curves(result)
-        mtf = any(kind == "mtf" for _, kind, _ in curves)
-        with self.mpl.rc_context(STYLE):
-            fig, axes = axes_of(self.mpl, _WIDTH, 3.5)
-            for (name, kind, (frequency, value, sigma)), colour in zip(curves, _COLOURS):
-                dashed = "--" if kind == "contrast" and mtf else "-"
-                axes.plot(frequency, value, dashed, color=colour, linewidth=1.3, label=name)
-                known = np.isfinite(sigma)
-                if frequency.size < 40 or isinstance(result.found, UsafResult):
-                    axes.errorbar(frequency[known], value[known], 2.0 * sigma[known], fmt="o", color=colour,
-                                  markersize=3.2, linewidth=0.9)  # fmt: skip
-                else:
-                    low, high = value - 2.0 * sigma, value + 2.0 * sigma
-                    axes.fill_between(frequency, low, high, color=colour, alpha=0.2, linewidth=0)
-            longest = max([0.5, *(float(f.max()) for _, _, (f, _, _) in curves if f.size)])
-            lowest = min([0.0, *(float(np.nanmin(v)) for _, _, (_, v, _) in curves if v.size)])
-            axes.axvline(0.5, color=SOFT, linewidth=0.8, linestyle=":")
-            axes.set(xlim=(0, longest * 1.02), ylim=(max(lowest, -0.3) - 0.02, 1.12), xlabel="cycles per pixel",
-                     ylabel="modulation transfer" if mtf else "contrast transfer of bars")  # fmt: skip
-            if result.pixel_um is not None and mtf:
-                scale = 1000.0 / result.pixel_um
-                top = axes.secondary_xaxis("top", functions=(lambda f: f * scale, lambda f: f / scale))
-                top.set_xlabel("line pairs per mm")
-            axes.legend(loc="upper right")
-            return png(fig)
-
-    def polar(self, star: StarMtf) -> bytes:
-        """Frequencies at which the modulation falls to some levels, by direction."""
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 4.2), layout="constrained")
-            axes = fig.add_subplot(projection="polar")
-            angles = np.array(list(star.directional))
-            for level, colour in zip(_LEVELS, _COLOURS):
-                reach = np.array([curve.falls_to(level) for curve in star.directional.values()])
-                if not np.isfinite(reach).any():
-                    continue
-                turn = np.deg2rad(np.concatenate([angles, angles + 180.0, angles[:1]]))
-                around = np.concatenate([reach, reach, reach[:1]])
-                axes.plot(turn, around, "o-", color=colour, markersize=3, linewidth=1.2, label=f"modulation {level:g}")
-            # Rows increase downwards: angles grow clockwise, as in the picture.
-            axes.set_theta_direction(-1)
-            axes.set_ylim(bottom=0.0)
-            axes.tick_params(labelsize=8)
-            fig.legend(loc="outside right upper")
-            return png(fig)
-
-    def picture(self, result: PatternResult, light: NDArray[np.float32]) -> bytes:
-        """The light of the pattern's window, thinned, and what was found in it."""
-        rows, columns = light.shape
-        step = _thinning(result.window)
-        marks = _marks(result)
-        with self.mpl.rc_context({**STYLE, "axes.grid": False}):
-            fig, axes = axes_of(self.mpl, _WIDTH, float(np.clip((_WIDTH - 0.5) * rows / columns + 0.5, 1.4, 8.5)))
-            low, high = np.nanquantile(light, [0.005, 0.995])
-            axes.imshow(light, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
-            for wanted, colour, name in ((True, GREEN, "resolved"), (False, RED, "not resolved")):
-                some = [(x / step, y / step, label) for (x, y), label, resolved in marks if resolved == wanted]
-                if some:
-                    axes.plot(*list(zip(*some))[:2], "+", color=colour, markersize=7, label=name)
-                for x, y, label in some:
-                    axes.annotate(label, (x, y), (3, 3), textcoords="offset points", fontsize=6.5, color=colour)
-            for number, part in enumerate(result.parts, 1):
-                place = (part.col - result.window.col) / step - 0.5, (part.row - result.window.row) / step - 0.5
-                side = part.width / step, part.height / step
-                axes.add_patch(self.mpl.patches.Rectangle(place, *side, fill=False, edgecolor=RED))
-                box = {"boxstyle": "square,pad=0.2", "facecolor": RED, "edgecolor": "none"}
-                axes.annotate(str(number), place, (3, -3), textcoords="offset points", va="top", fontsize=8,
-                              color="white", bbox=box)  # fmt: skip
-            axes.set(xlabel="column px", ylabel="row px")
-            if len({resolved for _, _, resolved in marks}) > 1:
-                fig.legend(loc="outside upper right", ncols=2, labelcolor=INK)
-            return png(fig)
+@styled
+def draw_curves(result: PatternResult) -> bytes:
+    """Transfer against frequency, with two standard deviations."""
+    curves = _curves(result)
+    mtf = any(kind == "mtf" for _, kind, _ in curves)
+    fig, axes = axes_of(_WIDTH, 3.5)
+    for (name, kind, (frequency, value, sigma)), colour in zip(curves, _COLOURS):
+        dashed = "--" if kind == "contrast" and mtf else "-"
+        axes.plot(frequency, value, dashed, color=colour, linewidth=1.3, label=name)
+        known = np.isfinite(sigma)
+        if frequency.size < 40 or isinstance(result.found, UsafResult):
+            axes.errorbar(frequency[known], value[known], 2.0 * sigma[known], fmt="o", color=colour,
+                          markersize=3.2, linewidth=0.9)  # fmt: skip
+        else:
+            low, high = value - 2.0 * sigma, value + 2.0 * sigma
+            axes.fill_between(frequency, low, high, color=colour, alpha=0.2, linewidth=0)
+    longest = max([0.5, *(float(f.max()) for _, _, (f, _, _) in curves if f.size)])
+    lowest = min([0.0, *(float(np.nanmin(v)) for _, _, (_, v, _) in curves if v.size)])
+    axes.axvline(0.5, color=SOFT, linewidth=0.8, linestyle=":")
+    axes.set(xlim=(0, longest * 1.02), ylim=(max(lowest, -0.3) - 0.02, 1.12), xlabel="cycles per pixel",
+             ylabel="modulation transfer" if mtf else "contrast transfer of bars")  # fmt: skip
+    if result.pixel_um is not None and mtf:
+        scale = 1000.0 / result.pixel_um
+        top = axes.secondary_xaxis("top", functions=(lambda f: f * scale, lambda f: f / scale))
+        top.set_xlabel("line pairs per mm")
+    axes.legend(loc="upper right")
+    return png(fig)
 
 
-def pattern_page(made: PatternReport, mpl: Any) -> str:
+@styled
+def draw_polar(star: StarMtf) -> bytes:
+    """Frequencies at which the modulation falls to some levels, by direction."""
+    fig = figure_of(_WIDTH, 4.2)
+    axes = fig.add_subplot(projection="polar")
+    angles = np.array(list(star.directional))
+    for level, colour in zip(_LEVELS, _COLOURS):
+        reach = np.array([curve.falls_to(level) for curve in star.directional.values()])
+        if not np.isfinite(reach).any():
+            continue
+        turn = np.deg2rad(np.concatenate([angles, angles + 180.0, angles[:1]]))
+        around = np.concatenate([reach, reach, reach[:1]])
+        axes.plot(turn, around, "o-", color=colour, markersize=3, linewidth=1.2, label=f"modulation {level:g}")
+    # Rows increase downwards: angles grow clockwise, as in the picture.
+    axes.set_theta_direction(-1)
+    axes.set_ylim(bottom=0.0)
+    axes.tick_params(labelsize=8)
+    fig.legend(loc="outside right upper")
+    return png(fig)
+
+
+def draw_picture(result: PatternResult, light: NDArray[np.float32]) -> bytes:
+    """The light of the pattern's window, thinned, and what was found in it."""
+    rows, columns = light.shape
+    step = _thinning(result.window)
+    marks = _marks(result)
+    with mpl.rc_context({**STYLE, "axes.grid": False}):
+        fig, axes = axes_of(_WIDTH, float(np.clip((_WIDTH - 0.5) * rows / columns + 0.5, 1.4, 8.5)))
+        low, high = np.nanquantile(light, [0.005, 0.995])
+        axes.imshow(light, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
+        for wanted, colour, name in ((True, GREEN, "resolved"), (False, RED, "not resolved")):
+            some = [(x / step, y / step, label) for (x, y), label, resolved in marks if resolved == wanted]
+            if some:
+                axes.plot(*list(zip(*some))[:2], "+", color=colour, markersize=7, label=name)
+            for x, y, label in some:
+                axes.annotate(label, (x, y), (3, 3), textcoords="offset points", fontsize=6.5, color=colour)
+        for number, part in enumerate(result.parts, 1):
+            place = (part.col - result.window.col) / step - 0.5, (part.row - result.window.row) / step - 0.5
+            side = part.width / step, part.height / step
+            axes.add_patch(mpl.patches.Rectangle(place, *side, fill=False, edgecolor=RED))
+            box = {"boxstyle": "square,pad=0.2", "facecolor": RED, "edgecolor": "none"}
+            axes.annotate(str(number), place, (3, -3), textcoords="offset points", va="top", fontsize=8,
+                          color="white", bbox=box)  # fmt: skip
+        axes.set(xlabel="column px", ylabel="row px")
+        if len({resolved for _, _, resolved in marks}) > 1:
+            fig.legend(loc="outside upper right", ncols=2, labelcolor=INK)
+        return png(fig)
+
+
+def pattern_page(made: PatternReport) -> str:
     """The report as one HTML document; images are opened again for the pictures."""
-    plots = PatternPlots(mpl)
     parts = []
     for result in (result for image in made.images for result in image.results):
         found = [f"<p>{text(result.lines()[0])}</p>", _table(result)]
         found += [f"<p>{text(note)}</p>" for note in result.notes]
         if any(frequency.size for _, _, (frequency, _, _) in _curves(result)):
             caption = "With two standard deviations; the dotted line is the Nyquist frequency."
-            found.append(figure(plots.curves(result), "Transfer", caption))
+            found.append(figure(draw_curves(result), "Transfer", caption))
         if isinstance(result.found, StarMtf) and result.found.directional:
             caption = "Frequency in cycles per pixel at which the modulation falls to a level, by its direction."
-            found.append(figure(plots.polar(result.found), "Transfer by direction", caption))
+            found.append(figure(draw_polar(result.found), "Transfer by direction", caption))
         # Bars may lie far apart.
         if result.window.size <= MOST_PIXELS:
             light = _light(result, made.linearisation)
-            found.append(figure(plots.picture(result, light), "Pattern", "What was found, marked at its place."))
+            found.append(figure(draw_picture(result, light), "Pattern", "What was found, marked at its place."))
         parts.append(section(result.name, found))
     kind = made.linearisation.describe() if made.images else ""
     return page("Test patterns", f"Modulation and contrast transfer of images; linearisation: {kind}", parts)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isfinite
-from typing import Any
 
 import numpy as np
 
@@ -22,8 +21,16 @@ from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.design import Sharpness
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 from photoplan.report.page import Cell, cells, figure, headline, page, section, table, text
-from photoplan.report.restore.filters import MOST_DRAWN, FilterPlots, frequency_response
-from photoplan.report.restore.plots import AxisPicture, FieldMap, RestorePlots, compare
+from photoplan.report.restore.filters import MOST_DRAWN, draw_kernels, frequency_response
+from photoplan.report.restore.plots import (
+    AxisPicture,
+    FieldMap,
+    compare,
+    draw_details,
+    draw_ends,
+    draw_field,
+    draw_sharpness,
+)
 
 #: Images that get pictures, and parts of the field that are listed.
 _PICTURED = 30
@@ -40,7 +47,7 @@ _AXES = (("x", "rows", (1.0, 0.0)), ("y", "columns", (0.0, 1.0)))
 _BANDS = 6
 
 
-def restore_page(found: FoundFilter, jobs: Sequence[Job], made: RestoreReport, mpl: Any) -> str:
+def restore_page(found: FoundFilter, jobs: Sequence[Job], made: RestoreReport) -> str:
     """The report as one HTML document; images and results are opened again for details.
 
     Raises
@@ -48,11 +55,10 @@ def restore_page(found: FoundFilter, jobs: Sequence[Job], made: RestoreReport, m
     InputError
         An image changed meanwhile and is damaged.
     """
-    plots = RestorePlots(mpl)
     by_path = {job.target: job for job in jobs}
-    parts = [section("The filter", _filter(found, plots))]
+    parts = [section("The filter", _filter(found))]
     for k, image in enumerate(made.images):
-        parts.append(section(image.image, _image(image, by_path[image.path], plots if k < _PICTURED else None)))
+        parts.append(section(image.image, _image(image, by_path[image.path], k < _PICTURED)))
     if made.failed:
         rows = [[Cell(name), Cell(reason)] for name, reason in made.failed.items()]
         parts.append(section("Images without result", [table(("image", "reason"), rows)]))
@@ -60,7 +66,7 @@ def restore_page(found: FoundFilter, jobs: Sequence[Job], made: RestoreReport, m
     return page(f"Restoration: {title}", "Images restored by a filter: where it comes from and what it did", parts)
 
 
-def _filter(found: FoundFilter, plots: RestorePlots) -> list[str]:
+def _filter(found: FoundFilter) -> list[str]:
     used, measured = found.filter, found.measured
     columns, rows = used.margin
     figures = [
@@ -69,19 +75,19 @@ def _filter(found: FoundFilter, plots: RestorePlots) -> list[str]:
     ]
     figures += [] if measured is None else _measured_figures(measured)
     parts = [headline(figures), f"<p>{text(origin(found))}</p>"]
-    parts += [] if measured is None else _measured_parts(measured, plots)
+    parts += [] if measured is None else _measured_parts(measured)
     if measured is None and used.facts:
         parts.append(table(("entry of the filter", "value"), [cells(fact, 2) for fact in plain_facts(used)]))
     caption = "Weights, sections through the middle, and by what factor the filter changes the amplitude of waves."
-    picture = FilterPlots(plots.mpl).draw(used.description or "restoration filter", distinct_kernels(used))
+    picture = draw_kernels(used.description or "restoration filter", distinct_kernels(used))
     parts.append(figure(picture, "Restoration filter", caption))
     for name, maps in field_maps(used, measured):
         caption = "In each part of the field. A dash: too few edges; whole field or other direction stand for it."
-        parts.append(figure(plots.field(maps), f"Over the field, {name}", caption))
+        parts.append(figure(draw_field(maps), f"Over the field, {name}", caption))
     return parts
 
 
-def _measured_parts(measured: MeasuredFilter, plots: RestorePlots) -> list[str]:
+def _measured_parts(measured: MeasuredFilter) -> list[str]:
     """Notes, rules, sharpness and table of the parts of bands and field."""
     drawn = distinct_parts(measured.parts)
     parts = [f"<p><b>Mind:</b> {text(note)}.</p>" for note in measured.notes]
@@ -96,7 +102,7 @@ def _measured_parts(measured: MeasuredFilter, plots: RestorePlots) -> list[str]:
             "columns). Right: modulation transfer, and the curve that is expected after restoration, |MTF × response "
             "of the filter|. An exact inverse restores objects of whole pixels, which lifts the curve above 1."
         )
-        parts.append(figure(plots.sharpness(axis_pictures(part)), f"Sharpness, {part_name(part)}", caption))
+        parts.append(figure(draw_sharpness(axis_pictures(part)), f"Sharpness, {part_name(part)}", caption))
     rows = [row for part in drawn for row in part_rows(part)]
     parts.append(table(_PART_HEAD, [cells(row, 1) for row in rows[:_LISTED]]))
     if any(_STANDS_FOR in row[3] for row in rows[:_LISTED]):
@@ -106,7 +112,7 @@ def _measured_parts(measured: MeasuredFilter, plots: RestorePlots) -> list[str]:
     return parts
 
 
-def _image(image: RestoredImage, job: Job, plots: RestorePlots | None) -> list[str]:
+def _image(image: RestoredImage, job: Job, drawn: bool) -> list[str]:
     size, aligned = job.reader.size, job.reader.step(AlignStep)
     clipped = sum(image.below) + sum(image.above)
     figures = [
@@ -121,15 +127,15 @@ def _image(image: RestoredImage, job: Job, plots: RestorePlots | None) -> list[s
     parts.append(f"<p>{text(f'The result is {image.path.name}; light: {light}.')}</p>")
     if lit is not None:
         parts.append(f"<p>{text(f'Before the filter: {fall_off_line(lit.fall_off)}.')}</p>")
-    if plots is not None:
+    if drawn:
         seen = compare(RasterReader(job.reader.info.path), RasterReader(image.path))
         window = seen.window
         place = f"Columns {window.col} to {window.stop[0] - 1}, rows {window.row} to {window.stop[1] - 1}"
         caption = f"{place}, where contrast is largest. Both have the same scale of grey values."
-        parts.append(figure(plots.details(seen.before, seen.after), f"A detail of {image.image}", caption))
+        parts.append(figure(draw_details(seen.before, seen.after), f"A detail of {image.image}", caption))
         if seen.ends is not None:
             caption = "Grey values near the ends, all bands. The last class holds what was clipped."
-            parts.append(figure(plots.ends(seen.ends), "Ends of the histogram", caption))
+            parts.append(figure(draw_ends(seen.ends), "Ends of the histogram", caption))
     parts.append(table(_BAND_HEAD, [cells(row, 1) for row in _band_rows(image)]))
     if aligned is not None:
         parts.append("<p>Lateral chromatic aberration, corrected before the filter:</p>")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
-from photoplan.report.drawing import BLUE, INK, ORANGE, SOFT, STYLE, png
+from photoplan.report.drawing import BLUE, INK, ORANGE, SOFT, figure_of, mpl, png, styled
 
 Array = NDArray[np.float64]
 
@@ -49,112 +49,110 @@ class FieldMap:
     digits: int
 
 
-@dataclass(frozen=True, eq=False)
-class RestorePlots:
-    """Draws sharpness, maps of the field, details and histograms."""
+@styled
+def draw_sharpness(axes: Sequence[AxisPicture]) -> bytes:
+    """Discrete spread functions as bars, and MTF curves with what they become."""
+    fig = figure_of(_WIDTH, 3.4)
+    left, right = fig.subplots(1, 2, gridspec_kw={"width_ratios": [1.0, 1.25]})
+    _spreads(left, axes)
+    _curves(right, axes)
+    return png(fig)
 
-    mpl: Any
 
-    def sharpness(self, axes: Sequence[AxisPicture]) -> bytes:
-        """Discrete spread functions as bars, and MTF curves with what they become."""
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 3.4), layout="constrained")
-            left, right = fig.subplots(1, 2, gridspec_kw={"width_ratios": [1.0, 1.25]})
-            self._spreads(left, axes)
-            self._curves(right, axes)
-            return png(fig)
+def _spreads(axes: Any, pictures: Sequence[AxisPicture]) -> None:
+    width = 0.8 / len(pictures)
+    top = max(float(picture.spread.max()) for picture in pictures)
+    for number, (picture, colour) in enumerate(zip(pictures, _COLOURS)):
+        side = picture.spread[: _SPREAD + 1]
+        at = np.arange(1 - side.size, side.size) + (number - (len(pictures) - 1) / 2) * width
+        axes.bar(at, np.concatenate([side[:0:-1], side]), width, color=colour, label=picture.label)
+    shares = [
+        f"{name}  " + " / ".join(f"{picture.spread[place]:.3f}" for picture in pictures)
+        for place, name in enumerate(_NAMES[: pictures[0].spread.size])
+    ]
+    # In a corner: beside the bars they would lie over each other.
+    where = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
+    axes.annotate("\n".join(shares), (0.98, 0.97), fontsize=7.5, color=INK, **where)
+    axes.axhline(0.0, color=SOFT, linewidth=0.8)
+    axes.set(xlabel="pixels from the middle", title="spread function: share of the light", ylim=(None, 1.3 * top))
+    axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(integer=True))
+    axes.legend(loc="upper left", fontsize=7.5)
 
-    def _spreads(self, axes: Any, pictures: Sequence[AxisPicture]) -> None:
-        width = 0.8 / len(pictures)
-        top = max(float(picture.spread.max()) for picture in pictures)
-        for number, (picture, colour) in enumerate(zip(pictures, _COLOURS)):
-            side = picture.spread[: _SPREAD + 1]
-            at = np.arange(1 - side.size, side.size) + (number - (len(pictures) - 1) / 2) * width
-            axes.bar(at, np.concatenate([side[:0:-1], side]), width, color=colour, label=picture.label)
-        shares = [
-            f"{name}  " + " / ".join(f"{picture.spread[place]:.3f}" for picture in pictures)
-            for place, name in enumerate(_NAMES[: pictures[0].spread.size])
-        ]
-        # In a corner: beside the bars they would lie over each other.
-        where = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
-        axes.annotate("\n".join(shares), (0.98, 0.97), fontsize=7.5, color=INK, **where)
-        axes.axhline(0.0, color=SOFT, linewidth=0.8)
-        axes.set(xlabel="pixels from the middle", title="spread function: share of the light", ylim=(None, 1.3 * top))
-        axes.xaxis.set_major_locator(self.mpl.ticker.MaxNLocator(integer=True))
-        axes.legend(loc="upper left", fontsize=7.5)
 
-    @staticmethod
-    def _curves(axes: Any, pictures: Sequence[AxisPicture]) -> None:
-        for picture, colour in zip(pictures, _COLOURS):
-            axes.plot(picture.frequency, picture.modulation, color=colour, linewidth=1.4, label=picture.label)
-            label = f"{picture.label}, expected after"
-            axes.plot(picture.frequency, picture.expected, "--", color=colour, linewidth=1.6, label=label)
-        axes.axhline(0.5, color=SOFT, linewidth=0.6, linestyle=":")
-        axes.axhline(1.0, color=SOFT, linewidth=0.6, linestyle=":")
-        top = max(1.0, *(float(np.nanmax(p.expected)) for p in pictures))
-        axes.set(xlim=(0.0, 0.5), ylim=(0.0, top + 0.08), xlabel="frequency, cycles per pixel")
-        axes.set_title("modulation transfer")
-        axes.legend(loc="lower left", fontsize=7.5)
+def _curves(axes: Any, pictures: Sequence[AxisPicture]) -> None:
+    for picture, colour in zip(pictures, _COLOURS):
+        axes.plot(picture.frequency, picture.modulation, color=colour, linewidth=1.4, label=picture.label)
+        label = f"{picture.label}, expected after"
+        axes.plot(picture.frequency, picture.expected, "--", color=colour, linewidth=1.6, label=label)
+    axes.axhline(0.5, color=SOFT, linewidth=0.6, linestyle=":")
+    axes.axhline(1.0, color=SOFT, linewidth=0.6, linestyle=":")
+    top = max(1.0, *(float(np.nanmax(p.expected)) for p in pictures))
+    axes.set(xlim=(0.0, 0.5), ylim=(0.0, top + 0.08), xlabel="frequency, cycles per pixel")
+    axes.set_title("modulation transfer")
+    axes.legend(loc="lower left", fontsize=7.5)
 
-    def field(self, maps: Sequence[FieldMap]) -> bytes:
-        """Values over the field side by side, each with a scale of its own."""
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(3.1 * max(len(maps), 2), 2.7), layout="constrained")
-            for axes, each in zip(fig.subplots(1, len(maps), squeeze=False)[0], maps):
-                known = each.values[np.isfinite(each.values)]
-                low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-                pad = max(0.05 * abs(high), 0.1 * (high - low))
-                shown = axes.imshow(each.values, cmap="viridis", vmin=low - pad, vmax=high + pad, aspect="auto")
-                if max(each.values.shape) <= 8:
-                    for (row, column), value in np.ndenumerate(each.values):
-                        known_here = bool(np.isfinite(value))
-                        words = f"{value:.{each.digits}f}" if known_here else "–"
-                        colour = "white" if known_here and value <= (low + high) / 2 else INK
-                        axes.annotate(words, (column, row), ha="center", va="center", fontsize=8, color=colour)
-                axes.set(xticks=[], yticks=[], title=each.title)
-                axes.grid(False)
-                fig.colorbar(shown, ax=axes, shrink=0.85)
-            return png(fig)
 
-    def details(self, before: NDArray[np.uint8], after: NDArray[np.uint8]) -> bytes:
-        """A detail before and after, enlarged by a whole factor.
+@styled
+def draw_field(maps: Sequence[FieldMap]) -> bytes:
+    """Values over the field side by side, each with a scale of its own."""
+    fig = figure_of(3.1 * max(len(maps), 2), 2.7)
+    for axes, each in zip(fig.subplots(1, len(maps), squeeze=False)[0], maps):
+        known = each.values[np.isfinite(each.values)]
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+        pad = max(0.05 * abs(high), 0.1 * (high - low))
+        shown = axes.imshow(each.values, cmap="viridis", vmin=low - pad, vmax=high + pad, aspect="auto")
+        if max(each.values.shape) <= 8:
+            for (row, column), value in np.ndenumerate(each.values):
+                known_here = bool(np.isfinite(value))
+                words = f"{value:.{each.digits}f}" if known_here else "–"
+                colour = "white" if known_here and value <= (low + high) / 2 else INK
+                axes.annotate(words, (column, row), ha="center", va="center", fontsize=8, color=colour)
+        axes.set(xticks=[], yticks=[], title=each.title)
+        axes.grid(False)
+        fig.colorbar(shown, ax=axes, shrink=0.85)
+    return png(fig)
 
-        Parameters
-        ----------
-        before, after : ndarray, shape (height, width) or (height, width, 3)
-        """
-        height, width = before.shape[:2]
-        factor = max(1, _DETAIL // max(height, width))
-        wide, tall, gap, head = factor * width, factor * height, 48, 68
-        total = 2 * wide + gap, tall + head
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(total[0] / _DPI, total[1] / _DPI))
-            for number, (name, picture) in enumerate((("as it was", before), ("restored", after))):
-                place = number * (wide + gap) / total[0], 0.0, wide / total[0], tall / total[1]
-                axes = fig.add_axes(place)
-                axes.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest", aspect="auto")
-                axes.set_axis_off()
-                axes.set_title(f" {name}", fontsize=9, color=INK)
-            return png(fig, _DPI)
 
-    def ends(self, picture: HistogramEnds) -> bytes:
-        """How many pixels have the darkest and the brightest grey values, before and after."""
-        with self.mpl.rc_context(STYLE):
-            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 2.6), layout="constrained")
-            shares = np.concatenate([*picture.before, *picture.after])
-            low = float(shares[shares > 0].min()) / 2 if (shares > 0).any() else 1e-3
-            panels = fig.subplots(1, 2, sharey=True)
-            for axes, name, edges, was, now in zip(
-                panels, ("dark end", "bright end"), picture.edges, picture.before, picture.after
-            ):
-                axes.stairs(was, edges, baseline=low, fill=True, color="#c4ced5", label="as it was")
-                axes.stairs(now, edges, baseline=low, color=BLUE, linewidth=1.5, label="restored")
-                axes.set(yscale="log", title=name, xlabel="grey value", xlim=(edges[0], edges[-1]))
-                axes.set_ylim(low, max(2.0 * float(shares.max()), 4.0 * low))
-                axes.yaxis.set_major_formatter(self.mpl.ticker.FuncFormatter(lambda value, at: f"{value:g}"))
-            panels[0].set_ylabel("share of the pixels, %")
-            panels[1].legend(fontsize=7.5, loc="upper left")
-            return png(fig)
+@styled
+def draw_details(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> bytes:
+    """A detail before and after, enlarged by a whole factor.
+
+    Parameters
+    ----------
+    before, after : ndarray, shape (height, width) or (height, width, 3)
+    """
+    height, width = before.shape[:2]
+    factor = max(1, _DETAIL // max(height, width))
+    wide, tall, gap, head = factor * width, factor * height, 48, 68
+    total = 2 * wide + gap, tall + head
+    fig = mpl.figure.Figure(figsize=(total[0] / _DPI, total[1] / _DPI))
+    for number, (name, picture) in enumerate((("as it was", before), ("restored", after))):
+        place = number * (wide + gap) / total[0], 0.0, wide / total[0], tall / total[1]
+        axes = fig.add_axes(place)
+        axes.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest", aspect="auto")
+        axes.set_axis_off()
+        axes.set_title(f" {name}", fontsize=9, color=INK)
+    return png(fig, _DPI)
+
+
+@styled
+def draw_ends(picture: HistogramEnds) -> bytes:
+    """How many pixels have the darkest and the brightest grey values, before and after."""
+    fig = figure_of(_WIDTH, 2.6)
+    shares = np.concatenate([*picture.before, *picture.after])
+    low = float(shares[shares > 0].min()) / 2 if (shares > 0).any() else 1e-3
+    panels = fig.subplots(1, 2, sharey=True)
+    for axes, name, edges, was, now in zip(
+        panels, ("dark end", "bright end"), picture.edges, picture.before, picture.after
+    ):
+        axes.stairs(was, edges, baseline=low, fill=True, color="#c4ced5", label="as it was")
+        axes.stairs(now, edges, baseline=low, color=BLUE, linewidth=1.5, label="restored")
+        axes.set(yscale="log", title=name, xlabel="grey value", xlim=(edges[0], edges[-1]))
+        axes.set_ylim(low, max(2.0 * float(shares.max()), 4.0 * low))
+        axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, at: f"{value:g}"))
+    panels[0].set_ylabel("share of the pixels, %")
+    panels[1].legend(fontsize=7.5, loc="upper left")
+    return png(fig)
 
 
 #: Side of a detail, pixels; and places in each direction at which details are looked at.
