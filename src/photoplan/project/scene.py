@@ -57,7 +57,8 @@ class SceneAddress:
         camera: dict[str, Any] = next(iter(project.pop("cameras").values()), {})
         restored = image.pop("restore", None) or camera.get("restore")
         camera.pop("restore", None)
-        for name in ("name", "file", "balance", "camera", "rpc", "sigma_center", "sigma_angles", "correlation"):
+        for name in ("name", "file", "balance", "camera", "rpc", "sigma_center", "sigma_angles", "correlation",
+                     "covariance", "correction", "mount"):  # fmt: skip
             image.pop(name, None)
         ground = (project["terrain"], *project.get("objects", ()))
         idle = [(part, name) for part in ground for name in ("file", "sigma")]

@@ -10,11 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import CentralCamera, project
+from photoplan.cameras.base import CentralCamera, Projection, Rays, project
 from photoplan.cameras.build import oriented_camera
 from photoplan.engine.steps import Steps, Store
 from photoplan.errors import InputError
@@ -51,6 +52,15 @@ _SEARCH = 0.15
 _FRAME = 0.02
 
 
+class Placing(Projection, Rays, Protocol):
+    """What tells where an image lies: a central camera, or the map."""
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """From where it looks, (3,), metres."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class TieImage:
     """An image and what is known of it."""
@@ -60,12 +70,14 @@ class TieImage:
     grey: GreyImage
     calibration: Calibration | None
     """None: a scan whose marks are not measured."""
-    camera: CentralCamera | None
+    camera: Placing | None
     """Approximate orientation; None: not oriented, or not to be used."""
     level: float
     """Height of the ground below, metres; NaN: not known."""
     position: NDArray[np.float64] | None
     """Projection centre or antenna (3,), metres; None: not known."""
+    geometry: str = ""
+    """What decides its pixels beside its file."""
 
     @property
     def placed(self) -> bool:
@@ -255,7 +267,10 @@ class FeatureStore:
     _cached: Callable[[int], Features] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        names = tuple(("features", fingerprint(i.path).digest, repr(i.grey.area)) for i in self.images)
+        names = tuple(
+            ("features", fingerprint(i.path).digest, repr(i.grey.area), *([i.geometry] if i.geometry else []))
+            for i in self.images
+        )
         object.__setattr__(self, "names", names)
         read = lru_cache(maxsize=_IN_MEMORY)(lambda k: self.log[self.log.index(names[k])])
         object.__setattr__(self, "_cached", read)

@@ -21,6 +21,7 @@ from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import input_entry, run_times, write_run_record
 from photoplan.matching.features import FeatureSettings, opencv
@@ -41,6 +42,7 @@ from photoplan.products.tie.inputs import (
     like_pairs,
     open_images,
 )
+from photoplan.products.tie.rectified import carried_back, open_rectified
 from photoplan.project.scene import input_files
 
 #: Changes when kept results mean something else.
@@ -157,7 +159,9 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     times, project = run_times(), load_project(request.project)
     names = project.select(request.images or None)
     output = _check(request, project, names)
-    images, notes = open_images(project, names, request.use_orientation)
+    # What frames alone took is matched as it is; anything else is brought onto the map first.
+    on_map = not all(isinstance(project.any_image(name), Image) for name in names)
+    images, notes = (open_rectified if on_map else open_images)(project, names, request.use_orientation)
     factor = _factor(request, images)
     pairs, chosen = chosen_pairs(images, request.pairs)
     if request.dry_run:
@@ -183,6 +187,8 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     if not len(tracks):
         raise GeometryError("no tie point is left after refinement; look at the images, or give `refine=False`")
     points = _points(tracks, names)
+    if on_map:
+        points = carried_back(tracks, images, points)
     with together():
         write_image_points(output, points)
         _enter(request.project, project, output)
