@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
@@ -11,8 +12,12 @@ import pytest
 
 import photoplan
 from photoplan.cameras import corrected, curved, frame, warped
+from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses.fisheye import Fisheye
+from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.io.camera.kinds import Camera
-from photoplan.io.camera.model import CameraEntry
+from photoplan.io.camera.model import BrownLens, CameraEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
 
 ROOT = Path(photoplan.__file__).parent
 #: Classes of the registry.
@@ -66,6 +71,14 @@ def test_a_kind_is_complete(kind: type[CameraEntry]) -> None:
     """It has no abstract part, and a comment for every entry that is written."""
     assert not inspect.isabstract(kind)
     assert set(kind.comments) | {"lens", "restore", "sigma"} == set(kind.model_fields)
+
+
+@pytest.mark.parametrize(
+    ("entry", "lens"), [(BrownLens, Brown), (OpenCVLens, OpenCV), (OpenCVFisheyeLens, Fisheye), (IdealLens, NoLens)]
+)
+def test_a_described_lens_has_the_coefficients_of_the_lens_that_computes(entry: type, lens: type) -> None:
+    own = [name for name in entry.model_fields if name not in ("type", "unit", "y_axis", "meaning")]
+    assert own == [field.name for field in fields(lens)]
 
 
 def test_no_file_is_longer_than_400_lines() -> None:

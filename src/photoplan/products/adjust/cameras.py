@@ -247,11 +247,8 @@ def _lens_entry(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) 
     """The lens as the project file states it; None where its entry stays right."""
     lens = camera.lens
     own = [p for p in found.free if p not in INTERIOR]
-    if own and isinstance(found.lens, Brown):
-        return _brown(found.lens)
-    if own and isinstance(found.lens, OpenCV):
-        values = {key: getattr(found.lens, key) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")}
-        return {"type": "opencv", **{k: v for k, v in values.items() if v}}
+    if own and isinstance(found.lens, Brown | OpenCV):
+        return _stated(found.lens)
     if found.c == start.c:
         return None
     # The lens stays; entries that depend on the camera constant are written for the new one.
@@ -259,7 +256,7 @@ def _lens_entry(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) 
         inner = found.lens.lens if isinstance(found.lens, Reversed) else found.lens
         assert isinstance(inner, Brown)
         meaning = {"meaning": "correction"} if isinstance(found.lens, Reversed) else {}
-        return {**_brown(inner), **meaning}
+        return {**_stated(inner), **meaning}
     if isinstance(lens, RadialTableLens):
         factor = found.c / start.c
         entry: dict[str, Any] = {"type": lens.type, "distortion_um": [v * factor for v in lens.distortion_um]}
@@ -269,6 +266,7 @@ def _lens_entry(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) 
     return None
 
 
-def _brown(lens: Brown) -> dict[str, Any]:
-    values = {field.name: getattr(lens, field.name) for field in dataclasses.fields(lens)}
-    return {"type": "brown", **{k: v for k, v in values.items() if v}}
+def _stated(lens: Brown | OpenCV) -> dict[str, Any]:
+    """A lens by its coefficients; those that are 0 are left out."""
+    values = dataclasses.asdict(lens).items()
+    return {"type": "brown" if isinstance(lens, Brown) else "opencv", **{k: v for k, v in values if v}}

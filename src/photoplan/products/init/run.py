@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from photoplan.geometry.heights import height_label
 from photoplan.io.camera.file import CameraFile, read_cameras
 from photoplan.io.camera.model import CameraEntry, Triple
 from photoplan.io.camera.opensfm import resized
+from photoplan.io.camera.rpc.file import read_rpc, rpc_beside, rpc_in
 from photoplan.io.names import check_input_name, match_key, relative_path
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
@@ -23,6 +24,7 @@ from photoplan.io.project.file import parse_project, write_project
 from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.model import Project, StatedTerrain
 from photoplan.io.project.posed import Image
+from photoplan.io.project.rpc import TAGS, RpcImage
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.products.init.match import (
     Unoriented,
@@ -33,7 +35,6 @@ from photoplan.products.init.match import (
     some,
     unoriented,
 )
-from photoplan.products.init.own_geometry import own_geometry
 from photoplan.products.init.systems import check_joined, height_systems, placed, project_crs, terrain_entry
 from photoplan.products.judged import differences, on_map, stated_positions
 
@@ -44,6 +45,36 @@ LENS_NAMES = {
     "opencv_fisheye": "OpenCV fisheye lens",
     "radial_table": "radial table",
 }
+
+
+@dataclass(frozen=True)
+class OwnGeometry:
+    """An image with rational polynomials."""
+
+    image: RpcImage
+    place: tuple[float, float]
+    """Latitude and longitude in the middle of what the polynomials hold for, degrees."""
+
+
+def own_geometry(files: Iterable[Path], folder: Path) -> dict[Path, OwnGeometry]:
+    """Those of the files that have rational polynomials; tags come before a file beside the image.
+
+    Raises
+    ------
+    InputError
+        Polynomials that there are cannot be used.
+    """
+    found = {}
+    for file in files:
+        rpc, beside = rpc_in(file), None
+        if rpc is None and (beside := rpc_beside(file)) is not None:
+            rpc = read_rpc(beside)
+        if rpc is not None:
+            source = TAGS if beside is None else relative_path(beside, folder)
+            lon, lat, _ = rpc.functions.ground_offset
+            image = RpcImage(name=match_key(file.name), file=relative_path(file, folder), rpc=source)
+            found[file] = OwnGeometry(image, (lat, lon))
+    return found
 
 
 @dataclass(frozen=True)
