@@ -109,8 +109,8 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
 
 def _tell_accuracy(results: list[ProductResult], draw: bool, events: Telling) -> None:
     """Figures of each product's accuracy, and a picture where pictures can be made."""
-    from photoplan.report.accuracy import draw_accuracy
     from photoplan.report.drawing import has_matplotlib
+    from photoplan.report.maps import draw_accuracy
 
     for result in results:
         found = result.accuracy
@@ -125,7 +125,7 @@ def _draw_sources(results: list[ProductResult], events: Telling) -> None:
     """A picture of each mosaic's regions, where pictures can be made."""
     from photoplan.io.polygons import read_features
     from photoplan.report.drawing import has_matplotlib
-    from photoplan.report.mosaic import draw_regions
+    from photoplan.report.maps import draw_regions
 
     for result in results if has_matplotlib() else ():
         regions = seams_path(result.path)

@@ -27,7 +27,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     from photoplan.cli.telling import Telling
     from photoplan.products.seams.run import SeamsRequest, make_seams
     from photoplan.report.drawing import has_matplotlib
-    from photoplan.report.mosaic import draw_regions
+    from photoplan.report.maps import draw_regions
 
     request = SeamsRequest(**options)
     with Telling(quiet) as events:

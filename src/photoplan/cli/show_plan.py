@@ -41,7 +41,7 @@ def show_plan(
 def _draw(plan: OrthoPlan, squares: PlanSquares, picture: Path, how: How, events: Events) -> None:
     """A picture of the squares of a plan's first product, or of all objects where each has its own."""
     from photoplan.report.drawing import has_matplotlib
-    from photoplan.report.quadtree import draw_squares
+    from photoplan.report.maps import draw_squares
 
     if how.quicklook and has_matplotlib():
         # Products of images show the same objects again and again.

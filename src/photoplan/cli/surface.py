@@ -61,7 +61,7 @@ def command(project: Path, **options: Any) -> None:
 def _tell(result: Any, plan: Any, draw: bool, events: Any) -> None:
     """Figures of a surface, and its picture where pictures can be made."""
     from photoplan.report.drawing import has_matplotlib
-    from photoplan.report.surface import draw_surface
+    from photoplan.report.maps import draw_surface
 
     known = {name: value for name, value in result.sigma0.items() if value is not None}
     mean = "unknown" if result.sigma is None else f"{result.sigma:.3g} m ({result.sigma_px:.2g} px of parallax)"
