@@ -9,7 +9,7 @@ import pytest
 
 from photoplan.engine.steps import steps
 from photoplan.errors import InputError, UsageError
-from photoplan.terrain.visibility import Observer, SightSettings, curvature_drop, horizon, needed_heights
+from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights
 
 FLAT_EARTH = SightSettings(curvature=False)
 
@@ -76,9 +76,9 @@ def test_corrections_are_those_of_ecker():
     """Ecker 1991, table 5.1: 0.08, 7.84 and 783.70 m at 1, 10 and 100 km; refraction takes 13 % of it."""
     none = SightSettings(refraction=0.0)
     for s, drop in ((1e3, 0.08), (1e4, 7.84), (1e5, 783.70)):
-        assert curvature_drop(s, none) == pytest.approx(drop, abs=0.005)
-        assert curvature_drop(s, SightSettings()) == pytest.approx(0.87 * drop, abs=0.005)
-    assert curvature_drop(1e5, FLAT_EARTH) == 0 and horizon(2.0, FLAT_EARTH) == math.inf
+        assert s**2 * none.bend == pytest.approx(drop, abs=0.005)
+        assert s**2 * SightSettings().bend == pytest.approx(0.87 * drop, abs=0.005)
+    assert FLAT_EARTH.bend == 0 and horizon(2.0, FLAT_EARTH) == math.inf
 
 
 def test_who_sees_is_seen():

@@ -57,16 +57,11 @@ class SightSettings:
 
     @property
     def bend(self) -> float:
-        """Drop of the ground below the tangent line of sight per squared distance, 1/m."""
+        """Drop of the ground below the tangent line of sight per squared distance, 1/m: (1 − k) / 2R.
+
+        Earth curvature lowers it by s² / 2R (Ecker 1991, eq. 5.6), refraction raises it by k s² / 2R (eq. 5.7).
+        """
         return (1.0 - self.refraction) / (2.0 * self.earth_radius) if self.curvature else 0.0
-
-
-def curvature_drop(distance: NDArray[np.float64] | float, settings: SightSettings) -> NDArray[np.float64]:
-    """By how much ground at a horizontal distance seems to be lower, metres: s² (1 − k) / 2R.
-
-    Earth curvature lowers it by s² / 2R (Ecker 1991, eq. 5.6), refraction raises it by k s² / 2R (eq. 5.7).
-    """
-    return np.asarray(np.square(distance) * settings.bend, float)
 
 
 def horizon(eye_height: float, settings: SightSettings) -> float:
