@@ -79,9 +79,7 @@ def affine_facts(transformation: Affine2D | Bilinear2D) -> AffineFacts:
 
 
 def film_shrinkage(
-    transformation: Affine2D | Bilinear2D,
-    pitch: tuple[float, float],
-    covariance: NDArray[np.float64] | None = None,
+    transformation: Affine2D | Bilinear2D, pitch: tuple[float, float], covariance: NDArray[np.float64] | None = None
 ) -> Shrinkage:
     """Shrinkage of the film since its calibration, if the scanner's sampling distance is known.
 

@@ -46,10 +46,7 @@ class Interior:
 
     @classmethod
     def digital(
-        cls,
-        size: tuple[int, int],
-        focal_px: tuple[float, float],
-        principal_offset_px: tuple[float, float] = (0.0, 0.0),
+        cls, size: tuple[int, int], focal_px: tuple[float, float], principal_offset_px: tuple[float, float] = (0.0, 0.0)
     ) -> Interior:
         """A camera that was calibrated in pixels.
 

@@ -75,7 +75,6 @@ def fit_rpc(camera: Camera, ground: GeodeticGround, heights: tuple[float, float]
     ----------
     camera : Camera
         Over the map of `ground`.
-    ground : GeodeticGround
     heights : (float, float)
         Lowest and highest, in the ground's height system, metres.
 

@@ -145,7 +145,6 @@ def patches_at(image: Grey, corner: NDArray[np.int64], side: int) -> NDArray[np.
 
     Parameters
     ----------
-    image : Grey
     corner : ndarray, shape (n, 2)
         Column and row of the upper-left pixel of each window.
     side : int

@@ -74,11 +74,7 @@ def latin_weights(radius: int, affine: NDArray[np.float64], part: int) -> NDArra
 
 
 def close_loops(
-    tracks: Tracks,
-    reference: NDArray[np.int64],
-    images: Sequence[Grey],
-    settings: RefineSettings,
-    run: Map = map,
+    tracks: Tracks, reference: NDArray[np.int64], images: Sequence[Grey], settings: RefineSettings, run: Map = map
 ) -> Loops:
     """Measure the factor on some of the tracks with three rays or more.
 

@@ -105,7 +105,6 @@ def match_features(a: Features, b: Features, guide: Guide | None = None) -> NDAr
 
     Parameters
     ----------
-    a, b : Features
     guide : Guide, optional
         Features of b are compared only where those of a are expected.
 

@@ -93,7 +93,6 @@ def match_between(
         Column and row in the first image.
     start : pair of ndarrays
         Approximate position in the second image (n, 2), and affine from the first to the second image (n, 2, 2).
-    settings : RefineSettings
     weights : ndarray, shape (n, m, m), optional
         Of the template's pixels; the whole disc if it is None.
     """
@@ -169,7 +168,6 @@ def local_affines(tracks: Tracks, first: NDArray[np.int64], second: NDArray[np.i
 
     Parameters
     ----------
-    tracks : Tracks
     first, second : ndarrays, shape (n,)
         Rows of the two images' points of the same tracks.
     """
@@ -196,9 +194,7 @@ def refine_tracks(
 
     Parameters
     ----------
-    tracks : Tracks
     images : sequence of Grey
-    settings : RefineSettings
     factor : float
         Standard deviations of the fit are multiplied by this, see `photoplan.matching.loops`.
     run : callable

@@ -134,7 +134,6 @@ def thin_tracks(tracks: Tracks, sizes: Sequence[tuple[int, int]], per_image: int
 
     Parameters
     ----------
-    tracks : Tracks
     sizes : sequence of (int, int)
         Width and height of each image.
     per_image : int

@@ -78,7 +78,6 @@ def verify_pair(
         Matched image points of the first and the second image, pixels.
     calibrations : pair
         Interior orientation and lens of each, None where they are not known.
-    settings : VerifySettings
 
     Returns
     -------

@@ -130,12 +130,10 @@ def tile_accuracy(
 
     Parameters
     ----------
-    target : Target
     window : Window
         The tile, in the target's pixels.
     surface : Surface
         What the depth is taken from; it is asked for a pixel more all round, so that slopes do not end at tiles.
-    depth_errors : callable
     sources : mapping
         By row of the product's table of sources.
     owner : ndarray of uint16, shape (height, width), optional

@@ -112,11 +112,7 @@ def _weights(fractions: NDArray[np.float64]) -> NDArray[np.float64]:
 _FROM, _TO = _weights(_START), _weights(_START + _ALONG)
 
 
-def bend_errors(
-    breaks: Breaks,
-    corners: NDArray[np.float64],
-    strict: Positions,
-) -> NDArray[np.float64]:
+def bend_errors(breaks: Breaks, corners: NDArray[np.float64], strict: Positions) -> NDArray[np.float64]:
     """Residual of boxes at the breaks that cross them, pixels.
 
     Parameters
@@ -125,7 +121,6 @@ def bend_errors(
         By positions that the boxes give.
     corners : ndarray, shape (n, 8, 3)
         Homogeneous corners of the boxes.
-    strict : callable
 
     Returns
     -------

@@ -149,7 +149,6 @@ def footprint(camera: Camera, terrain: Terrain, bounds: Bounds | None) -> Footpr
 
     Parameters
     ----------
-    camera : Camera
     terrain : Terrain
         In the CRS of the camera.
     bounds : (float, float, float, float) or None
@@ -306,10 +305,7 @@ def _border(camera: Camera, level: float) -> NDArray[np.float64] | None:
 
 
 def _feet(
-    camera: Camera,
-    xy: NDArray[np.float64],
-    level: float,
-    rays: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+    camera: Camera, xy: NDArray[np.float64], level: float, rays: tuple[NDArray[np.float64], NDArray[np.float64]] | None
 ) -> NDArray[np.float64]:
     """Where rays cross a level, X and Y (n, 2); those that never do, or far away, end far away in their direction."""
     vantage = camera.vantage

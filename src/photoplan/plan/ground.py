@@ -126,11 +126,7 @@ def _between_breaks(target: Target, window: Window) -> NDArray[np.int32]:
 
 
 def _boxes(
-    target: Target,
-    window: Window,
-    rects: NDArray[np.int32],
-    heights: NDArray[np.float64],
-    layers: NDArray[np.int64],
+    target: Target, window: Window, rects: NDArray[np.int32], heights: NDArray[np.float64], layers: NDArray[np.int64]
 ) -> Boxes:
     """Rectangles with their own height range; those without a surface are dropped."""
     there = np.isfinite(heights).all(axis=1)

@@ -110,7 +110,6 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Project
 
     Parameters
     ----------
-    product : ProductPlan
     tile : Tile
         A tile of the product, or a part of one.
     cameras : mapping

@@ -42,10 +42,6 @@ def read_linearisation_table(path: Path) -> NDArray[np.float64]:
     line of words are passed over. One column holds the light of the grey values 0, 1, 2 …, two hold grey value and
     light, three the light in three bands, four the grey value and the light in three bands.
 
-    Parameters
-    ----------
-    path : Path
-
     Returns
     -------
     array

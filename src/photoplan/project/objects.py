@@ -47,9 +47,7 @@ def with_objects(ground: Terrain, files: Sequence[tuple[Path, Objects]], place: 
 
     Parameters
     ----------
-    ground : Terrain
     files : sequence of (path, entry)
-    place : Place
 
     Returns
     -------

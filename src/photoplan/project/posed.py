@@ -74,7 +74,6 @@ def view_of(image: Image, camera: CameraEntry, orientation: Orientation, center:
 
     Parameters
     ----------
-    image : Image
     camera : CameraEntry
         Description of its camera.
     orientation : Orientation

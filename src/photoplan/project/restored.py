@@ -97,8 +97,6 @@ def restored(
 
     Parameters
     ----------
-    source : SteppedReader
-    filter_ : RestorationFilter
     linearisation : Linearisation, optional
         How grey values become light; they are light already if it is None. After a `FallOffStep` it is the same.
     out : dtype, optional

@@ -41,8 +41,6 @@ def source_errors(
 
     Parameters
     ----------
-    project : Project
-    image : Image
     ground : Ground
         The project's.
     projection : Projection

@@ -20,7 +20,6 @@ def carried_positions(
 
     Parameters
     ----------
-    grid : MapGrid
     window : Window
         Pixels of the grid; at least one.
     carry : callable

@@ -27,7 +27,6 @@ def intersect(
 
     Parameters
     ----------
-    camera : Camera
     xy : array_like, shape (n, 2)
         Image points in pixels.
     terrain : Terrain
@@ -55,7 +54,6 @@ def ray_paths(camera: Rays, xy: ArrayLike, height_range: tuple[float, float]) ->
 
     Parameters
     ----------
-    camera : Rays
     xy : array_like, shape (n, 2)
         Image points in pixels.
     height_range : (float, float)

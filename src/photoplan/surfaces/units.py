@@ -35,12 +35,7 @@ class UnitLayout:
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """Outer edges xmin, ymin, xmax, ymax."""
-        return (
-            self.left,
-            self.top - self.rows * self.side,
-            self.left + self.columns * self.side,
-            self.top,
-        )
+        return (self.left, self.top - self.rows * self.side, self.left + self.columns * self.side, self.top)
 
     def corner(self, column: int, row: int) -> tuple[float, float]:
         """X, Y of a unit's upper-left corner."""

@@ -79,11 +79,7 @@ class Brown:
 
     @classmethod
     def from_y_down(
-        cls,
-        *,
-        k: tuple[float, ...] = (),
-        p: tuple[float, float] = (0.0, 0.0),
-        b: tuple[float, float] = (0.0, 0.0),
+        cls, *, k: tuple[float, ...] = (), p: tuple[float, float] = (0.0, 0.0), b: tuple[float, float] = (0.0, 0.0)
     ) -> Brown:
         """From coefficients of the same formula in a system with y down; only p2 and b2 change their sign."""
         k1, k2, k3, k4 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]

@@ -63,10 +63,7 @@ def constrained_faces(xy: NDArray[np.float64], edges: NDArray[np.int64]) -> NDAr
 
 
 def build_faces(
-    unit: Unit,
-    lines: Sequence[LineElement],
-    neighbours: Mapping[Side, Unit] | None = None,
-    domain: Any = None,
+    unit: Unit, lines: Sequence[LineElement], neighbours: Mapping[Side, Unit] | None = None, domain: Any = None
 ) -> MeshFaces | None:
     """Constrained triangulation of the meshes that a bilinear patch cannot describe.
 
@@ -207,7 +204,6 @@ def split_at_walls(
 
     Parameters
     ----------
-    nodes : Nodes
     lines : sequence of LineElement
         Those that the nodes come from.
     corners : ndarray, shape (f, 3)

@@ -25,7 +25,6 @@ def on_grid(line: LineElement, layout: UnitLayout, meshes: NDArray[np.int64]) ->
     ----------
     line : LineElement
         With or without intersections; another grid's may stay.
-    layout : UnitLayout
     meshes : ndarray, shape (rows, columns)
         Meshes along the side of every unit; 0 for empty units, of which only the borders count.
 
