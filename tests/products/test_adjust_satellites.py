@@ -90,6 +90,8 @@ def test_affine_corrections_of_polynomials_are_found_and_used(tmp_path: Path, cu
     Q = np.zeros((6, 6))
     Q[np.tril_indices(6)] = entry["covariance"]
     assert np.abs(np.array(entry["shift"]) - (1.5, -2.25)).max() < 5 * np.sqrt(np.diag(Q)[:2].max())
+    path.write_text(path.read_text() + '\n[terrain]\nheight = 200.0\nheight_system = "ellipsoidal"\n')
+    assert "polynomials are corrected by" in inside("check", path).out
     # Another run begins there and stays there.
     assert inside("adjust", str(path), "--overwrite").code == 0
     again = tomllib.loads(path.read_text())["images"][1]
@@ -146,6 +148,9 @@ def test_boresight_and_clock_of_a_strip_are_found_and_used(tmp_path: Path) -> No
     assert found["boresight x"] == pytest.approx(-0.03, abs=2e-3)
     assert found["boresight z"] == pytest.approx(-0.05, abs=5e-3)
     assert (tmp_path / "adjustment/nadir.correction.toml").exists()
+    path.write_text(path.read_text() + '\n[terrain]\nheight = 100.0\nheight_system = "ellipsoidal"\n')
+    checked = inside("check", path)
+    assert checked.code == 0 and "trajectory is corrected by adjustment/forward.correction.toml" in checked.out
     adjust_project(AdjustRequest(path, overwrite=True))
     assert difference(path, cameras) < 0.1
 
@@ -165,3 +170,17 @@ def test_fault_18_broken_corrections_are_refused_by_name(tmp_path: Path) -> None
     path.write_text(path.read_text().replace('detectors = "nadir"\n', 'detectors = "nadir"\ncorrection = "c.toml"\n'))
     said = inside("adjust", str(path))
     assert said.code == 3 and "c.toml" in said.err and "time_offset_s" in said.err
+
+
+def test_fault_23_points_on_lines_without_orientation_are_named(tmp_path: Path) -> None:
+    path, _ = flown(tmp_path)
+    table = (tmp_path / "flight.csv").read_text().splitlines()
+    # The last third of the record is lost: lines from about 7000 on.
+    (tmp_path / "flight.csv").write_text("\n".join(table[: len(table) * 72 // 100]))
+    rows = (tmp_path / "points.csv").read_text().splitlines()
+    late = [row for row in rows[1:] if float(row.split(",")[3]) > 7900]
+    said = inside("adjust", path, "--dry-run")
+    assert said.code == 0 and late, said.err
+    assert "has no ray" in said.err and "such measurements take no part" in said.err
+    name, image = late[0].split(",")[:2]
+    assert not any(f"gross error: point '{name}' in image '{image}'" in line for line in said.err.splitlines())

@@ -139,12 +139,14 @@ def _of_objects(project: Project, ground: Ground, names: Sequence[str]) -> tuple
 
 def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) -> ImageCheck:
     name, tilt, fault = looked.name, looked.tilt, looked.fault
-    file = project.resolve(project.any_image(name).file)
+    image = project.any_image(name)
+    file = project.resolve(image.file)
     if is_there(file):
         scene = open_scene(project, name)
         camera, notes = scene.camera, scene.notes
     else:
         camera, notes = camera_without_pixels(project, name), (f"{file} is not there: all but its pixels is checked",)
+    notes = (*image.remarks, *notes)
     # Figures are those of the ground, whether a product will show objects or not.
     seen = footprint(camera, ground.bare, ground.bounds)
     nan = float("nan")

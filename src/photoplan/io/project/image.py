@@ -48,6 +48,11 @@ class ImageEntry(Entry, ABC):
         return [] if self.geometry_file is None else [resolve(self.geometry_file)]
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know of its geometry, a clause each."""
+        return ()
+
+    @property
     @abstractmethod
     def described_by(self) -> str | None:
         """Name of the [cameras.NAME] table that it needs; None: it needs none."""

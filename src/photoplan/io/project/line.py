@@ -40,6 +40,11 @@ class LineImage(ImageEntry):
         return [*line_files(resolve(self.line)), *correction]
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """Its correction."""
+        return () if self.correction is None else (f"trajectory is corrected by {self.correction}",)
+
+    @property
     def described_by(self) -> None:
         """It needs no table of cameras."""
         return None

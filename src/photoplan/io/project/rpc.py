@@ -36,6 +36,8 @@ class RpcImage(ImageEntry):
     def _covariance(cls, values: tuple[float, ...] | None) -> tuple[float, ...] | None:
         if values is not None and len(values) not in (3, 21):
             raise ValueError(f"covariance of {len(values)} numbers; 3 of shift, or 21 of shift and drift are needed")
+        if values is not None and min(values[0], values[2]) < 0:
+            raise ValueError("covariance with a variance below 0; it is the lower triangle by rows")
         return values
 
     @property
@@ -47,6 +49,17 @@ class RpcImage(ImageEntry):
     def described_by(self) -> None:
         """It needs no camera."""
         return None
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Its correction."""
+        if self.shift is None:
+            return ()
+        known = "accuracy not stated"
+        if self.covariance is not None:
+            known = f"± {self.covariance[0] ** 0.5:.2g}, {self.covariance[2] ** 0.5:.2g} px"
+        x, y = self.shift
+        return (f"polynomials are corrected by {x:+.2f}, {y:+.2f} px ({known})",)
 
     @property
     def correction(self) -> Affine2D | None:

@@ -116,6 +116,7 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
         raise InputError(f"camera {unused[0]!r} is to be calibrated, but none of the images is of it")
     known = inputs.ground.XYZ[np.isfinite(inputs.ground.XYZ[:, 2]), 2]
     projections = block_projections(project, inputs.projected, frame, float(known.mean()) if len(known) else None)
+    inputs = _sighted(inputs, projections)
     near = _places(inputs, starts, images, cameras)
     _places_by_projections(inputs, projections, frame, near)
     adjustment = project.adjustment
@@ -140,6 +141,25 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
         on_map=on_map(frame),
     )
     return Prepared(inputs, frame, block, near)
+
+
+def _sighted(inputs: AdjustInputs, projections: Sequence[BlockProjection]) -> AdjustInputs:
+    """The inputs without measurements whose rays no geometry knows; the first of them is named."""
+    points, lost = inputs.points, np.zeros(len(inputs.points), bool)
+    for p in projections:
+        mine = np.flatnonzero(points.image == (points.images.index(p.name) if p.name in points.images else -1))
+        lost[mine] = ~np.isfinite(p.sight(points.xy[mine])[1]).all(axis=1)
+    if not lost.any():
+        return inputs
+    k = int(np.flatnonzero(lost)[0])
+    x, y = points.xy[k]
+    note = (
+        f"{points.label(k)}: column {x:g}, row {y:g} has no ray: the line was taken outside of what is known of the "
+        f"flight, or polynomials do not hold there; {lost.sum()} such measurements take no part"
+    )
+    if lost.all():
+        raise InputError(note)
+    return replace(inputs, points=points.where(~lost), notes=(*inputs.notes, note))
 
 
 def _about(inputs: AdjustInputs) -> _Floats:
