@@ -53,7 +53,7 @@ def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: 
     names = {g.name for g in ground}
     tie = np.array([name not in names for name in adjusted.points], bool)
     sigma = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
-    system = project.orientation.height_system
+    system = project.height_system
     residuals = adjusted.residuals[used]
     return AdjustFigures(
         title=title,
