@@ -14,6 +14,7 @@ from draw_idea import draw_idea
 from draw_marks import draw_marks
 from draw_prediction import draw_prediction
 from draw_road import draw_road
+from draw_strip import draw_strip
 from draw_true import draw_true
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -157,6 +158,7 @@ FIGURES = {
     "road-edge": draw_road,
     "marks": draw_marks,
     "true-orthophoto": draw_true,
+    "pyramid-strip": draw_strip,
 }
 
 

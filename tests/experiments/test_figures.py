@@ -17,6 +17,7 @@ mpl = pytest.importorskip("matplotlib")
         ("road-edge", {}),
         ("marks", {}),
         ("true-orthophoto", {"resolution": 2.0}),
+        ("pyramid-strip", {"lines": 500, "columns": 400}),
     ],
 )
 def test_figure(name, sizes, tmp_path):
