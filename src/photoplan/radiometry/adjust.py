@@ -32,9 +32,8 @@ _LEAST_SLOPE = 0.05
 #: What a table that may not fall weighs beside the observations; their least standard deviation, part of the range.
 _HARD, _FLOOR = 1e4, 0.001
 _ROUNDS, _CONVERGED = 30, 1e-3
-#: Parts of the ground that are left out in turn, most turns of the iteration for each, where it ends, and
-#: draws of what was known beforehand.
-_PARTS, _TURNS, _LEFT, _DRAWS = 16, 60, 0.001, 64
+#: Parts of the ground that are left out in turn, and draws of what was known beforehand.
+_PARTS, _DRAWS = 16, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +110,8 @@ def adjust(band: Band, gauge: Gauge) -> Adjusted:
         rising, missing = _rising(band, state, flat)
         hard = _HARD * float(found.N.diagonal().max())
         known = prior.T @ prior + hard * (rising.T @ rising)
-        solved = Solved.of(found.N + known, H, state.width)
+        N = found.N + known
+        solved = Solved.of(N, H)
         step = solved.step(found.g + prior.T @ (wanted - prior @ x) + hard * (rising.T @ missing), held - H @ x)
         state = state.with_vector(x + step)
         state = State(state.tables, state.trends, state.ground + found.alone - found.lost @ step)
@@ -121,7 +121,7 @@ def adjust(band: Band, gauge: Gauge) -> Adjusted:
             break
         flat |= falling
     weights = _weigh(band, state, robust, gauge.fixed is None)
-    variance = _without_parts(band, state, weights, solved) + _of_prior(solved, prior)
+    variance = _without_parts(band, state, weights, solved, N) + _of_prior(solved, prior)
     sigmas = State(state.tables, state.trends, np.full(len(state.ground), np.nan)).with_vector(np.sqrt(variance))
     return Adjusted(state, sigmas, weights.sigma, rounds, float((robust < 0.5).mean()))
 
@@ -218,7 +218,7 @@ def _rising(band: Band, state: State, flat: NDArray[np.bool_]) -> tuple[csr_arra
     return rows, _LEAST_SLOPE * band.step - np.diff(state.tables, axis=1)[image, k]
 
 
-def _without_parts(band: Band, state: State, weights: _Weights, solved: Solved) -> _Floats:
+def _without_parts(band: Band, state: State, weights: _Weights, solved: Solved, N: csr_array) -> _Floats:
     """Variances of the unknowns by what they become without a part of the ground (Quenouille 1956, Tukey 1958).
 
     What lies near each other errs together; so parts are blocks of cells, drawn by lot, where there are enough.
@@ -232,11 +232,7 @@ def _without_parts(band: Band, state: State, weights: _Weights, solved: Solved) 
         rows = np.flatnonzero(of == k)
         some = replace(weights, of=weights.of[rows], ground=weights.ground * (ground == k))
         one = _normals(band.some(rows), state, some)
-        # (N − Nₖ) x = −gₖ by N alone: what is left shrinks with every turn, the slower the more the part had to say.
-        for _ in range(_TURNS):
-            before, moved[k] = moved[k].copy(), solved.step(one.N @ moved[k] - one.g, 0.0)
-            if np.linalg.norm(moved[k] - before) < _LEFT * np.linalg.norm(before):
-                break
+        moved[k] = solved.without(one.N, N, -one.g)
     # What residuals change with the unknowns under robust weights, beside what the weights alone say.
     kept = max(float(np.mean(2 * weights.robust**2 - weights.robust) / np.mean(weights.robust)), 0.2)
     moved /= kept

@@ -130,6 +130,8 @@ def balance(
             found.append(adjust(Band.of(inner, band, sizes[images], powers, nodes), Gauge(parts, place)))
             done()
         raw = [[_tone(nodes, each, k, powers) for each in found] for k in range(len(images))]
+        if place is not None:
+            raw[place] = [Tone(limits, limits)] * cells.bands
     seen = cells.some(np.isin(cells.image, images))
     kept = _kept(seen, images, sizes, raw)
     contrast = tuple(1.0 / kept[:, 1])

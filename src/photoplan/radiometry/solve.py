@@ -1,4 +1,4 @@
-"""Normal equations of many images: banded, since an image shares ground with its neighbours only."""
+"""Normal equations of many images: sparse, since an image shares ground with its neighbours only."""
 
 from __future__ import annotations
 
@@ -6,56 +6,60 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.sparse import csr_array, csr_matrix
-from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse import csc_matrix, csr_array, diags
+from scipy.sparse.linalg import SuperLU, splu
 
 _Floats = NDArray[np.float64]
 
 #: What is added to the diagonal, a part of it: conditions determine what equations leave open.
 _RIDGE = 1e-9
+#: Most turns of an iteration, and the part of a solution that its last one changes.
+_TURNS, _LEFT = 60, 0.001
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
     """Equations N x = g, factored, under conditions H x = held."""
 
-    order: NDArray[np.int64]
-    """Unknowns in the order in which N is banded."""
-    factor: _Floats
-    """Cholesky factor as bands."""
+    factor: SuperLU
     H: _Floats
-    W: _Floats
-    """N⁻¹ Hᵀ."""
+    back: _Floats
+    """What fulfils the conditions if they lack one, N⁻¹ Hᵀ (H N⁻¹ Hᵀ)⁻¹."""
 
     @classmethod
-    def of(cls, N: csr_array, H: _Floats, width: int) -> Solved:
-        """Factor equations whose unknowns come in groups of `width`, one for each image."""
-        entries = N.tocoo()
-        images = N.shape[0] // width
-        at = entries.row // width, entries.col // width
-        joined = csr_matrix((np.ones(entries.nnz), at), shape=(images, images))
-        near = reverse_cuthill_mckee(joined, symmetric_mode=True).astype(np.int64)
-        order = (near[:, None] * width + np.arange(width)).ravel()
-        place = np.empty_like(order)
-        place[order] = np.arange(len(order))
-        row, col = place[entries.row], place[entries.col]
-        lower = row >= col
-        bands = np.zeros((int((row - col).max()) + 1, len(order)))
-        bands[(row - col)[lower], col[lower]] = entries.data[lower]
-        bands[0] *= 1 + _RIDGE
-        factor = cholesky_banded(bands, lower=True, overwrite_ab=True, check_finite=False)
-        found = cls(order, factor, H, np.empty((len(order), 0)))
-        return cls(order, factor, H, found._free(np.ascontiguousarray(H.T))) if len(H) else found
+    def of(cls, N: csr_array, H: _Floats) -> Solved:
+        """Factor equations with a positive definite matrix."""
+        whole = csc_matrix(N + diags(_RIDGE * N.diagonal()))
+        # An order that fills little: a band would be as wide as the block, and its cost an image grow with that.
+        factor = splu(whole, permc_spec="COLAMD", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        if not len(H):
+            return cls(factor, H, H.T)
+        W = factor.solve(np.ascontiguousarray(H.T))
+        return cls(factor, H, np.linalg.solve(H @ W, W.T).T)
 
     def step(self, g: _Floats, missing: _Floats | float) -> _Floats:
         """Solutions for right sides (unknowns,) or (unknowns, k) that fulfil the conditions."""
-        free = self._free(g)
-        if not len(self.H):
-            return free
-        return np.asarray(free + self.W @ np.linalg.solve(self.H @ self.W, missing - self.H @ free))
+        free = self.factor.solve(np.ascontiguousarray(g))
+        return np.asarray(free + self.back @ (missing - self.H @ free)) if len(self.H) else np.asarray(free)
 
-    def _free(self, g: _Floats) -> _Floats:
-        x = np.empty_like(g)
-        x[self.order] = cho_solve_banded((self.factor, True), g[self.order], check_finite=False)
+    def without(self, part: csr_array, whole: csr_array, g: _Floats) -> _Floats:
+        """Solution of (whole − part) x = g under H x = 0, where `whole` are the equations that were factored.
+
+        Conjugate gradients with the factored equations as preconditioner (Gould, Hribar & Nocedal 2001): the more the
+        part had to say, the more turns.
+        """
+        x, left = np.zeros_like(g), g
+        z = self.step(left, 0.0)
+        way, size = z, float(left @ z)
+        for _ in range(_TURNS):
+            pushed = whole @ way - part @ way
+            curve = float(way @ pushed)
+            if not (curve > 0 and size > 0):
+                break
+            x, left = x + size / curve * way, left - size / curve * pushed
+            if size / curve * np.linalg.norm(way) < _LEFT * np.linalg.norm(x):
+                break
+            z = self.step(left, 0.0)
+            before, size = size, float(left @ z)
+            way = z + size / before * way
         return x

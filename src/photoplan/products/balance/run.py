@@ -24,6 +24,7 @@ from photoplan.io.tables import write_table
 from photoplan.plain import pick
 from photoplan.products.balance.reference import Reference, open_reference
 from photoplan.products.balance.sample import Survey, sample, survey
+from photoplan.products.run import refuse_inputs
 from photoplan.project.scene import input_files
 from photoplan.radiometry.balance import Balanced, Pairs, balance, even_images, pairs_of
 from photoplan.radiometry.cells import SIDE, Cells
@@ -216,9 +217,12 @@ def _check(request: BalanceRequest, project: Project, names: Sequence[str]) -> s
     if request.folder.exists() and not request.folder.is_dir():
         raise UsageError(f"{request.folder}: is a file; give the name of a folder")
     if not request.dry_run:
-        for path in (request.table, *(request.folder / f"{safe_stem(name)}.toml" for name in names)):
-            inputs = [request.project, *input_files(project), *([request.reference] if request.reference else [])]
-            check_output(path, inputs, overwrite=request.overwrite)
+        outputs = [request.table, *(request.folder / f"{safe_stem(name)}.toml" for name in names)]
+        refuse_inputs(
+            [request.project, *input_files(project), *([request.reference] if request.reference else [])], outputs
+        )
+        for path in outputs:
+            check_output(path, overwrite=request.overwrite)
     if request.reference_image is None:
         return None
     (fixed, *more) = project.select([request.reference_image])
