@@ -83,3 +83,14 @@ def plain(value: Any, where: str = "value") -> Any:
 def json_text(value: Any, where: str = "value", indent: int | None = 2) -> str:
     """A value as JSON text; see `plain`."""
     return json.dumps(plain(value, where), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def two_figures(size: float, least: int = 3) -> int:
+    """Decimals that show two figures of a size: `least` of them, at most nine; `least` for what is below 1e-9."""
+    size = abs(size)
+    return min(max(least, 1 - math.floor(math.log10(size))), 9) if math.isfinite(size) and size > 1e-9 else least
+
+
+def shown_metres(value: float, size: float) -> str:
+    """A length in metres, to two figures of `size` (its standard deviation, or itself), and to millimetres at least."""
+    return f"{value:.{two_figures(size)}f} m"

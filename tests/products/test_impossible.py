@@ -19,6 +19,8 @@ def made(folder: Path, change: str = "", n: int = 9) -> Path:
     """A vertical image of nine control points, and what is written otherwise."""
     rng = np.random.default_rng(4)
     X = CENTER + np.column_stack([rng.uniform(-500, 500, n), rng.uniform(-350, 350, n), rng.uniform(-1250, -1000, n)])
+    if change == "rough":
+        X = CENTER + np.array([[-450, 300, -1000], [450, 300, -1250], [-450, -300, -1250], [450, -300, -1000]])
     xy = pixels(X, CENTER, rotation_from_angles(np.radians([1.2, -0.8, 12.0]))) + rng.normal(0, 0.4, (n, 2))
     if change == "exchanged":
         X = X[:, [1, 0, 2]]
@@ -26,6 +28,9 @@ def made(folder: Path, change: str = "", n: int = 9) -> Path:
         xy[:, 1] = SIZE[1] - 1 - xy[:, 1]
     elif change == "feet":
         X = X / [1.0, 1.0, 0.3048]
+    elif change in ("depths", "rough"):
+        X = X * [1.0, 1.0, -1.0]
+        xy += rng.normal(0, 3.0 if change == "rough" else 0.0, xy.shape)
     elif change == "names":
         X = X[rng.permutation(n)]
     folder.mkdir(exist_ok=True)
@@ -67,6 +72,7 @@ def test_what_is_right_is_written(tmp_path: Path) -> None:
         ("exchanged", "the camera lies [0-9]+ m below its ground points and looks up", "with X and Y of control exch"),
         ("upwards", "the camera lies [0-9]+ m below its ground points and looks up", "with y of image points upwards"),
         ("feet", "(residuals of [0-9]+ px are|points do not fit)", "with heights of control in feet, 9 of 9 points"),
+        ("depths", ".", "with Z of control counted downwards, or away from the camera, 9 of 9 points"),
     ],
 )
 def test_impossible_poses_are_refused_and_what_fits_is_named(tmp_path: Path, change: str, says: str, fits: str) -> None:
@@ -80,10 +86,16 @@ def test_impossible_poses_are_refused_and_what_fits_is_named(tmp_path: Path, cha
     assert "9 of 9 points fit to 0." in result.failed["a"]
 
 
+def test_a_reading_that_fits_much_better_is_named_whatever_was_stated(tmp_path: Path) -> None:
+    """Four points, measured to some 4 px where 0.5 px are stated."""
+    result = resect_project(ResectRequest(made(tmp_path, "rough", n=4)))
+    assert "with Z of control counted downwards" in result.failed["a"]
+
+
 def test_where_nothing_fits_this_is_said(tmp_path: Path) -> None:
     result = resect_project(ResectRequest(made(tmp_path, "names")))
     assert not result.written
-    print(result.failed)
+    assert "do not determine" in result.failed["a"]
 
 
 def test_a_block_with_exchanged_axes_is_refused(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import click
 
 from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import show, show_json
+from photoplan.plain import shown_metres
 
 if TYPE_CHECKING:
     from photoplan.products.adjust.run import AdjustReport
@@ -89,7 +90,8 @@ def _figures(report: AdjustReport) -> list[str]:
     if f.check is not None:
         c = f.check
         count = max(c.horizontal, c.vertical)
-        lines.append(f"check points: RMSE_H {c.rmse_h:.3f} m, RMSE_V {c.rmse_v:.3f} m, {count} points (ASPRS 2023)")
+        rmse = f"RMSE_H {shown_metres(c.rmse_h, c.rmse_h)}, RMSE_V {shown_metres(c.rmse_v, c.rmse_v)}"
+        lines.append(f"check points: {rmse}, {count} points (ASPRS 2023)")
         lines += [f"  warning: {text}" for text in c.warnings]
     return lines
 

@@ -9,6 +9,7 @@ import click
 
 from photoplan.cli.options import PATH, POSITIVE, ending, images_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
+from photoplan.plain import shown_metres
 
 if TYPE_CHECKING:
     from photoplan.products.resect import ResectedImage, ResectResult
@@ -76,7 +77,7 @@ def _lines(image: ResectedImage) -> list[str]:
     lines = [
         f"{image.image.name}  {used} points · redundancy {found.redundancy} · sigma0 {found.sigma0:.3g} · "
         f"rms {found.rms:.2f} px",
-        "  " + "  ".join(f"{name} {value:.3f} ±{sigma:.3f} m" for name, value, sigma in center),
+        "  " + "  ".join(_with_sigma(*parameter) for parameter in center),
         "  " + "  ".join(f"{name} {value:.{digits}f} ±{sigma:.{digits}f}{sign}" for name, value, sigma in angles),
     ]
     if image.calibrated is not None:
@@ -84,6 +85,10 @@ def _lines(image: ResectedImage) -> list[str]:
         rows = zip(c.parameters, c.after, c.sigma, c.units)
         lines.append("  " + "  ".join(f"{name} {value:.4f} ±{sigma:.4f} {u}" for name, value, sigma, u in rows))
     return lines + [f"  {line}" for line in image.gross_errors]
+
+
+def _with_sigma(name: str, value: float, sigma: float) -> str:
+    return f"{name} {shown_metres(value, sigma).removesuffix(' m')} ±{shown_metres(sigma, sigma)}"
 
 
 def _talk(result: ResectResult) -> None:

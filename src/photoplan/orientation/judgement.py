@@ -27,6 +27,8 @@ _SYSTEMS = 110.0
 _WRONG, _ENOUGH = 0.35, 6
 #: sigma0 against what was stated, together with residuals in pixels, that no one means.
 _SIGMA0, _PIXELS = 20.0, 10.0
+#: sigma0 of a reading that fits, and part of the residuals of the reading as given that it may leave.
+_FITS, _FIFTH = 3.0, 0.2
 #: An international foot, metres.
 FOOT = 0.3048
 
@@ -87,7 +89,7 @@ def of_resection(points: MeasuredPoints, found: Resected, terrain: float = float
     )
 
 
-def fitting(points: MeasuredPoints, height: int, resect: Callable[[MeasuredPoints], Resected]) -> str:
+def fitting(points: MeasuredPoints, height: int, resect: Callable[[MeasuredPoints], Resected], rms: float) -> str:
     """What the measurements of an image, read otherwise, would fit; as a sentence.
 
     Parameters
@@ -98,6 +100,8 @@ def fitting(points: MeasuredPoints, height: int, resect: Callable[[MeasuredPoint
         Of the image, pixels.
     resect : callable
         Orients the image by other points.
+    rms : float
+        Of the residuals as measurements were given, pixels: a reading with a fifth of it fits too, whatever was stated.
     """
     fits = []
     for what, other in other_points(points, height):
@@ -106,12 +110,13 @@ def fitting(points: MeasuredPoints, height: int, resect: Callable[[MeasuredPoint
         except PhotoplanError:
             continue
         few = tried.rejected.sum() <= 0.2 * len(points) and tried.redundancy > 0
-        if few and tried.sigma0 < 3.0 and impossible(of_resection(other, tried)) is None:
+        close = tried.sigma0 < _FITS or tried.rms < _FIFTH * rms
+        if few and close and impossible(of_resection(other, tried)) is None:
             used = int((~tried.rejected).sum())
             fits.append(f"with {what}, {used} of {len(points)} points fit to {tried.rms:.2f} px")
     return "; ".join(fits) or (
-        "no exchange of axes, no other direction of y and no other unit of heights fits either; check the names of "
-        "points, the camera constant and the CRS"
+        "no exchange of axes, no other direction of y or Z and no other unit of heights fits either; check the names "
+        "of points, the camera constant and the CRS"
     )
 
 
@@ -140,5 +145,6 @@ def other_points(points: MeasuredPoints, height: int) -> Iterator[tuple[str, Mea
         ("heights of control in feet", [1.0, 1.0, FOOT]),
         ("heights of control in metres, X and Y in feet", [FOOT, FOOT, 1.0]),
         ("heights of control in millimetres", [1.0, 1.0, 1e-3]),
+        ("Z of control counted downwards, or away from the camera", [1.0, 1.0, -1.0]),
     ):
         yield what, replace(points, XYZ=XYZ * scale)

@@ -310,7 +310,10 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     wrong = impossible(of_resection(working, found, terrain))
     if wrong is not None:
         fits = fitting(
-            working, interior.size[1], lambda other: resected(project, image, other, (interior, lens), settings)
+            working,
+            interior.size[1],
+            lambda other: resected(project, image, other, (interior, lens), settings),
+            found.rms,
         )
         raise GeometryError(f"image {image.name!r}: {wrong}; its orientation is not written: {fits}")
     center = found.pose.center.copy()

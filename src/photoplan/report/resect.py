@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from photoplan.plain import shown_metres
 from photoplan.products.resect import ResectedImage, ResectResult
 from photoplan.report.drawing import BLUE, INK, RED, SOFT, axes_of, png, round_down, shortened, styled
 from photoplan.report.page import Cell, cells, figure, headline, number, page, section, table, text
@@ -110,7 +111,7 @@ def _orientation(image: ResectedImage) -> list[tuple[str, str, str]]:
     """Name, value and standard deviation of each parameter."""
     sign = image.angle_sign
     rows = [
-        (name, f"{value:.3f} m", f"± {sigma:.3f} m")
+        (name, shown_metres(value, sigma), f"± {shown_metres(sigma, sigma)}")
         for name, value, sigma in zip(("X0", "Y0", "Z0"), image.center, image.sigma_center)
     ]
     rows += [

@@ -129,7 +129,8 @@ def agreeing(found: Misclosures, ground: _Mask, critical: float) -> Agreeing:
     """The largest set of control points that agree, with what of the others agrees with it too.
 
     Where less than half of the points agree, or the set fits worse than its standard deviations allow, these are taken
-    as stated too well, not the points as wrong.
+    as stated too well, not the points as wrong. Where another set is as large, nothing tells which holds the wrong
+    point, and all stay.
 
     Parameters
     ----------
@@ -152,6 +153,9 @@ def agreeing(found: Misclosures, ground: _Mask, critical: float) -> Agreeing:
         else:
             break
     best, other = sets[-1] if 2 * sets[-1][0].sum() > len(kept[found.points]) else sets[0]
+    if other.sum() >= best.sum() and not best.all():
+        kept[found.points] = True
+        return Agreeing(kept, tuple(found.points[other].tolist()))
     kept[found.points] = best[:, None]
     # A wrong height does not make the place of a point wrong, nor the other way round.
     for k in np.flatnonzero(~best):

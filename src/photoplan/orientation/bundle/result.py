@@ -249,6 +249,11 @@ def _of_ground(solution: Solution) -> tuple[_Floats, _Floats]:
     residuals[at >= 0] = solution.state.XYZ[at[at >= 0]] - ground.XYZ[at >= 0]
     normalised = np.full((len(ground), 3), np.nan)
     normalised[model.ground, model.ground_axis] = solution.normalised()[model.parts.ground]
+    # What was taken out is judged by how well its rays and its own coordinates are known, be these held fixed.
+    out = solution.weight[model.parts.ground] == 0.0
+    g, axis, p = model.ground[out], model.ground_axis[out], at[model.ground[out]]
+    spread = np.hypot(np.nan_to_num(ground.sigma[g, axis]), np.sqrt(solution.point_cofactors[p, axis, axis]))
+    normalised[g, axis] = residuals[g, axis] / (spread * (solution.sigma0 if solution.sigma0 > 0 else 1.0))
     return residuals, normalised
 
 

@@ -14,7 +14,7 @@ from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.bundle.block import BlockCamera
 from photoplan.orientation.resection.direct import resect_direct
-from photoplan.orientation.start.model import Net, StartModel, free_model, grown, looseness, net_of
+from photoplan.orientation.start.model import FEWEST, Net, StartModel, free_model, grown, looseness, net_of
 from photoplan.orientation.start.similarity import Similarity, robust_similarity
 
 Array = NDArray[np.float64]
@@ -171,9 +171,8 @@ def _result(
         count = len(net.of_image[k])
         why = reasons.get(k)
         if why is None:
-            why = (
-                "no point is measured in it" if count == 0 else f"its {count} points do not connect it to other images"
-            )
+            seen = int(np.isfinite(block.XYZ[net.point[net.of_image[k]], 0]).sum())
+            why = "no point is measured in it" if count == 0 else _apart(count, seen)
         left.append((image.name, why))
     # What is said of models tells more than what is said of single images.
     told = {images[k].name for k in reasons}
@@ -185,4 +184,14 @@ def _result(
         {images[k].name: how[k] for k in sorted(how)},
         points,  # type: ignore[arg-type]
         tuple(left),
+    )
+
+
+def _apart(count: int, known: int) -> str:
+    """Why an image with points has no orientation."""
+    if known < FEWEST:
+        return f"its {count} points do not connect it to other images"
+    return (
+        f"{known} of its {count} points are known from other images, but no orientation makes enough of them fit: "
+        "are camera constant, lens and the names of its points right?"
     )

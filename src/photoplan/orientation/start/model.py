@@ -24,8 +24,9 @@ from photoplan.orientation.start.relative import RelativeOrientation, relate
 
 Array = NDArray[np.float64]
 
-#: Known points that an image needs to be resected, and the part of them that must agree.
-_POINTS = 6
+#: Known points that an image needs to be resected.
+FEWEST = 6
+#: Part of them that must agree.
 _SHARE = 0.4
 #: Images with at least this part of the best image's points are added together.
 _TOGETHER = 0.7
@@ -107,7 +108,7 @@ def grown(net: Net, model: StartModel, images: Iterable[int], loose: float, fixe
         _intersected(net, model, loose, fixed)
         known = np.isfinite(model.XYZ[:, 0])
         counts = {k: int(known[net.point[net.of_image[k]]].sum()) for k in waiting}
-        able = {k: n for k, n in counts.items() if n >= _POINTS and n > refused.get(k, 0)}
+        able = {k: n for k, n in counts.items() if n >= FEWEST and n > refused.get(k, 0)}
         if not able:
             return added
         enough = _TOGETHER * max(able.values())
@@ -183,7 +184,7 @@ def _resected(net: Net, model: StartModel, k: int, loose: float) -> Pose | None:
         found = resect_direct(t, X, _SLACK * sigma)
     except GeometryError:
         return None
-    good = found.inliers.sum() >= max(_POINTS, _SHARE * len(t)) and found.scale <= 5.0 * _SLACK * loose * sigma
+    good = found.inliers.sum() >= max(FEWEST, _SHARE * len(t)) and found.scale <= 5.0 * _SLACK * loose * sigma
     return found.pose if good else None
 
 
@@ -192,7 +193,7 @@ def _polished(net: Net, model: StartModel, k: int, loose: float) -> Pose:
     pose = model.poses[k]
     r = np.linalg.norm(reprojected(pose.R_ground_camera[None], pose.center[None], X)[0] - t, axis=1)
     near = r < 4.0 * _SLACK * loose * sigma
-    return polished_pose(pose, t, X, near) if near.sum() >= _POINTS else pose
+    return polished_pose(pose, t, X, near) if near.sum() >= FEWEST else pose
 
 
 class _NetImage(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -131,5 +132,8 @@ def _hint(result: MapResult) -> str:
     given, described = measured_control(inputs, rows[image.name]), inputs.project.cameras[image.camera]
     camera = interior_of(described, image), lens_of(described)
     return fitting(
-        given, camera[0].size[1], lambda other: resected(inputs.project, image, other, camera, ResectSettings())
+        given,
+        camera[0].size[1],
+        lambda other: resected(inputs.project, image, other, camera, ResectSettings()),
+        math.nan,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -44,7 +44,7 @@ from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
 from photoplan.products.adjust.judged import cause_notes, refuse_cause, refuse_impossible
 from photoplan.products.adjust.projections import geometry_of
 from photoplan.products.adjust.record import block_json
-from photoplan.products.adjust.start import known_poses, started
+from photoplan.products.adjust.start import EarlierResult, known_poses, started
 from photoplan.products.adjust.summary import point_layers, summarise
 from photoplan.project.scene import input_files
 
@@ -152,20 +152,41 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
 
 
 def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events: Events) -> tuple[Prepared, Adjusted]:
-    """The block adjusted from its approximate orientations; if that fails, from control and tie points alone."""
+    """The block adjusted from wherever it can begin, with the images that only its calibration orients."""
 
     def iterated(number: int, rms: float) -> None:
         events.begin(f"iteration {number} · weighted residuals {rms:.4g}")
 
-    def tried(known: bool) -> tuple[Prepared, Adjusted]:
-        prepared = prepare(*started(inputs, known=known), free)
+    def tried(known: bool = True, earlier: EarlierResult | None = None) -> tuple[Prepared, Adjusted]:
+        prepared = prepare(*started(inputs, known=known, earlier=earlier), free)
         events.talk(_used(prepared))
         return adjust_prepared(prepared, settings, partial(adjust_block, progress=iterated))
 
+    prepared, adjusted = _begun(inputs, tried, settings, events)
+    lost = len(inputs.images) - len(adjusted.images)
+    if not (lost and any(camera.free for camera in adjusted.cameras)):
+        return prepared, adjusted
+    # A lens that was not known yet may have kept them out.
+    poses = dict(zip(adjusted.images, map_result(prepared, adjusted).poses))
+    cameras = {
+        c.name: replace(prepared.block.cameras[c.name], c=c.c, principal_point=c.principal_point, lens=c.lens)
+        for c in adjusted.cameras
+    }
+    earlier = EarlierResult(poses, cameras)
+    if len(started(inputs, earlier=earlier)[1]) == len(poses):
+        return prepared, adjusted
+    events.talk(f"starting again with the calibrated cameras, as {lost} images could not be oriented without")
+    return tried(earlier=earlier)
+
+
+def _begun(
+    inputs: AdjustInputs, tried: Callable[[bool], tuple[Prepared, Adjusted]], settings: AdjustSettings, events: Events
+) -> tuple[Prepared, Adjusted]:
+    """The block adjusted from its approximate orientations; if that fails, from control and tie points alone."""
     first: tuple[Prepared, Adjusted] | None = None
     why = "many measurements do not fit them"
     try:
-        first = tried(known=True)
+        first = tried(True)
         few = _used_of(first[1]) < (1.0 - _POOR) * len(inputs.points) or len(first[1].images) < len(inputs.images)
         if not (settings.robust and few and known_poses(inputs)):
             return first
@@ -175,7 +196,7 @@ def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events
         failure, why = error, "from them the adjustment does not converge"
     events.talk(f"{why}: starting again without approximate orientations")
     try:
-        prepared, adjusted = tried(known=False)
+        prepared, adjusted = tried(False)
     except (GeometryError, InputError):
         if first is not None:
             return first

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,10 +36,22 @@ def known_poses(inputs: AdjustInputs) -> dict[str, Pose]:
     return found
 
 
-def started(inputs: AdjustInputs, *, known: bool = True) -> tuple[AdjustInputs, dict[str, Pose]]:
+@dataclass(frozen=True, eq=False)
+class EarlierResult:
+    """What an adjustment found, as the beginning of another."""
+
+    poses: Mapping[str, Pose]
+    """Map poses of the images that took part."""
+    cameras: Mapping[str, BlockCamera]
+    """As they were calibrated."""
+
+
+def started(
+    inputs: AdjustInputs, *, known: bool = True, earlier: EarlierResult | None = None
+) -> tuple[AdjustInputs, dict[str, Pose]]:
     """A map pose for every image; images that cannot be oriented are taken out, with a note that names them.
 
-    Without `known`, orientations that are stated are not used.
+    Without `known`, orientations that are stated are not used; with `earlier`, its poses and cameras are used instead.
 
     Raises
     ------
@@ -48,11 +60,11 @@ def started(inputs: AdjustInputs, *, known: bool = True) -> tuple[AdjustInputs, 
     InputError
         An interior orientation cannot be made (fiducial marks missing), or height systems cannot be joined.
     """
-    poses = known_poses(inputs) if known else {}
+    poses = dict(earlier.poses) if earlier is not None else known_poses(inputs) if known else {}
     _refuse_far(inputs, poses)
     if len(poses) == len(inputs.images):
         return inputs, poses
-    found, reasons = _found(inputs, poses)
+    found, reasons = _found(inputs, poses, {} if earlier is None else earlier.cameras)
     images = tuple(image for image in inputs.images if image.name in found)
     if not images and not inputs.projected:
         why = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:3])
@@ -89,7 +101,9 @@ def _refuse_far(inputs: AdjustInputs, known: Mapping[str, Pose]) -> None:
             )
 
 
-def _found(inputs: AdjustInputs, known: Mapping[str, Pose]) -> tuple[dict[str, Pose], dict[str, str]]:
+def _found(
+    inputs: AdjustInputs, known: Mapping[str, Pose], calibrated: Mapping[str, BlockCamera]
+) -> tuple[dict[str, Pose], dict[str, str]]:
     project, ground = inputs.project, inputs.ground
     places = [ground.XYZ, *(pose.center[None] for pose in known.values())]
     if inputs.positions is not None:
@@ -100,12 +114,13 @@ def _found(inputs: AdjustInputs, known: Mapping[str, Pose]) -> tuple[dict[str, P
             "nothing says where the block is: give control points, observed positions, or center and angles of images"
         )
     frame = block_frame(project, every)
-    cameras: dict[str, BlockCamera] = {}
+    cameras = dict(calibrated)
     images = []
     for image in inputs.images:
         camera = project.cameras[image.camera]
         interior = interior_of(camera, image)
-        cameras.setdefault(image.camera, block_camera(image.camera, camera, interior))
+        if image.camera not in cameras:
+            cameras[image.camera] = block_camera(image.camera, camera, interior)
         pose = frame.pose(known[image.name]) if image.name in known else None
         images.append(StartImage(image.name, image.camera, interior.plane_to_pixel, pose))
     full = ground.where(np.isfinite(ground.XYZ).all(axis=1))

@@ -14,6 +14,7 @@ from photoplan.geometry.rotation import ANGLE_UNITS
 from photoplan.io.geopackage import PointLayer
 from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.orientation.check_points import CheckAccuracy, check_accuracy
+from photoplan.plain import shown_metres
 from photoplan.products.adjust.block import MapResult
 from photoplan.products.adjust.figures import (
     AdjustFigures,
@@ -144,8 +145,13 @@ def _control_out(result: MapResult) -> list[str]:
                 "those that are left; measure more control"
             )
     names = [ground.names[k] for k in np.flatnonzero((adjusted.ground_rejected & known).any(axis=1))]
-    if names and adjusted.other_control:
-        others = some(list(adjusted.other_control))
+    others = some(list(adjusted.other_control))
+    if others and not names:
+        out.append(
+            f"control points contradict each other, and nothing tells which is wrong: {others} agree, and so do as "
+            "many others; all are kept: look at their coordinates, or measure one more"
+        )
+    elif names and others:
         out.append(f"control that does not agree with the rest is taken out: {some(names)}; next best agree {others}")
     place = dict(zip(adjusted.points, result.XYZ))
     for a, b in combinations([name for name in names if name in place], 2):
@@ -304,7 +310,7 @@ def _gross(result: MapResult) -> tuple[NamedMeasurement, ...]:
     for k, axis in zip(*np.nonzero(adjusted.ground_rejected)):
         d = result.ground_residuals[k, axis]
         what = f"control point {inputs.ground.names[k]!r}, {'XYZ'[axis]}"
-        text = f"{d:+.3f} m" if np.isfinite(d) else "too few of its image points are left"
+        text = ("+" if d > 0 else "") + shown_metres(d, d) if np.isfinite(d) else "too few of its image points are left"
         out.append(NamedMeasurement(what, text, float(adjusted.ground_normalised[k, axis]), True))
     if inputs.positions is not None:
         for k in np.flatnonzero(adjusted.position_rejected):

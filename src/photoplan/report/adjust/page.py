@@ -194,7 +194,7 @@ def _check(facts: AdjustFigures, check: CheckAccuracy) -> list[str]:
     rows: list[Row] = []
     for name, k in (("X", 0), ("Y", 1), ("Z", 2)):
         count = check.vertical if k == 2 else check.horizontal
-        rows.append([name, cell(number(count)), cell(plain(check.mean[k], 3, True)), cell(plain(check.rmse[k]))])
+        rows.append([name, cell(number(count)), cell(plain(check.mean[k], None, True)), cell(plain(check.rmse[k]))])
     totals: list[Row] = [
         ["horizontal (RMSE_H)", cell(plain(check.fit_h)), cell(plain(check.survey_h)), cell(plain(check.rmse_h))],
         ["vertical (RMSE_V)", cell(plain(check.fit_v)), cell(plain(check.survey_v)), cell(plain(check.rmse_v))],

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from photoplan.plain import two_figures
 from photoplan.products.adjust.figures import AdjustFigures, Calibrated, GroundFigures, NamedMeasurement
 from photoplan.report.page import Cell, table, text
 
@@ -30,7 +31,7 @@ def ground_table(ground: Sequence[GroundFigures], normalised: bool) -> str:
     rows: list[Row] = []
     for g in ground[:MOST_ROWS]:
         row: Row = [g.name, cell(number(g.rays) if g.rays else "–")]
-        row += [cell(plain(v, 3, True) + ("*" if r else "")) for v, r in zip(g.residual, g.rejected)]
+        row += [cell(plain(v, None, True) + ("*" if r else "")) for v, r in zip(g.residual, g.rejected)]
         row += [cell(plain(v)) for v in g.stated]
         row += [cell(plain(float(v))) for v in np.sqrt(np.diag(g.covariance))]
         if normalised:
@@ -89,7 +90,7 @@ def position_parts(facts: AdjustFigures) -> list[str]:
     rows: list[Row] = []
     for s in facts.strips[:MOST_ROWS]:
         row: Row = [s.name, cell(number(s.count)), cell(number(s.rejected))]
-        row += [cell(plain(v, 3, True)) for v in s.mean] + [cell(plain(v)) for v in s.rms]
+        row += [cell(plain(v, None, True)) for v in s.mean] + [cell(plain(v)) for v in s.rms]
         rows.append(row)
     head = ["strip", "images", "taken out", "mean dX m", "dY", "dZ", "rms dX m", "dY", "dZ"]
     parts = [table(head, rows) + _more(len(facts.strips))]
@@ -97,7 +98,7 @@ def position_parts(facts: AdjustFigures) -> list[str]:
     if shifted:
         drift: list[Row] = [
             [s.name]
-            + [cell(f"{plain(v, 3, True)} ± {plain(e)}") for v, e in zip(s.shift, s.sigma_shift)]
+            + [cell(f"{plain(v, None, True)} ± {plain(e)}") for v, e in zip(s.shift, s.sigma_shift)]
             + [cell(figures(v)) for v in s.rate]
             for s in shifted[:MOST_ROWS]
         ]
@@ -124,7 +125,7 @@ def image_parts(facts: AdjustFigures) -> list[str]:
             cell(number(image.measurements)),
             cell(number(image.rejected) if image.rejected else ""),
         ]
-        row += [cell(plain(v, 3, True)) for v in image.mean]
+        row += [cell(plain(v, None, True)) for v in image.mean]
         row += [cell(plain(v, 2)) for v in (*image.rms, image.worst)]
         row += [cell(plain(v)) for v in image.sigma_center]
         row += [cell(f"{v:.2g}" if np.isfinite(v) else "–") for v in image.sigma_angles]
@@ -200,10 +201,11 @@ def number(value: int) -> str:
     return f"{value:,}".replace(",", "\u202f")
 
 
-def plain(value: float, digits: int = 3, sign: bool = False) -> str:
-    """With a fixed number of digits; a dash where there is no value."""
+def plain(value: float, digits: int | None = None, sign: bool = False) -> str:
+    """With that number of digits, None: millimetres and two figures at least; a dash where there is no value."""
     if not np.isfinite(value):
         return "–"
+    digits = two_figures(value) if digits is None else digits
     return (f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}").replace("-", "−")
 
 
