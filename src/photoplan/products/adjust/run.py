@@ -42,10 +42,11 @@ from photoplan.products.adjust.cameras import Free, camera_entries, parse_calibr
 from photoplan.products.adjust.figures import AdjustFigures
 from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
 from photoplan.products.adjust.judged import cause_notes, refuse_cause, refuse_impossible
+from photoplan.products.adjust.layers import point_layers
 from photoplan.products.adjust.projections import geometry_of
 from photoplan.products.adjust.record import block_json
 from photoplan.products.adjust.start import EarlierResult, known_poses, started
-from photoplan.products.adjust.summary import point_layers, summarise
+from photoplan.products.adjust.summary import summarise
 from photoplan.project.scene import input_files
 
 #: Part of the measurements that take no part, from which on the start is doubted.

@@ -1,4 +1,4 @@
-"""From an adjusted block to its figures and the layers of its points."""
+"""From an adjusted block to its figures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.geometry.rotation import ANGLE_UNITS
-from photoplan.io.geopackage import PointLayer
 from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.orientation.check_points import CheckAccuracy, check_accuracy
 from photoplan.plain import shown_metres
@@ -356,49 +355,3 @@ def _settings(result: MapResult, settings: AdjustSettings, seconds: float) -> tu
         ("correlation of image errors", "regarded" if settings.correlation else "not regarded"),
         ("time", f"{seconds:.1f} s"),
     )
-
-
-def point_layers(result: MapResult, facts: AdjustFigures) -> list[PointLayer]:
-    """Layers of the GeoPackage: adjusted points, projection centres, and residuals of control and check points."""
-    adjusted = result.adjusted
-    role = {g.name: "check" if g.check else "control" for g in facts.ground}
-    sigma = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
-    points = PointLayer(
-        "points",
-        result.XYZ,
-        {
-            "name": np.array(adjusted.points, object),
-            "role": np.array([role.get(name, "tie") for name in adjusted.points], object),
-            "images": np.asarray(adjusted.rays, np.int32),
-            **_xyz("sigma", sigma),
-        },
-    )
-    images = facts.images
-    centers = PointLayer(
-        "projection_centres",
-        np.array([image.center for image in images]).reshape(-1, 3),
-        {
-            "name": np.array([image.name for image in images], object),
-            "strip": np.array([image.strip for image in images], object),
-            "points": np.array([image.measurements for image in images], np.int32),
-            "rms_px": np.array([np.hypot(*image.rms) for image in images]),
-            **_xyz("sigma", np.array([image.sigma_center for image in images]).reshape(-1, 3)),
-        },
-    )
-    shown = [g for g in facts.ground if np.isfinite(g.XYZ).all() and np.isfinite(g.residual).all()]
-    control = PointLayer(
-        "ground_residuals",
-        np.array([g.XYZ for g in shown]).reshape(-1, 3),
-        {
-            "name": np.array([g.name for g in shown], object),
-            "role": np.array([role[g.name] for g in shown], object),
-            **_xyz("residual", np.array([g.residual for g in shown]).reshape(-1, 3)),
-            **_xyz("normalised", np.array([g.normalised for g in shown]).reshape(-1, 3)),
-            "rejected": np.array([any(g.rejected) for g in shown], bool),
-        },
-    )
-    return [points, centers, control]
-
-
-def _xyz(name: str, values: _Floats) -> dict[str, _Floats]:
-    return {f"{name}_{axis}": np.ascontiguousarray(values[:, k], float) for k, axis in enumerate("xyz")}
