@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import errno
+from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from photoplan.radiometry.seams import Shown, _Level, find_seams
+from photoplan.errors import PhotoplanError, ResourceError
+from photoplan.io.scratch import Scratch
+from photoplan.radiometry import seams
+from photoplan.radiometry.seams import Parts, _Level
+from photoplan.radiometry.shown import Memory, Shown, layers_of
+
+
+def find_seams(
+    images: list[Shown], weight: NDArray[np.float32], fixed: NDArray[np.uint16] | None = None, **options: Parts
+) -> tuple[NDArray[np.uint16], float, float]:
+    store = Memory()
+    return seams.find_seams([layers_of(each, store) for each in images], store, weight, fixed, **options)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -19,19 +33,21 @@ def test_an_expansion_is_the_best_of_all_subsets(seed: int) -> None:
     images = [
         Shown(0, 0, random.uniform(0, 100, (1, 3, 3)).astype(np.float32), random.random((3, 3)) < 0.9) for _ in range(3)
     ]
-    level = _Level(images, random.uniform(1, 3, (3, 3)).astype(np.float32), np.zeros((3, 3), np.uint16))
-    flat = level.start().ravel().copy()
+    store, weight = Memory(), random.uniform(1, 3, (3, 3)).astype(np.float32)
+    layers = [layers_of(each, store)[0] for each in images]
+    level = _Level(layers, store, weight, np.zeros((3, 3), np.uint16), Parts())
+    labels, part = level.start().astype(np.int32), level.part((0, 0, 3, 3), 0)
     for image in range(3):
-        free = flat > 0
-        nodes = np.flatnonzero(free & images[image].valid.ravel() & (flat != image + 1))
-        best = level.total(flat)
+        free = labels > 0
+        nodes = np.argwhere(free & images[image].valid & (labels != image + 1))
+        best = part.total(labels)
         for chosen in product([False, True], repeat=len(nodes)):
-            trial = flat.copy()
-            trial[nodes[np.array(chosen, bool)]] = image + 1
-            best = min(best, level.total(trial))
-        level.expand(flat, image, free)
+            trial = labels.copy()
+            trial[tuple(nodes[np.array(chosen, bool)].T)] = image + 1
+            best = min(best, part.total(trial))
+        part.expand(labels, image, free)
         # Costs are counted in steps of a 64th of the usual difference.
-        assert level.total(flat) <= best + level.usual * len(nodes) / 16
+        assert part.total(labels) <= best + level.usual * len(nodes) / 16
 
 
 def ground(height: int = 120, width: int = 200) -> NDArray[np.float32]:
@@ -123,3 +139,49 @@ def test_halved_images_keep_their_place(shift: tuple[int, int]) -> None:
     inner = half.valid[1:-1, 1:-1]
     centre = 2 * (c + half.col) + 0.5 + 100.0 * (2 * (r + half.row) + 0.5)
     np.testing.assert_allclose(half.values[0, 1:-1, 1:-1][inner], centre[1:-1, 1:-1][inner], rtol=1e-5)
+
+
+def test_parts_of_a_map_cost_no_more_than_the_whole() -> None:
+    """Six images with things that moved: cut into 30 parts the sum is within 1 % of that of one part, and less than at
+    the start."""
+    random, size, step = np.random.default_rng(2), (110, 140), (60, 50)
+    whole = ground(step[0] + size[0], 2 * step[1] + size[1])
+    images = []
+    for row, col in product((0, step[0]), (0, step[1], 2 * step[1])):
+        values = whole[:, row : row + size[0], col : col + size[1]] * random.uniform(0.8, 1.2)
+        values = values + random.normal(0, 6, values.shape)
+        for y, x in random.integers(0, 90, (5, 2)):
+            values[:, y : y + 15, x : x + 15] += random.normal(0, 50)
+        images.append(Shown(row, col, values.astype(np.float32), np.ones(size, bool)))
+    weight = np.ones(whole.shape[1:], np.float32)
+    store = Memory()
+    level = _Level([layers_of(each, store)[0] for each in images], store, weight, np.zeros(weight.shape, np.uint16),
+                   Parts())  # fmt: skip
+    one, many = (find_seams(images, weight, parts=each)[0] for each in (Parts(1000), Parts(40, 12)))
+    assert level.total(many) < 1.01 * level.total(one) < 0.9 * level.total(level.start())
+    assert len(Parts(40, 12).of(weight.shape)) == 30 and len(np.unique(many)) > 4
+
+
+def test_arrays_wait_on_the_disk(tmp_path: Path) -> None:
+    """Seams from a file are those from memory; the file has no name, and a full disk is told."""
+    images = two(np.zeros((1, 120, 200), np.float32))
+    with Scratch(tmp_path) as store:
+        layers = [layers_of(each, store) for each in images]
+        found = seams.find_seams(layers, store, np.ones((120, 200), np.float32))[0]
+        assert not list(tmp_path.iterdir())
+        np.testing.assert_array_equal(found, find_seams(images, np.ones((120, 200), np.float32))[0])
+        lost = replace(layers[0][0], at=10**9)
+        with pytest.raises(PhotoplanError, match="cannot be read"):
+            lost.window(store, (0, 0, 10, 10))
+
+
+def test_fault_04_the_disk_is_full_when_seams_keep_what_images_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.pwrite", full)
+    with Scratch(tmp_path) as store, pytest.raises(ResourceError, match="No space left"):
+        layers_of(two(np.zeros((1, 120, 200), np.float32))[0], store)
+    assert not list(tmp_path.iterdir())

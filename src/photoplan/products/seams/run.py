@@ -14,21 +14,27 @@ from scipy import ndimage
 from photoplan.engine.steps import steps
 from photoplan.errors import GeometryError
 from photoplan.events import SILENT, Events
+from photoplan.geometry.grid import Window
+from photoplan.io.disk import make_folder
+from photoplan.io.lock import FileLock, lock_of
 from photoplan.io.polygons import label_polygons
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.regions import read_regions, write_regions
 from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
+from photoplan.io.scratch import Scratch
 from photoplan.products.balance.sample import Survey, survey
-from photoplan.products.orthophoto.look import Looked
 from photoplan.products.orthophoto.shown import shown
 from photoplan.project.scene import input_files
-from photoplan.radiometry.seams import Shown, find_seams
+from photoplan.radiometry.seams import find_seams
+from photoplan.radiometry.shown import Layer, Shown, layers_of
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
 
 #: Ground that stands out by this from what is around it, metres and pixels: houses, trees; and what seams cost there.
 _RAISED, _AROUND, _COSTS = 1.0, 25, 3.0
+#: Side of the parts in which that is looked at; ground where none is known.
+_PART, _ABYSS = 1024, -1e5
 
 
 @dataclass(frozen=True)
@@ -97,68 +103,80 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     notes = tuple(f"left out, sees no terrain: {line}" for line in found.blind)
     if request.dry_run:
         return SeamsReport(found, notes)
-    images = _images(found, request.workers, events)
-    if not sum(each.valid.any() for each in images) > 1:
-        raise GeometryError("fewer than two images show anything of the terrain; there is nothing to join")
     grid = found.grid
     fixed = None if request.keep is None else read_regions(request.keep, found.names, grid).rows(grid.window)
-    events.begin("finding seams", 0, "levels")
-    labels, halfway, best = find_seams(images, _weight(found), fixed, events.done)
-    polygons = label_polygons(labels.astype(np.int32), grid)
-    shapes = {row: _multi(shape) for row, shape in sorted(polygons.items())}
-    write_regions(request.path, found.names, shapes, grid.crs)
-    settings = {"resolution": grid.resolution, "images": list(found.names)}
-    inputs = [input_entry(file) for file in files]
-    key = run_key("seams", settings, inputs)
-    differences = {"halfway": halfway, "found": best}
-    run = {"workers": request.workers, **times()}
-    write_run_record(
-        request.path, product="seams", key=key, inputs=inputs, run=run, settings=settings, differences=differences
-    )
+    make_folder(request.path.parent)
+    with FileLock(lock_of(request.path)), Scratch(request.path.parent) as store:
+        images = _images(found, store, request.workers, events)
+        if not sum(each is not None for each in images) > 1:
+            raise GeometryError("fewer than two images show anything of the terrain; there is nothing to join")
+        events.begin("finding seams", 0, "levels")
+        labels, halfway, best = find_seams([each or () for each in images], store, _weight(found), fixed, events.done)
+        polygons = label_polygons(labels.astype(np.int32), grid)
+        shapes = {row: _multi(shape) for row, shape in sorted(polygons.items())}
+        write_regions(request.path, found.names, shapes, grid.crs)
+        settings = {"resolution": grid.resolution, "images": list(found.names)}
+        inputs = [input_entry(file) for file in files]
+        key = run_key("seams", settings, inputs)
+        differences = {"halfway": halfway, "found": best}
+        run = {"workers": request.workers, **times()}
+        write_run_record(
+            request.path, product="seams", key=key, inputs=inputs, run=run, settings=settings, differences=differences
+        )
     named = {found.names[row - 1]: shape for row, shape in shapes.items()}
     return SeamsReport(found, notes, request.path, named, (halfway, best))
 
 
-def _images(found: Survey, workers: int, events: Events) -> list[Shown]:
-    """What each image shows of the map."""
+def _images(found: Survey, store: Scratch, workers: int, events: Events) -> list[tuple[Layer, ...] | None]:
+    """What each image shows of the map, in a store; None: nothing."""
     events.begin("reading", len(found.looked), "images")
     with steps("seams", workers, events) as run:
-        return list(run(_Reading(found).image, found.looked))
+        return list(run(_Reading(found, store).image, range(len(found.looked))))
 
 
-@dataclass(frozen=True, eq=False)
 class _Reading:
     """From an image to what it shows."""
 
-    survey: Survey
+    def __init__(self, found: Survey, store: Scratch) -> None:
+        self._survey, self._store = found, store
+        self._windows: dict[int, list[Window]] = {}
+        for tile in found.tiles:
+            for row in tile.sources:
+                self._windows.setdefault(row, []).append(tile.window)
 
-    def image(self, one: Looked) -> Shown:
+    def image(self, row: int) -> tuple[Layer, ...] | None:
         """All that it shows, tile by tile, put together."""
-        grid, tiles = self.survey.grid, self.survey.tiles
-        row = self.survey.looked.index(one)
-        mine = [tile.window for tile in tiles if row in tile.sources]
+        one, mine = self._survey.looked[row], self._windows.get(row)
+        if not mine:
+            return None
         left, top = min(w.col for w in mine), min(w.row for w in mine)
         right, bottom = max(w.stop[0] for w in mine), max(w.stop[1] for w in mine)
         values = np.zeros((one.scene.reader.bands, bottom - top, right - left), np.float32)
         valid = np.zeros(values.shape[1:], np.bool_)
         for window in mine:
-            made = shown(one, grid, window, tiles.side)
+            made = shown(one, self._survey.grid, window, self._survey.tiles.side)
             if made.values is not None and made.valid is not None:
                 at = np.s_[window.row - top : window.stop[1] - top, window.col - left : window.stop[0] - left]
                 values[(slice(None), *at)], valid[at] = made.values, made.valid
-        return Shown(top, left, values, valid)
+        if not valid.any():
+            return None
+        rows, cols = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
+        at = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+        return layers_of(Shown(top + int(rows[0]), left + int(cols[0]), values[:, *at], valid[at]), self._store)
 
 
 def _weight(found: Survey) -> NDArray[np.float32]:
     """What seams cost at a place: more on what stands out of the ground, whose parallax no picture hides."""
     grid, surface = found.grid, painted_surface(found.looked[0].scene.surface)
-    relief = np.full((grid.height, grid.width), np.nan, np.float32)
-    for tile in found.tiles:
-        relief[tile.window.slices(grid.window)] = surface.relief(MapTarget(grid), tile.window)
-    known = np.where(np.isnan(relief), np.nanmin(relief), relief)
-    ground = ndimage.grey_opening(known, size=(_AROUND, _AROUND))
-    raised = ndimage.binary_dilation((known - ground > _RAISED) & ~np.isnan(relief))
-    return np.where(raised, np.float32(_COSTS), np.float32(1.0))
+    weight = np.ones((grid.height, grid.width), np.float32)
+    for part in grid.window.tiles(_PART):
+        wide = Window(part.col - _AROUND, part.row - _AROUND, part.width + 2 * _AROUND, part.height + 2 * _AROUND)
+        relief = surface.relief(MapTarget(grid), wide & grid.window)
+        known = np.where(np.isnan(relief), np.float32(_ABYSS), relief)
+        ground = ndimage.grey_opening(known, size=(_AROUND, _AROUND))
+        raised = ndimage.binary_dilation((known - ground > _RAISED) & ~np.isnan(relief))
+        weight[part.slices(grid.window)][raised[part.slices(wide & grid.window)]] = _COSTS
+    return weight
 
 
 def _multi(shape: Any) -> Any:
