@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import rasterio
 from tools.command import Said, inside
-from tools.facet_scene import CONTRAST, GROUND, Scene, write_scene
+from tools.facet_scene import CONTRAST, GROUND, GSD, Scene, write_scene
 from tools.small_block import X0, Y0
 
+CLOUDS = (".las", ".laz", ".ply")
 BOUNDS = (X0 - 18, Y0 - 30, X0 + 18, Y0 + 30)
-KINDS = ("", "_sigma", "_count", "_grey")
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +34,8 @@ class Judged:
     """Pixels of parallax."""
     normalised: np.ndarray
     grey_error: np.ndarray
+    """Against what pixels of the size of the images' see."""
+    grey_normalised: np.ndarray
 
     @property
     def rms(self) -> float:
@@ -54,17 +56,25 @@ def judge(scene: Scene, folder: Path) -> Judged:
     assert (np.isfinite(sigma) == known).all()
     off = (heights - scene.heights(X, Y))[known]
     grey, X, Y = places(folder / "surface_grey.tif")
+    grey_sigma, *_ = places(folder / "surface_grey_sigma.tif")
     seen = np.isfinite(grey)
-    # The images differ by factors: their mean is what the surface has.
-    true = scene.grey(X, Y)[seen]
+    assert (np.isfinite(grey_sigma) == seen).all()
+    # Pixels are means of two by two rays. The images differ by factors: their mean is what the surface has.
+    around = [scene.grey(X + i, Y + j) for i in (-GSD / 4, GSD / 4) for j in (-GSD / 4, GSD / 4)]
+    true = np.mean(around, axis=0)[seen]
     line = np.polyfit(true, grey[seen], 1)
-    return Judged(off / scene.height_of_a_pixel, off / sigma[known], (grey[seen] - np.polyval(line, true)) / line[0])
+    left = grey[seen] - np.polyval(line, true)
+    return Judged(off / scene.height_of_a_pixel, off / sigma[known], left / line[0], left / grey_sigma[seen])
 
 
 @pytest.fixture(scope="module")
 def made(scene: Scene) -> Path:
-    said = surface(scene, "--start", GROUND, "--json")
+    clouds = [word for kind in CLOUDS for word in ("--points", scene.path.parent / f"points{kind}")]
+    report = scene.path.parent / "report.html"
+    said = surface(scene, "--start", GROUND, "--json", "--residuals", *clouds, "--report", report)
     assert said.code == 0, said.err
+    files = [Path(file) for file in json.loads(said.out)["other_files"]]
+    assert len(files) == 9 and all(file.exists() for file in files) and report.exists()
     return scene.path.parent / "products"
 
 
@@ -72,7 +82,8 @@ def test_five_images_of_different_brightness(scene: Scene, made: Path) -> None:
     judged = judge(scene, made)
     assert judged.rms < 0.04 and abs(judged.error.mean()) < 0.01
     assert 0.6 < np.sqrt(np.mean(judged.normalised**2)) < 1.4
-    assert np.sqrt(np.mean(judged.grey_error**2)) < 0.07 * CONTRAST
+    assert np.sqrt(np.mean(judged.grey_error**2)) < 0.02 * CONTRAST
+    assert 0.8 < np.sqrt(np.mean(judged.grey_normalised**2)) < 1.4
     with rasterio.open(made / "surface_count.tif") as file:
         assert file.read(1).max() == 5
     record = json.loads((made / "surface.run.json").read_text())
@@ -81,6 +92,46 @@ def test_five_images_of_different_brightness(scene: Scene, made: Path) -> None:
     assert ((sigma0 > 0.4) & (sigma0 < 0.8)).all()
     assert max(record["product"]["corrections_px"]) < 0.05 and record["product"]["redundancy"] > 1000
     assert (made / "surface.png").exists()
+
+
+def test_residuals_of_a_surface_that_fits(made: Path) -> None:
+    fit, *_ = places(made / "surface_fit.tif")
+    assert 0.9 < np.median(fit) < 1.1 and fit.max() < 1.5
+    with rasterio.open(made / "surface_residuals.tif") as file:
+        assert file.count == 5 and file.descriptions[2] == "standardised residual of i3"
+        pictures = file.read()
+    with rasterio.open(made / "surface_grey.tif") as file:
+        assert pictures.shape[1:] == file.shape
+    spread = np.sqrt(np.nanmean(pictures**2, axis=(1, 2)))
+    # Grey values take a part of the noise of the pixels, one in five.
+    assert ((spread > 0.8) & (spread < 1)).all() and np.abs(np.nanmean(pictures, axis=(1, 2))).max() < 0.02
+
+
+@pytest.mark.parametrize("kind", CLOUDS)
+def test_points_of_a_surface(made: Path, kind: str) -> None:
+    path = made.parent / f"points{kind}"
+    if kind == ".ply":
+        head, _, body = path.read_bytes().partition(b"end_header\n")
+        assert b"element vertex 000000001025\n" in head and b"property float sigma" in head
+        found = np.frombuffer(body, [("xyz", "<f8", 3), ("sigma", "<f4"), ("grey", "<f4")])
+        xyz, sigma, grey = found["xyz"], found["sigma"], found["grey"]
+    else:
+        laspy = pytest.importorskip("laspy")
+        cloud = laspy.read(path)
+        assert cloud.header.parse_crs().to_epsg() == 32633
+        xyz, sigma, grey = np.asarray(cloud.xyz), np.asarray(cloud.sigma), np.asarray(cloud.intensity)
+    heights, X, Y = places(made / "surface.tif")
+    sigmas, *_ = places(made / "surface_sigma.tif")
+    fine, *_ = places(made / "surface_grey.tif")
+    means = fine.reshape(len(heights), 3, -1, 3).mean(axis=(1, 3))
+    for values, there, within in ((xyz[:, 0], X, 1e-3), (xyz[:, 1], Y, 1e-3), (xyz[:, 2], heights, 1e-3),
+                                  (sigma, sigmas, 1e-6), (grey, means, 0.51)):  # fmt: skip
+        assert values == pytest.approx(there.ravel(), abs=within)
+
+
+def test_the_report_of_a_surface(made: Path) -> None:
+    text = (made.parent / "report.html").read_text()
+    assert text.count("<img") == 4 and "100.0%" in text and "<td>i5</td>" in text
 
 
 def test_a_surface_serves_as_terrain(scene: Scene, made: Path) -> None:
@@ -117,6 +168,9 @@ def test_what_cannot_be_is_refused_by_name(scene: Scene, made: Path) -> None:
         (["--reach", -1], 2, "positive number"),
         (["--name", "../x"], 2, "without folder"),
         (["--memory", "300MB"], 2, "needed for one tile"),
+        (["--points", "a.xyz"], 2, ".las, .laz, .ply"),
+        (["--points", "a.ply", "--points", "./a.ply", "--overwrite"], 2, "one file twice"),
+        (["--report", "a.pdf"], 2, "ends in .html"),
     ):
         said = surface(scene, *words)
         assert said.code == code and text in said.err, said.err

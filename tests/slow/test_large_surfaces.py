@@ -39,7 +39,10 @@ def test_heights_and_what_they_claim(
         assert said.code == 0, said.err
         judged = judge(scene, folder / "products")
         assert abs(judged.error.mean()) < 0.005
-        found.append((judged.rms, np.sqrt(np.mean(judged.normalised**2))))
+        squares = (np.mean(values**2) for values in (judged.normalised, judged.grey_normalised))
+        found.append((judged.rms, *np.sqrt([*squares])))
     both = np.sqrt(np.mean(np.square(found), axis=0))
     print(images, snr, finest, both)
     assert both[0] < rms and 0.8 < both[1] < 1.3
+    # Waves of three pixels are more than the facets can follow where there is hardly any noise.
+    assert 0.9 < both[2] < (1.25 if finest == 3 and snr == 50 else 1.1)

@@ -19,6 +19,11 @@ from photoplan.cli.options import PATH, bounds_option, dry_run_option, executing
     "--start", default="terrain", metavar="WHAT", help="terrain (the project's), a height, or a file [terrain]."
 )
 @click.option("--reach", type=float, metavar="M", help="How far the start may be wrong [a tenth of the flying height].")
+@click.option(
+    "--points", type=PATH, multiple=True, metavar="FILE", help="Also as points, .las, .laz or .ply; may be repeated."
+)
+@click.option("--residuals", is_flag=True, help="Also the residuals of every image: NAME_residuals.tif.")
+@click.option("--report", type=PATH, metavar="HTML", help="Accuracy by classes, images and levels, with plots.")
 @click.option("--name", default="surface", metavar="NAME", help="Of the files [surface].")
 @click.option("--output", type=PATH, help="Folder of the files [PROJECT's folder/products].")
 @click.option("--force", is_flag=True, help="Also of orientations with a FAULT.")
@@ -28,7 +33,8 @@ def command(project: Path, **options: Any) -> None:
     """Heights and grey values from all images at once, each with its standard deviation.
 
     NAME.tif has the heights, NAME_sigma.tif their standard deviations, NAME_count.tif the images that see them,
-    NAME_grey.tif the grey values of the surface. The heights serve as [terrain] of a project. The same command
+    NAME_fit.tif the residuals around them, NAME_grey.tif the grey values of the surface, NAME_grey_sigma.tif their
+    standard deviations. The heights serve as [terrain] of a project. The same command
     continues a run that was interrupted.
     """
     from photoplan.cli import running
@@ -37,9 +43,13 @@ def command(project: Path, **options: Any) -> None:
     from photoplan.io.project.file import load_project
     from photoplan.products.surface.plan import SurfaceSettings, plan_surface
     from photoplan.products.surface.run import make_surface
+    from photoplan.report.page import open_report
+    from photoplan.report.surface import surface_page
 
     how = running.How.from_options(options)
     folder, dry_run, images, force = (options.pop(name) for name in ("output", "dry_run", "images", "force"))
+    report = None if dry_run else open_report(options.pop("report"), [], overwrite=how.overwrite, project=project)
+    options.pop("report", None)
     stated = load_project(project)
     with Telling(how.quiet) as events:
         plan = plan_surface(stated, SurfaceSettings(**options), images or None, force=force, events=events)
@@ -50,10 +60,11 @@ def command(project: Path, **options: Any) -> None:
             return
         events.talk(str(plan))
         result = make_surface(plan, folder or stated.folder / "products", how.run(events))
+        told = None if report is None else report.write(surface_page(plan, result))
         if how.as_json:
-            show_json(result)
+            show_json(result, report=told)
         else:
-            for path in (result.path, *result.others):
+            for path in filter(None, (result.path, *result.others, told)):
                 show(path)
         _tell(result, plan, how.quicklook, events)
 
@@ -67,7 +78,7 @@ def _tell(result: Any, plan: Any, draw: bool, events: Any) -> None:
     mean = "unknown" if result.sigma is None else f"{result.sigma:.3g} m ({result.sigma_px:.2g} px of parallax)"
     events.talk(
         f"surface in {result.seconds:.1f} s · {result.valid_share:.1%} of {plan.grid.width * plan.grid.height} posts "
-        f"have a height, mean standard deviation {mean}"
+        f"have a height, mean standard deviation {mean}; {result.misfit_share:.2%} fit badly"
     )
     corrections = ", ".join(f"{c:.3f}" for c in result.corrections[::-1])
     events.talk(f"  last corrections, coarse to fine: {corrections} px")

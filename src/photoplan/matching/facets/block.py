@@ -74,6 +74,8 @@ class Block:
     """Views that have pixels around each post."""
     sums: _Doubles = field(default_factory=lambda: np.zeros((0, 2)))
     """Of each view: Σ of robust factors times squared residuals in its own grey values; redundancy."""
+    ways: _Doubles = field(default_factory=lambda: np.empty((0, 0, 2)))
+    """Mean change of the pixels' places with height in each facet, posts per metre, (rows − 1, columns − 1, 2)."""
     _factors: list[_Floats] = field(default_factory=list)
     _pull: tuple[_Doubles, _Doubles] = (np.empty((0, 0)), np.empty((0, 0)))
     """Heights where the last equations were set up, and their right-hand side, of the pixels alone."""
@@ -88,13 +90,13 @@ class Block:
     def iterate(self, radiometry: bool = True) -> None:
         """One correction of everything."""
         self.sights = [sight.onto(self.heights) for sight in self.sights]
-        grey, weights = self._observed()
+        grey, weights = self.observed()
         if not len(self.values):
             self._start(grey, weights)
         density = self._solve_grey(grey, weights)
         if radiometry:
             self._improve_radiometry(weights)
-            grey, weights = self._observed()
+            grey, weights = self.observed()
         self._pull = self.heights, self._heights(grey, weights, density)
         self._settle()
         known = self.counted > 1
@@ -111,7 +113,7 @@ class Block:
         """Variance of the grey values about a surface of these heights over their own; infinite if few pixels tell."""
         trial = replace(self, heights=heights, sights=[s.onto(heights) for s in self.sights], values=_NONE, _factors=[])
         trial.transfers = first_guess(trial.sights, self.facets)
-        grey, weights = trial._observed()
+        grey, weights = trial.observed()
         weights = [(w > 0).astype(np.float32) for w in weights]
         trial._start(grey, weights)
         density = trial._solve_grey(grey, weights)
@@ -120,7 +122,7 @@ class Block:
         if free < _TELLING * sum(s.raw.size for s in self.sights):
             return float("inf")
         values = np.concatenate([g[w > 0] for g, w in zip(grey, weights)])
-        surface = np.concatenate([trial._surface_at(s, w)[w > 0] for s, w in zip(trial.sights, weights)])
+        surface = np.concatenate([trial.surface_at(s, w)[w > 0] for s, w in zip(trial.sights, weights)])
         return float(np.sum((values - surface) ** 2) / free / max(float(values.var()), 1e-12))
 
     def variances(self) -> _Doubles:
@@ -177,7 +179,7 @@ class Block:
         sample_grey(self.values, self.facets.ratio, uv, out)
         return out
 
-    def _observed(self) -> tuple[list[_Floats], list[_Floats]]:
+    def observed(self) -> tuple[list[_Floats], list[_Floats]]:
         """Grey values of all views' pixels in the system of the surface, and their weights."""
         grey = [transfer.apply(sight, self.facets) for sight, transfer in zip(self.sights, self.transfers)]
         if not self._factors:
@@ -202,14 +204,10 @@ class Block:
         right, density = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         for sight, g, w in zip(self.sights, grey, weights):
             add_grey(sight.places, g, w, self.facets.ratio, system, right, density)
-        usual = float(density[density > 0].mean()) if (density > 0).any() else 1.0
-        # Coefficients that hardly any pixel knows stay near what they were.
-        system[..., 3] += np.float32(1e-4 * usual)
-        right += np.float32(1e-4 * usual) * self.values
-        solve_grey(system, right, _smooth(density) + np.float32(0.05 * usual), self.values, _ROUNDS, _EXACT)
+        self.values = solved_exactly(system, right, density, self.values)
         return density
 
-    def _surface_at(self, sight: Sight, weights: _Floats) -> _Floats:
+    def surface_at(self, sight: Sight, weights: _Floats) -> _Floats:
         """Grey values of the surface where a view's pixels lie; 0 where none is used."""
         out = np.zeros(sight.raw.shape, np.float32)
         used = weights > 0
@@ -219,9 +217,7 @@ class Block:
     def _improve_radiometry(self, weights: Sequence[_Floats]) -> None:
         contrast = max(float(self.values.std()), 1e-6)
         new = [
-            transfer.improved(sight, self.facets, w, self._surface_at(sight, w), contrast)
-            if (w > 0).any()
-            else transfer
+            transfer.improved(sight, self.facets, w, self.surface_at(sight, w), contrast) if (w > 0).any() else transfer
             for sight, transfer, w in zip(self.sights, self.transfers, weights)
         ]
         self.transfers = levelled(new)
@@ -232,7 +228,7 @@ class Block:
         sums = np.zeros((rows - 1, columns - 1, 3))
         for sight, w in zip(self.sights, weights):
             add_means(sight.places, w, sums)
-        means = sums[..., 1:] / np.maximum(sums[..., :1], 1e-30)
+        self.ways = sums[..., 1:] / np.maximum(sums[..., :1], 1e-30)
         self.system, right = np.zeros((7, rows, columns)), np.zeros((rows, columns))
         self.noise = np.zeros((rows, columns))
         counted = np.zeros((rows, columns), np.uint8)
@@ -241,7 +237,7 @@ class Block:
             residuals = np.empty(g.shape, np.float32)
             before = self.system[0].copy()
             add_heights(
-                sight.places, g, w, self.values, self.facets.ratio, means, self.sigmas[n], _LIMIT,
+                sight.places, g, w, self.values, self.facets.ratio, self.ways, self.sigmas[n], _LIMIT,
                 self.system, right, self.noise, residuals, self._factors[n], found[n],
             )  # fmt: skip
             counted += self.system[0] > before
@@ -264,7 +260,17 @@ class Block:
         self.sigmas = np.where(used, np.maximum(self.sigmas * np.clip(factor, 0.2, 5.0), quiet), self.sigmas)
 
 
-def _smooth(values: _Floats) -> _Floats:
+def solved_exactly(system: _Floats, right: _Floats, density: _Floats, values: _Floats) -> _Floats:
+    """Coefficients of grey facets from their normal equations and the weights on each of them, beginning with `values`:
+    as exact as a part of their own standard deviations. Those that hardly any pixel knows stay near what they were."""
+    usual = np.float32(density[density > 0].mean() if (density > 0).any() else 1.0)
+    system[..., 3] += np.float32(1e-4) * usual
+    right += np.float32(1e-4) * usual * values
+    solve_grey(system, right, smoothed(density) + np.float32(0.05) * usual, values, _ROUNDS, _EXACT)
+    return values
+
+
+def smoothed(values: _Floats) -> _Floats:
     """Means of three by three."""
     padded = np.pad(values, 1, mode="edge")
     across = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.block import Block
 from photoplan.matching.facets.curvature import Roughness
+from photoplan.matching.facets.judged import fit, grey_places, grey_sigmas, residual_pictures
 from photoplan.matching.facets.observe import Facets, Sight, View, look
 from photoplan.matching.facets.radiometry import Transfer, first_guess
 
@@ -58,8 +60,15 @@ class Found:
     """Standard deviations, metres; NaN where there is no height."""
     count: NDArray[np.uint8]
     """Images that see the facets around a post."""
+    fit: _Floats
+    """Root mean square of the standardised residuals around a post, 1 is expected; NaN where there is no height."""
     grey: _Floats
     """Grey values, `ratio` times as fine; NaN where no image sees it."""
+    grey_sigmas: _Floats
+    """Their standard deviations; NaN where there is no grey value."""
+    residuals: _Floats | None
+    """Standardised residuals of every view where the grey values are, shape (views, m · rows, m · columns), NaN without
+    a pixel; None: not wanted."""
     sums: _Doubles
     """Of every view: Σ of squared residuals in its own grey values, and redundancy; shape (n, 2)."""
     moves: tuple[float, ...]
@@ -80,7 +89,12 @@ def facets_of(grid: MapGrid, window: Window, level: int, ratio: int, margin: int
 
 
 def reconstruct(
-    views: Sequence[View], grid: MapGrid, window: Window, scheme: Scheme, start: Callable[[_Doubles], _Doubles]
+    views: Sequence[View],
+    grid: MapGrid,
+    window: Window,
+    scheme: Scheme,
+    start: Callable[[_Doubles], _Doubles],
+    residuals: bool = False,
 ) -> Found | None:
     """Heights and grey values of a window of a map.
 
@@ -94,6 +108,8 @@ def reconstruct(
     scheme : Scheme
     start : callable
         Heights of map points (..., 2) with which the coarsest level begins, metres; NaN: unknown.
+    residuals : bool
+        Whether residuals of every view are wanted.
 
     Returns
     -------
@@ -104,7 +120,7 @@ def reconstruct(
     moves = [0.0] * (scheme.coarsest + 1)
     for level in range(scheme.coarsest, -1, -1):
         facets = facets_of(grid, window, level, scheme.ratio)
-        heights = _start_heights(start, facets) if block is None else _finer(block, facets)
+        heights = _start_heights(start, facets) if block is None else _finer(block, facets, start)
         if heights is None:
             return None
         block = _opened(views, level + scheme.base, facets, heights, block) or block
@@ -119,7 +135,7 @@ def reconstruct(
         moves[level] = block.moves[-1]
     if block is None or block.facets.pitch != grid.resolution:
         return None
-    return _found(block, views, window, tuple(moves))
+    return _found(block, views, window, tuple(moves), residuals)
 
 
 def _opened(views: Sequence[View], level: int, facets: Facets, heights: _Doubles, before: Block | None) -> Block | None:
@@ -190,27 +206,55 @@ def _start_heights(start: Callable[[_Doubles], _Doubles], facets: Facets) -> _Do
     return np.where(known, found, found[known].mean()) if known.any() else None
 
 
-def _finer(block: Block, facets: Facets) -> _Doubles:
-    """Heights of the level before at the posts of finer facets, bilinear; beyond the border those of the border."""
-    return block.facets.sampled(block.heights, facets.posts)
+def _finer(block: Block, facets: Facets, start: Callable[[_Doubles], _Doubles]) -> _Doubles:
+    """Heights of the level before at the posts of finer facets, bilinear, with what the start has between its posts;
+    beyond the border those of the border.
+
+    So relief that coarse facets cannot follow is not lost by them.
+    """
+    coarse, fine = (np.asarray(start(f.posts), float) for f in (block.facets, facets))
+    detail = fine - block.facets.sampled(coarse, facets.posts)
+    return block.facets.sampled(block.heights, facets.posts) + np.nan_to_num(detail)
 
 
-def _found(block: Block, views: Sequence[View], window: Window, moves: tuple[float, ...]) -> Found:
+def _found(
+    block: Block, views: Sequence[View], window: Window, moves: tuple[float, ...], residuals: bool = False
+) -> Found:
     """What a block holds of its window."""
     variance = block.variances()
     ratio = block.facets.ratio
     inner = slice(MARGIN, MARGIN + window.height), slice(MARGIN, MARGIN + window.width)
     count = block.counted[inner]
-    seen = count > 1
-    heights = np.where(seen, block.heights[inner], np.nan).astype(np.float32)
-    sigmas = np.where(seen, np.sqrt(np.maximum(variance[inner], 0.0)), np.nan).astype(np.float32)
-    part = (np.arange(ratio) + 0.5) / ratio - 0.5
-    u = (MARGIN + np.arange(window.width)[:, None] + part).reshape(-1)
-    v = (MARGIN + np.arange(window.height)[:, None] + part).reshape(-1)
-    grey = block.grey_values(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)).reshape(len(v), len(u))
-    seen_grey = np.repeat(np.repeat(count > 0, ratio, axis=0), ratio, axis=1)
+    place = [next(n for n, view in enumerate(views) if view is own) for own in block.views]
     sums = np.zeros((len(views), 2))
-    place = {id(view): n for n, view in enumerate(views)}
-    for view, both in zip(block.views, block.sums):
-        sums[place[id(view)]] = both
-    return Found(heights, sigmas, count, np.where(seen_grey, grey, np.float32(np.nan)), sums, moves)
+    sums[place] = block.sums
+    at = grey_places(block, window, MARGIN)
+
+    def finer(values: NDArray[Any]) -> NDArray[Any]:
+        return np.repeat(np.repeat(values, ratio, axis=0), ratio, axis=1)
+
+    pictures = None
+    if residuals:
+        fine = (
+            slice(ratio * MARGIN, ratio * (MARGIN + window.height)),
+            slice(ratio * MARGIN, ratio * (MARGIN + window.width)),
+        )
+        pictures = np.full((len(views), *at.shape[:2]), np.nan, np.float32)
+        for n, picture in zip(place, residual_pictures(block)):
+            pictures[n] = picture[fine]
+    return Found(
+        heights=_where(count > 1, block.heights[inner]),
+        sigmas=_where(count > 1, np.sqrt(np.maximum(variance[inner], 0.0))),
+        count=count,
+        fit=_where(count > 1, fit(block)[inner]),
+        grey=_where(finer(count > 0), block.grey_values(at.reshape(-1, 2)).reshape(at.shape[:2])),
+        grey_sigmas=_where(finer(count > 0), grey_sigmas(block, at, finer(np.nan_to_num(variance[inner])))),
+        residuals=pictures,
+        sums=sums,
+        moves=moves,
+    )
+
+
+def _where(known: NDArray[np.bool_], values: NDArray[Any]) -> _Floats:
+    """Values where they are known, NaN elsewhere."""
+    return np.where(known, values, np.nan).astype(np.float32)

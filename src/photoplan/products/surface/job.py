@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.engine.run import Made
+from photoplan.engine.run import Made, Output
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.observe import View
 from photoplan.matching.facets.pyramid import Pyramid
@@ -26,6 +26,8 @@ _Doubles = NDArray[np.float64]
 
 #: Grey facets along a part that is reconstructed at once, and blocks of image pyramids that are kept, bytes in all.
 _PART, _KEPT = 768, 256 << 20
+MISFIT = 2.0
+"""Heights around which residuals are so many times larger than expected are told of: they may be wrong."""
 #: Bytes of a grey facet while it is adjusted: its equations twice, and what the pixels need.
 _EACH = 400
 
@@ -39,6 +41,8 @@ class SurfaceJob:
     scheme: Scheme
     start: str
     """See `SurfaceSettings.start`."""
+    residuals: bool = False
+    """See `SurfaceSettings.residuals`."""
 
     @property
     def part(self) -> int:
@@ -51,24 +55,27 @@ class SurfaceJob:
         return ((self.part + 2 * MARGIN) * self.scheme.ratio) ** 2 * _EACH + 2 * (_PART**2) * len(self.address.scenes)
 
     def __call__(self, tile: Tile) -> Made:
-        """Heights, standard deviations, number of images, grey values of a tile."""
+        """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""
         views = [_view(scene, _KEPT // len(self.address.scenes)) for scene in self.address.scenes]
         start = _start(self.address, self.start, self.grid.crs)
         window, m = tile.window, self.scheme.ratio
-        shape = window.height, window.width
-        heights, sigmas = (np.full((1, *shape), np.nan, np.float32) for _ in range(2))
-        count, grey = np.zeros((1, *shape), np.uint8), np.full((1, m * shape[0], m * shape[1]), np.nan, np.float32)
+        shape, finest = (window.height, window.width), (m * window.height, m * window.width)
+        heights, sigmas, fit = (np.full((1, *shape), np.nan, np.float32) for _ in range(3))
+        count = np.zeros((1, *shape), np.uint8)
+        grey, grey_sigmas = (np.full((1, *finest), np.nan, np.float32) for _ in range(2))
+        residuals = np.full((len(views) if self.residuals else 0, *finest), np.nan, np.float32)
         sums, moves, parts = np.zeros((len(views), 2)), np.zeros(self.scheme.coarsest + 1), 0
         for part in window.tiles(self.part):
-            found = reconstruct(views, self.grid, part, self.scheme, start)
+            found = reconstruct(views, self.grid, part, self.scheme, start, self.residuals)
             if found is None:
                 continue
-            rows, columns = part.slices(window)
-            heights[0, rows, columns], sigmas[0, rows, columns] = found.heights, found.sigmas
-            count[0, rows, columns] = found.count
+            at = (0, *part.slices(window))
+            heights[at], sigmas[at], count[at], fit[at] = found.heights, found.sigmas, found.count, found.fit
             finer = Window(m * part.col, m * part.row, m * part.width, m * part.height)
-            rows, columns = finer.slices(Window(m * window.col, m * window.row, m * window.width, m * window.height))
-            grey[0, rows, columns] = found.grey
+            there = finer.slices(Window(m * window.col, m * window.row, m * window.width, m * window.height))
+            grey[(0, *there)], grey_sigmas[(0, *there)] = found.grey, found.grey_sigmas
+            if found.residuals is not None:
+                residuals[(slice(None), *there)] = found.residuals
             sums, moves, parts = sums + found.sums, moves + found.moves, parts + 1
         record = {
             "squares": sums[:, 0].tolist(),
@@ -77,11 +84,15 @@ class SurfaceJob:
             "parts": parts,
             "sigmas": float(np.nansum(sigmas)),
             "heights": int(np.isfinite(sigmas).sum()),
+            "misfits": int((fit > MISFIT).sum()),
         }
         known, seen = np.isfinite(heights[0]), np.isfinite(grey[0])
-        if not known.any():
-            return Made((None, None, None, None), record)
-        return Made(((heights, known), (sigmas, known), (count, count[0] > 0), (grey, seen)), record)
+        layers: list[Output] = [
+            (heights, known), (sigmas, known), (count, count[0] > 0), (fit, known), (grey, seen), (grey_sigmas, seen)
+        ]  # fmt: skip
+        if self.residuals:
+            layers.append((residuals, seen & np.isfinite(residuals).any(axis=0)))
+        return Made(tuple(layers) if known.any() else (None,) * len(layers), record)
 
 
 @lru_cache(maxsize=256)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import numpy as np
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid
+from photoplan.io.point_cloud import check_cloud
 from photoplan.io.project.model import Project
 from photoplan.io.run_record import run_key
 from photoplan.matching.facets.reconstruct import Scheme
@@ -53,6 +54,10 @@ class SurfaceSettings:
     """`terrain` (the project's), a height in metres, or a file of heights."""
     reach: float | None = None
     """How far the start may be wrong, metres; None: a tenth of the flying height."""
+    residuals: bool = False
+    """Whether to write the residuals of every image, too."""
+    points: tuple[Path, ...] = ()
+    """Files that the heights are written to as points, too: .las, .laz or .ply."""
     name: str = "surface"
     """Of the product, and of its files without the extension."""
 
@@ -165,7 +170,12 @@ def plan_surface(
     files = [Path(path) for path, _ in ScenesAddress.of(project, used).digests]
     if settings.start not in ("terrain",) and _number(settings.start) is None:
         files.append(Path(settings.start))
-    stated = {"settings": settings, "scheme": scheme, "grid": grid, "facts": ScenesAddress.of(project, used).facts}
+    stated = {
+        "settings": replace(settings, points=()),
+        "scheme": scheme,
+        "grid": grid,
+        "facts": ScenesAddress.of(project, used).facts,
+    }
     key = run_key("surface", stated, files)
     return SurfacePlan(project, settings, used, tuple(blind), grid, scheme, gsd, height_error, key)
 
@@ -184,6 +194,8 @@ def check_start(project: Project, settings: SurfaceSettings) -> None:
         raise UsageError(f"reach {settings.reach}; a positive number of metres is needed")
     if not settings.name.strip() or Path(settings.name).name != settings.name or settings.name in (".", ".."):
         raise UsageError(f"name {settings.name!r}; give the name of a file without folder and extension")
+    for path in settings.points:
+        check_cloud(path)
     if settings.start == "terrain":
         return
     number = _number(settings.start)

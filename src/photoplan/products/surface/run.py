@@ -14,9 +14,11 @@ from photoplan import __version__
 from photoplan.engine.cluster import Question
 from photoplan.engine.executors import open_workers
 from photoplan.engine.run import Runner, Tally, Work, tiles_in_flight
+from photoplan.errors import UsageError
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm
 from photoplan.io.naming import together
+from photoplan.io.point_cloud import write_cloud
 from photoplan.io.product import ProductFile, check_output
 from photoplan.io.run_record import input_entry, versions, write_run_record
 from photoplan.plain import pick
@@ -31,8 +33,13 @@ KINDS = {
     "heights": ("", "height", "metre"),
     "sigma": ("_sigma", "standard deviation of the height", "metre"),
     "count": ("_count", "images that see it", ""),
+    "fit": ("_fit", "standardised residuals of the grey values around it, root mean square", ""),
     "grey": ("_grey", "grey value", ""),
+    "grey_sigma": ("_grey_sigma", "standard deviation of the grey value", ""),
+    "residuals": ("_residuals", "standardised residual", ""),
 }
+#: Those that have the pixels of the grey values.
+_FINE = ("grey", "grey_sigma", "residuals")
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,7 @@ class SurfaceResult:
     path: Path
     """The heights."""
     others: tuple[Path, ...]
-    """Standard deviations, number of images, grey values."""
+    """Standard deviations, number of images, fit, grey values and theirs, residuals, points."""
     images: tuple[str, ...]
     seconds: float
     valid_share: float
@@ -55,6 +62,8 @@ class SurfaceResult:
     """Mean standard deviation of the heights, metres."""
     sigma_px: float | None
     """The same in pixels of parallax between the outermost images."""
+    misfit_share: float
+    """Heights around which residuals are more than twice as large as expected, among all, 0 to 1."""
     corrections: tuple[float, ...]
     """Mean last correction of the heights on each level, the finest first, pixels of parallax."""
     tiles: int
@@ -64,13 +73,14 @@ class SurfaceResult:
     def json_fields(self) -> dict[str, Any]:
         """All figures, with units."""
         more = {"sigma_m": "sigma", "corrections_px": "corrections", "resumed_tiles": "resumed"}
-        own = ("path", "images", "seconds", "valid_share", "sigma0", "redundancy", "sigma_px", "tiles")
+        own = ("path", "images", "seconds", "valid_share", "sigma0", "redundancy", "sigma_px", "misfit_share", "tiles")
         return pick(self, *own, other_files="others", **more)
 
 
 def outputs(folder: Path, plan: SurfacePlan) -> dict[str, Path]:
     """Files of a surface."""
-    return {kind: folder / f"{plan.settings.name}{ending}.tif" for kind, (ending, _, _) in KINDS.items()}
+    kinds = {kind: ending for kind, (ending, _, _) in KINDS.items() if kind != "residuals" or plan.settings.residuals}
+    return {kind: folder / f"{plan.settings.name}{ending}.tif" for kind, ending in kinds.items()}
 
 
 def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) -> SurfaceResult:
@@ -99,12 +109,15 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
     folder = Path(output)
     run.check()
     paths = outputs(folder, plan)
-    refuse_inputs(input_files(plan.project), paths.values())
-    for path in paths.values():
+    written = [*paths.values(), *plan.settings.points]
+    refuse_inputs(input_files(plan.project), written)
+    if len({path.resolve() for path in written}) < len(written):
+        raise UsageError(f"points {', '.join(map(str, plan.settings.points))}: one file twice; give each its own name")
+    for path in written:
         check_output(path, [], overwrite=run.overwrite)
     make_folder(folder)
     address = plan.address
-    job = SurfaceJob(address, plan.grid, plan.scheme, plan.settings.start)
+    job = SurfaceJob(address, plan.grid, plan.scheme, plan.settings.start, plan.settings.residuals)
     inputs = tuple(str(Path(path).resolve()) for path, _ in address.digests)
     question = Question(versions, inputs, str(folder.resolve()))
     tiles = Tiles.every(plan.grid.window, TILE)
@@ -130,12 +143,13 @@ def _files(plan: SurfacePlan, paths: dict[str, Path], run: Run) -> dict[str, Pro
     """The files, in the order of a tile's layers."""
     made = {}
     for kind, path in paths.items():
-        grid, side = (plan.grey_grid, TILE * plan.scheme.ratio) if kind == "grey" else (plan.grid, TILE)
+        grid, side = (plan.grey_grid, TILE * plan.scheme.ratio) if kind in _FINE else (plan.grid, TILE)
         _, name, unit = KINDS[kind]
+        names = tuple(f"{name} of {image}" for image in plan.images) if kind == "residuals" else (name,)
         made[kind] = ProductFile(
             path,
             grid.placement,
-            1,
+            len(names),
             np.dtype(np.uint8 if kind == "count" else np.float32),
             run_key=plan.key,
             tile=side,
@@ -143,7 +157,7 @@ def _files(plan: SurfacePlan, paths: dict[str, Path], run: Run) -> dict[str, Pro
             inputs=[file for file, _ in plan.address.digests],
             threads=run.workers,
             resampling="mode" if kind == "count" else "average",
-            form=ImageForm(descriptions=(name,), units=(unit,) if unit else ()),
+            form=ImageForm(descriptions=names, units=(unit,) if unit else ()),
         )
     return made
 
@@ -161,6 +175,8 @@ def _complete(
     }
     with together():
         facts, *_ = [file.complete(tags) for file in files.values()]
+        for path in plan.settings.points:
+            write_cloud(path, files["heights"].path, files["sigma"].path, files["grey"].path, plan.grid.crs)
         ran = times()
         result = _result(plan, files, ran["seconds"], facts.valid_share, tally)
         scene = plan.address.scenes[0].open()
@@ -190,7 +206,7 @@ def _result(
     sigma = totals["sigmas"] / totals["heights"] if totals["heights"] else None
     return SurfaceResult(
         path=files["heights"].path,
-        others=tuple(file.path for kind, file in files.items() if kind != "heights"),
+        others=(*(file.path for kind, file in files.items() if kind != "heights"), *plan.settings.points),
         images=plan.images,
         seconds=seconds,
         valid_share=share,
@@ -198,6 +214,7 @@ def _result(
         redundancy=sum(totals["redundancy"]),
         sigma=sigma,
         sigma_px=None if sigma is None else sigma / plan.height_error,
+        misfit_share=totals["misfits"] / totals["heights"] if totals["heights"] else 0.0,
         corrections=tuple(move / parts for move in totals["moves"]),
         tiles=len(files["heights"].windows),
         resumed=tally.resumed,

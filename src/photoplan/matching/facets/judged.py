@@ -1,0 +1,122 @@
+"""What an adjusted block says of itself: standard deviations of its grey values, and how the pixels fit it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.geometry.grid import Window
+from photoplan.kernels.facets_grey import OFFSETS, add_grey, sample_grey
+from photoplan.kernels.facets_residuals import add_residuals, sample_slopes
+from photoplan.matching.facets.block import Block, smoothed, solved_exactly
+
+_Floats = NDArray[np.float32]
+_Doubles = NDArray[np.float64]
+
+#: Grey values along a patch over which the errors that were drawn are averaged.
+_PATCH = 17
+#: Least part of the pixels around a post that are redundant.
+_LEAST = 0.1
+
+
+def grey_places(block: Block, window: Window, margin: int) -> _Doubles:
+    """Places of the grey values of a window, which begins `margin` posts inside a block, in columns and rows of its
+    posts; shape (m · rows, m · columns, 2)."""
+    m = block.facets.ratio
+    part = (np.arange(m) + 0.5) / m - 0.5
+    u, v = ((margin + np.arange(n)[:, None] + part).reshape(-1) for n in (window.width, window.height))
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def grey_sigmas(block: Block, at: _Doubles, height_variances: _Doubles) -> _Floats:
+    """Standard deviations of grey values at places (n, m, 2) of a grid.
+
+    Errors of the pixels are drawn and carried through the normal equations: what comes out has the covariance of the
+    grey facets. Its squares, in units of what the pixels around a place weigh, change slowly, so that one draw and
+    means over patches are enough. An error dZ of the height shows a place that lies beside by k·dZ, with k the mean of
+    the images.
+
+    Parameters
+    ----------
+    block : Block
+        After its last iteration.
+    at : ndarray
+        Columns and rows of the posts.
+    height_variances : ndarray, shape (n, m)
+        Of the heights there, m².
+    """
+    ratio = block.facets.ratio
+    shape = block.values.shape
+    system, right = np.zeros((*shape, OFFSETS), np.float32), np.zeros(shape, np.float32)
+    density = np.zeros(shape, np.float32)
+    _, weights = block.observed()
+    signs = np.random.default_rng(11)
+    for sight, w in zip(block.sights, weights):
+        drawn = (signs.integers(0, 2, w.shape) * 2 - 1) / np.sqrt(np.maximum(w, np.float32(1e-30)))
+        add_grey(sight.places, drawn.astype(np.float32), w, ratio, system, right, density)
+    error = solved_exactly(system, right, density, np.zeros(shape, np.float32))
+    places = at.reshape(-1, 2)
+    drawn_there, known = np.empty(len(places), np.float32), np.empty(len(places), np.float32)
+    sample_grey(error, ratio, places, drawn_there)
+    sample_grey(smoothed(density), ratio, places, known)
+    single = 1 / np.maximum(known.reshape(at.shape[:2]), np.float32(1e-3 * max(float(density.mean()), 1e-30)))
+    times = _mean(drawn_there.reshape(at.shape[:2]) ** 2 / single)
+    slopes = np.empty((len(places), 2), np.float32)
+    sample_slopes(block.values, ratio, places, slopes)
+    j, i = (
+        np.clip(at[..., k].astype(int), 0, n - 2) for k, n in ((1, block.facets.shape[0]), (0, block.facets.shape[1]))
+    )
+    beside = (slopes.reshape(at.shape) * block.ways[j, i]).sum(axis=-1)
+    return np.sqrt(times * single + beside**2 * height_variances).astype(np.float32)
+
+
+def fit(block: Block) -> _Doubles:
+    """Root mean square of the standardised residuals around each post, shape (rows, columns); NaN without pixels.
+
+    1 is what is expected: squares are divided by the redundancy, what grey values and height take of the pixels.
+    """
+    sums = np.zeros((*block.facets.shape, 3))
+    for sight, residuals in zip(block.sights, standardised(block)):
+        add_residuals(sight.places, residuals, 1, sums)
+    count, squares = _mean(sums[..., 0], 3), _mean(sums[..., 2], 3)
+    free = np.maximum(count - block.facets.ratio**2 - 1, _LEAST * count)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(sums[..., 0] > 0, np.sqrt(squares / free), np.nan)
+
+
+def residual_pictures(block: Block) -> list[_Floats]:
+    """Mean standardised residual of each view's pixels in every grey value's cell, shape (m · rows, m · columns); NaN
+    without pixels. The first cell is that of the first post less half a facet."""
+    m, pictures = block.facets.ratio, []
+    for sight, residuals in zip(block.sights, standardised(block)):
+        sums = np.zeros((m * block.facets.shape[0], m * block.facets.shape[1], 3))
+        add_residuals(sight.places, residuals, m, sums)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pictures.append((sums[..., 1] / sums[..., 0]).astype(np.float32))
+    return pictures
+
+
+def standardised(block: Block) -> list[_Floats]:
+    """Residuals of every view's pixels, the surface's grey value less theirs, in their standard deviations; NaN: not
+    used."""
+    grey, weights = block.observed()
+    found = []
+    for sight, g, w, sigma in zip(block.sights, grey, weights, block.sigmas):
+        left = (block.surface_at(sight, w) - g) / np.float32(sigma)
+        found.append(np.where(w > 0, left, np.float32(np.nan)))
+    return found
+
+
+def _mean(values: NDArray[np.floating], patch: int = _PATCH) -> _Doubles:
+    """Means over patches, fewer at the border."""
+    out = np.asarray(values, float)
+    half = patch // 2
+    for axis in (0, 1):
+        count = out.shape[axis]
+        sums = np.insert(np.cumsum(out, axis=axis), 0, 0.0, axis=axis)
+        k = np.arange(count)
+        first, last = np.maximum(k - half, 0), np.minimum(k + half + 1, count)
+        out = (sums.take(last, axis) - sums.take(first, axis)) / (last - first).reshape(
+            (-1, 1) if axis == 0 else (1, -1)
+        )
+    return out
