@@ -12,7 +12,7 @@ import click
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tools.command import options_of, unknown_options, verbs
+from tools.command import options_of, unfinished_in_files, unknown_options, verbs
 
 import photoplan
 from photoplan.cli.main import photoplan as command
@@ -32,10 +32,23 @@ def test_no_word_of_numpy_reaches_a_user() -> None:
     """An overflow of absurd numbers, in a process of its own."""
     code = (
         "from photoplan.cli.main import start; start(); import numpy as np; from photoplan.io.orientation import text\n"
+        "np.linalg.norm(np.full(3, 1e300)); np.nanmean([np.nan]); np.nanmax([np.nan])\n"
         "text.checked_rotation(np.full(9, 1e300), 'a.txt:1')"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "not a rotation matrix" in ran.stderr and "Warning" not in ran.stderr
+
+
+def test_numbers_that_are_none_are_seen_in_files(tmp_path: Path) -> None:
+    """What every command test asks of the reports and tables that were written."""
+    for name, text, words in (
+        ("a.csv", "x,y\n1,nan\n", ["nan"]),
+        ("b.html", '<td>±inf</td><img src="data:image/png;base64,aa+nan/+inf==">', ["±inf"]),
+        ("c.json", '{"name": "nan.tif", "note": "an information"}', []),
+        ("d.tif", "nan", []),
+    ):
+        (tmp_path / name).write_text(text)
+        assert unfinished_in_files({tmp_path}, 0.0).get(str(tmp_path / name), []) == words, name
 
 
 def test_an_empty_name_is_no_path_in_any_command() -> None:
@@ -125,3 +138,7 @@ def test_images_with_commas_or_repeated(tmp_path: Path) -> None:
     own.touch()
     assert listed(["a, b", "c*"]) == ("a", "b", "c*")
     assert listed([str(own), "d,"]) == (str(own), "d")
+    chosen = {name: p for name, c in VERBS.items() for p in c.params if "--images" in p.opts}
+    assert len(chosen) > 15
+    for name, option in chosen.items():
+        assert option.multiple and option.callback(None, option, ["a,b", "c"]) == ("a", "b", "c"), name

@@ -47,3 +47,14 @@ def test_rasters_are_closed_before_the_interpreter_ends(block: Path) -> None:
     image = sorted((block / "images").iterdir())[0]
     said = subprocess.run([sys.executable, "-c", code, str(image)], capture_output=True, text=True, check=True)
     assert said.stdout.split() == ["1", "0"]
+
+
+def test_the_archive_of_sources_holds_tests_and_pages_and_metadata_say_where_it_runs() -> None:
+    grafted = set(re.findall(r"^graft (\S+)", (CHECKOUT / "MANIFEST.in").read_text("utf-8"), re.M))
+    assert {"tests", "docs", "examples"} <= grafted and all((CHECKOUT / name).is_dir() for name in grafted)
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text("utf-8"))["project"]
+    classifiers = "\n".join(project["classifiers"])
+    assert "Programming Language :: Python :: 3.11" in classifiers and "Operating System ::" in classifiers
+    assert project["authors"]
+    # 2.6 and 2.7 do not work.
+    assert "pydantic>=2.8" in project["dependencies"]

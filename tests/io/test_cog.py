@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -148,3 +149,51 @@ def test_what_gdal_grumbles_about_is_an_error(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(rasterio.shutil, "copy", lambda *a, **k: copy(*a, **(k | {"nonsense": 1, "quality": "many"})))
     with pytest.raises(PhotoplanError, match="could not write it cleanly"):
         write_cog(tmp_path / "a.tif", tmp_path / "b.tif", CogOptions(), np.dtype("uint8"))
+
+
+#: Bytes of a value by TIFF's types (TIFF 6.0, and 13, 16 to 18 of BigTIFF).
+TYPES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+
+
+def tags_of(path: Path) -> list[dict[int, tuple[int, int, bytes]]]:
+    """Type, count and bytes of every tag of every directory, read as a strict reader does."""
+    data = path.read_bytes()
+    order = {b"II": "<", b"MM": ">"}[data[:2]]
+    big = struct.unpack(order + "H", data[2:4])[0] == 43
+    size, width, entry, count_as = (8, "Q", 20, "Q") if big else (4, "I", 12, "H")
+    at = struct.unpack(order + width, data[8:16] if big else data[4:8])[0]
+    found = []
+    while at:
+        step = struct.calcsize(order + count_as)
+        number = struct.unpack(order + count_as, data[at : at + step])[0]
+        tags = {}
+        for k in range(number):
+            start = at + step + k * entry
+            tag, kind = struct.unpack(order + "HH", data[start : start + 4])
+            count = struct.unpack(order + width, data[start + 4 : start + 4 + size])[0]
+            place = start + 4 + size
+            if count * TYPES[kind] > size:
+                place = struct.unpack(order + width, data[place : place + size])[0]
+            assert place + count * TYPES[kind] <= len(data), (tag, "beyond the file")
+            assert tag > max(tags, default=0), (tag, "out of order or twice")
+            tags[tag] = kind, count, data[place : place + count * TYPES[kind]]
+        found.append(tags)
+        end = at + step + number * entry
+        at = struct.unpack(order + width, data[end : end + size])[0]
+    return found
+
+
+@pytest.mark.parametrize(
+    "options", [{"compress": "none", "overviews": False}, {"compress": "deflate", "nodata": "mask"}], ids=str
+)
+def test_strict_readers_have_nothing_to_complain_of(tmp_path: Path, options: dict[str, Any]) -> None:
+    """Directories by the letter of TIFF 6.0: tags in order, known types, values within the file, texts that end."""
+    product(tmp_path / "a.tif", **options)
+    for number, tags in enumerate(tags_of(tmp_path / "a.tif")):
+        assert {256, 257, 258, 259, 262, 277, 322, 323, 324, 325} <= set(tags)
+        assert (254 in tags) or number == 0
+        assert tags[324][1] == tags[325][1]
+        for tag, (kind, count, value) in tags.items():
+            assert count > 0, tag
+            if kind == 2:
+                assert value.endswith(b"\0") and value.isascii(), (tag, value)

@@ -34,6 +34,7 @@ def write(folder: Path, content: str | bytes, name: str = "points.csv") -> Path:
         TABLE.replace("x,y", "Column,Row").replace("point", "Point"),
         "image,id,point,y,x\np1.tif,1,A,20.25,10.5\np2.tif,2,A,21,11\np1.tif,3,B,3e2,-0.5\n",
         '"point" "image" x y\n"A" "p1.tif" 10.5 20.25\n"A" "p2.tif" 11 21\n"B" "p1.tif" -0.5 3e2\n',
+        "'point','image','x','y'\n'A','p1.tif','10.5','20.25'\n'A','p2.tif',11,21\n'B','p1.tif',-0.5,3e2\n",
     ],
 )
 def test_layouts_give_one_table(tmp_path: Path, text: str) -> None:
@@ -43,6 +44,11 @@ def test_layouts_give_one_table(tmp_path: Path, text: str) -> None:
     np.testing.assert_array_equal(points.point, [0, 0, 1])
     np.testing.assert_array_equal(points.xy, [[10.5, 20.25], [11, 21], [-0.5, 300]])
     assert np.isnan(points.sigma).all()
+
+
+def test_quotes_hold_a_delimiter_together_and_apostrophes_are_letters(tmp_path: Path) -> None:
+    points = read_image_points(write(tmp_path, "point,image,x,y\n'A, north',p1.tif,1,2\nO'Hara,p1.tif,3,4\n"))
+    assert points.points == ("A, north", "O'Hara")
 
 
 def test_declared_columns_and_decimal_comma(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from rasterio.enums import ColorInterp
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io import raster_pixels as raster_module
-from photoplan.io.gdal import close_handles
+from photoplan.io.gdal import close_handles, not_georeferenced
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import read_info
 from photoplan.io.raster_pixels import DecodedPicture, decoded_picture
@@ -408,3 +408,16 @@ def test_usual_nodata_values_that_are_not_declared_are_refused(tmp_path: Path, d
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
         masked = make(tmp_path / "masked.tif", pixels, mask=mask)
     assert RasterReader(masked).read(WINDOW)[1] is not None
+
+
+def test_silence_about_georeferences_may_nest() -> None:
+    """It hung for ever, waiting for itself."""
+
+    def nested() -> None:
+        with not_georeferenced(), not_georeferenced():
+            pass
+
+    thread = threading.Thread(target=nested, daemon=True)
+    thread.start()
+    thread.join(5)
+    assert not thread.is_alive()

@@ -258,7 +258,8 @@ def test_fault_20_terrain_in_degrees_or_without_a_crs_is_refused(tmp_path: Path)
 
 
 def test_faults_30_32_absurd_numbers_and_pictures_are_refused(small: Block) -> None:
-    for words in (["--from", 1e300, 5e6], ["--from", X0, Y0, "--altitude", 1e300],
+    for words in (["--from", 1e300, 5e6], ["--from", X0, Y0, "--altitude", 1e300], ["--from", X0, Y0, "--height", 1e9],
+                  ["--from", 1e9, Y0, "--force"], ["--from", X0, Y0, "--altitude", 1e7, "--force"],
                   ["--from", X0, Y0, "--size", 10**9, 5],
                   ["--from", X0, Y0, "--fov", 1e-9], ["--from", X0, Y0, "--earth-radius", 6.38]):  # fmt: skip
         said = inside("view", small.terrain, *words, "--azimuth", 0, "--dry-run")

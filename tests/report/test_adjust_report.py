@@ -131,9 +131,19 @@ def facts(name: str = "p") -> AdjustFigures:
         ),
         strips=(
             StripFigures(
-                name, 6, 1, (0.0, 0.0, 0.01), (0.05, 0.04, 0.06), (0.1, 0.2, -0.3), (0.0, 0.0, 0.0), (0.01,) * 3
+                name,
+                6,
+                1,
+                (0.0, 0.0, 0.01),
+                (0.05, 0.04, 0.06),
+                (0.1, 0.2, -0.3),
+                (3e-3,) * 3,
+                (0.01,) * 3,
+                (4e-4,) * 3,
             ),
-            StripFigures("b", 6, 0, (0.0, 0.0, 0.0), (0.05, 0.04, 0.06), (NAN,) * 3, (NAN,) * 3, (NAN,) * 3),
+            StripFigures(
+                "b", 6, 0, (0.0, 0.0, 0.0), (0.05, 0.04, 0.06), (NAN,) * 3, (NAN,) * 3, (NAN,) * 3, (NAN,) * 3
+            ),
         ),
         lever_arm=((0.1, 0.2, 1.3), (0.01, 0.01, 0.02)),
         boresight=((0.1, 0.2, 0.3), (0.01, 0.01, 0.02)),
@@ -250,3 +260,7 @@ def test_thirty_check_points_are_enough(count: int, warned: bool) -> None:
     signs = np.resize([1.0, -1.0], count)[:, None]
     found = check_accuracy(0.1 * signs * np.ones(3), np.full((count, 3), 0.02))
     assert bool(found.warnings) == warned
+
+
+def test_rates_of_a_drift_have_their_standard_deviations():
+    assert "0.003 ± 0.0004" in "".join(Page(adjust_page(facts())).words)

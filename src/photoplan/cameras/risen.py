@@ -32,7 +32,8 @@ class EarthBend:
     def inverse(self, displaced: ArrayLike) -> NDArray[np.float64]:
         """Points over the plane back to the map."""
         out = np.array(displaced, float)
-        out[..., 2] += self.bend * self._squared(out)
+        with np.errstate(invalid="ignore"):  # what lies on no map is at infinity
+            out[..., 2] += self.bend * self._squared(out)
         return out
 
     def jacobian(self, XYZ: ArrayLike) -> NDArray[np.float64]:

@@ -85,7 +85,8 @@ def start() -> None:
     # Photos have no georeference. Here and not only where files are opened, since a filter there holds for one thread.
     warnings.filterwarnings("ignore", "Dataset has no geotransform")
     # A user can do nothing with a word of NumPy on an overflow: what comes of it is judged by its meaning.
-    warnings.filterwarnings("ignore", category=RuntimeWarning, module=r"photoplan\.")
+    warnings.filterwarnings("ignore", "(overflow|underflow|divide by zero|invalid value) encountered", RuntimeWarning)
+    warnings.filterwarnings("ignore", "(Mean of empty|All-NaN|Degrees of freedom)", RuntimeWarning)
     warnings.formatwarning = _warning
 
 

@@ -25,7 +25,7 @@ GDAL_ERRORS = (RasterioError, CPLE_BaseError)
 """What may come out of a call of rasterio: its own errors, and GDAL's where it does not translate them."""
 _HANDLES_PER_THREAD = 4
 _DAMAGE = re.compile(r"corrupt|premature|truncat|too short|not enough data|invalid|bad huffman|crc|checksum", re.I)
-_open_lock = threading.Lock()
+_open_lock = threading.RLock()
 
 
 def gdal_settings(**more: Any) -> rasterio.Env:
@@ -121,7 +121,7 @@ def open_raster(path: Path, driver: str | None, overview: int | None = None) -> 
 def not_georeferenced() -> Iterator[None]:
     """Open and write rasters that need no georeference without a word about it.
 
-    `catch_warnings` changes a list of the whole process, so only one thread may be inside.
+    `catch_warnings` changes a list of the whole process, so only one thread may be inside, as often as it likes.
     """
     with _open_lock, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)

@@ -9,7 +9,7 @@ import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import InputError
 
 #: Bytes of a stem at most; file systems allow 255 for a name, and products add a few suffixes.
 MAX_BYTES = 120
@@ -112,21 +112,6 @@ def resolve_input(folder: Path, text: str) -> Path:
         raise InputError(f"input {text[:200]!r}: leads to no file ({error}); give the path of a file") from error
     check_input_name(str(full))
     return full
-
-
-def inside(folder: Path, name: str) -> Path:
-    """Path of an output `name` inside `folder`.
-
-    Raises
-    ------
-    UsageError
-        The name leads out of the folder.
-    """
-    root = folder.resolve()
-    path = (root / name).resolve()
-    if root not in path.parents:
-        raise UsageError(f"output {name!r} lies outside {folder}; nothing is written outside the output folder")
-    return path
 
 
 def relative_path(file: Path, folder: Path) -> str:

@@ -210,7 +210,8 @@ def carried_hits(
     there = np.flatnonzero(np.isfinite(hits.along))
     piece = np.minimum(hits.along[there].astype(int), fine.shape[1] - 2)
     a, b = fine[there, piece], fine[there, piece + 1]
-    hits.XYZ[there, :2] = (a + (hits.along[there] - piece)[:, None] * (b - a))[:, :2]
+    with np.errstate(invalid="ignore"):  # what lies on no map is at infinity
+        hits.XYZ[there, :2] = (a + (hits.along[there] - piece)[:, None] * (b - a))[:, :2]
     hits.along[there] *= (paths.shape[1] - 1) / (fine.shape[1] - 1)
     if len(there):
         _carry_back(hits, there, carry)

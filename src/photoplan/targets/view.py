@@ -180,7 +180,8 @@ class ViewTarget:
     def _off(self, ways: NDArray[np.float64], reach: float, pieces: int) -> float:
         """By how much the middles of pieces leave them at most."""
         path = self._path(ways, reach, 2 * pieces)
-        off = np.linalg.norm(path[:, 1::2] - (path[:, :-1:2] + path[:, 2::2]) / 2, axis=-1)
+        with np.errstate(invalid="ignore"):  # what lies on no map is at infinity
+            off = np.linalg.norm(path[:, 1::2] - (path[:, :-1:2] + path[:, 2::2]) / 2, axis=-1)
         return float(np.nanmax(off, initial=0.0))
 
     def _path(self, ways: NDArray[np.float64], reach: float, pieces: int) -> NDArray[np.float64]:
@@ -191,7 +192,8 @@ class ViewTarget:
         path[:, 1:] = self._on_map(self.bundle.center + along * unit[:, None])
         if self.warps:
             away = path[..., :2] - self.center[:2]
-            path[..., 2] -= self.bend * dot(away, away)
+            with np.errstate(invalid="ignore"):
+                path[..., 2] -= self.bend * dot(away, away)
         return path
 
     def _on_map(self, points: NDArray[np.float64]) -> NDArray[np.float64]:

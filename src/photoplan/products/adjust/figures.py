@@ -102,6 +102,7 @@ class StripFigures:
     """NaN where it was no unknown."""
     rate: tuple[float, float, float]
     sigma_shift: tuple[float, float, float]
+    sigma_rate: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)

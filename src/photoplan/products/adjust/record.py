@@ -96,7 +96,7 @@ def _measurement(m: NamedMeasurement) -> dict[str, Any]:
 def _positions(figures: AdjustFigures) -> dict[str, Any] | None:
     if not figures.strips:
         return None
-    own = ("name", "rejected", "mean", "rms", "shift", "rate", "sigma_shift")
+    own = ("name", "rejected", "mean", "rms", "shift", "rate", "sigma_shift", "sigma_rate")
     arm, turn = figures.lever_arm, figures.boresight
     return {
         "strips": [pick(strip, *own, images="count") for strip in figures.strips],

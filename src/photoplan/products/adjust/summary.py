@@ -289,6 +289,7 @@ def _strips(result: MapResult) -> tuple[StripFigures, ...]:
                 shift=_triple(frame.map_vectors(found.shift, middle) if known and found is not None else nothing),
                 rate=_triple(frame.map_vectors(found.rate, middle) if known and found is not None else nothing),
                 sigma_shift=_triple(found.sigma[:3] if found is not None else nothing),
+                sigma_rate=_triple(found.sigma[3:] if found is not None else nothing),
             )
         )
     return tuple(out)

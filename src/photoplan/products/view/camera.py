@@ -15,6 +15,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.risen import EarthBend, Exaggeration
 from photoplan.cameras.warped import Warp
 from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.geometry.bounds import odd_place
 from photoplan.geometry.grid import USUAL_TILE, refuse_absurd
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
@@ -220,9 +221,13 @@ def _of_standpoint(request: CameraRequest, ground: ViewGround) -> ViewCamera:
     assert request.position is not None
     X, Y = request.position
     floor = float(ground.terrain.heights(np.array([X, Y])))
+    Z = floor + request.height if request.altitude is None else request.altitude
+    for what, place in (("standpoint", (X, Y, Z)), ("look-at point", request.look_at)):
+        odd = place and odd_place((*place, math.nan)[:3], camera=True)
+        if odd:
+            raise InputError(f"{what}: {odd}")
     if request.altitude is None and not math.isfinite(floor):
         raise InputError(f"standpoint {X:.10g} {Y:.10g}: the terrain has no height there; give its `altitude`")
-    Z = floor + request.height if request.altitude is None else request.altitude
     center = np.array([X, Y, Z])
     look_at = None
     if request.look_at is not None:

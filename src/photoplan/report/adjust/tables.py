@@ -99,7 +99,7 @@ def position_parts(facts: AdjustFigures) -> list[str]:
         drift: list[Row] = [
             [s.name]
             + [cell(f"{plain(v, None, True)} ± {plain(e)}") for v, e in zip(s.shift, s.sigma_shift)]
-            + [cell(figures(v)) for v in s.rate]
+            + [cell(f"{figures(v)} ± {figures(e)}") for v, e in zip(s.rate, s.sigma_rate)]
             for s in shifted[:MOST_ROWS]
         ]
         parts.append(table(["strip", "shift X m", "Y", "Z", "rate X m/s", "Y", "Z"], drift) + _more(len(shifted)))
