@@ -72,9 +72,9 @@ def test_options_of_a_verb(verb):
     # Of a mosaic only those are listed that an orthophoto does not have, of an object those that a mosaic has not.
     same = {
         "mosaic": options_of("ortho") - {"--true", "--ground", "--method", "--fill"},
-        "object": options_of("mosaic") - {"--name", "--seams", "--feather", "--sheets"},
+        "object": options_of("mosaic") - {"--name", "--seams", "--feather", "--blend", "--sheets"},
     }.get(verb, set())
-    others = {"--true", "--name", "--seams", "--feather", "--sheets"} if same else set()
+    others = {"--true", "--name", "--seams", "--feather", "--blend", "--sheets"} if same else set()
     assert (told - elsewhere - (others - options_of(verb))) | same == options_of(verb)
 
 

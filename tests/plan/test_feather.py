@@ -44,8 +44,8 @@ def weights(owner: np.ndarray, width: int, seen: list[np.ndarray], window: Windo
     ground = TileGround.of(target, wide, SURFACE.relief(target, wide))
     numbers: Any = {k: k for k in range(len(seen))}
     found = feather.weights(padded(owner)[wide.slices(WIDE)], ground, window, numbers, SURFACE)
-    none = np.zeros((window.height, window.width), np.float32)
-    return np.stack([found.get(k, none) for k in range(len(seen))])
+    none = np.zeros((1, window.height, window.width), np.float32)
+    return np.stack([found[k][0] if k in found else none for k in range(len(seen))])[:, 0]
 
 
 def everything() -> np.ndarray:
@@ -104,6 +104,19 @@ def test_weights_do_not_depend_on_the_window_and_three_add_up() -> None:
     inner = plain.sum(axis=0)[30:-30, 30:-30]
     np.testing.assert_allclose(inner[inner > 0], 1, atol=1e-6)
     assert not plain[:, owner == 0].any()
+
+
+def test_bands_pass_in_strips_of_their_own() -> None:
+    feather = Feather(Masks(everything(), everything()), 32, bands=True)
+    assert feather.reaches == (2, 4, 8, 16) and Feather(Masks(), 32).reaches == (16,)
+    wide, target = feather.around(GRID.window), MapTarget(GRID)
+    ground = TileGround.of(target, wide, SURFACE.relief(target, wide))
+    cameras: Any = {0: 0, 1: 1}
+    found = feather.weights(padded(halves())[wide.slices(WIDE)], ground, GRID.window, cameras, SURFACE)
+    (first, _), (second, seen) = found[0], found[1]
+    both = (first[:, 60] > 0) & (second[:, 60] > 0)
+    assert both.sum(axis=1).tolist() == [4, 8, 16, 32] and seen.shape == ground.relief.shape
+    np.testing.assert_allclose((first + second)[:, 60, 44:76], 1, atol=1e-6)
 
 
 def test_widths_that_cannot_be() -> None:

@@ -10,6 +10,7 @@ import pyogrio.raw
 import pytest
 import rasterio
 import shapely
+from scipy.ndimage import binary_dilation, uniform_filter
 from tools.command import Here
 from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Block, make_project, texture, write_image
 from tools.town import write_town
@@ -206,4 +207,39 @@ def test_feathered_images_pass_into_each_other(small: Block, capsys: pytest.Capt
     np.testing.assert_array_equal(soft[away], hard[away])
     assert away.any() and (soft != hard).any()
     said = photoplan(*plain, "--feather", -1, "--name", "x")
+    assert said.code == 2 and "--feather" in said.err
+
+
+def test_bands_keep_fine_detail_and_pass_coarse_over_the_width(
+    small: Block, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Images of one grey value each, with noise of their own: no step at seams, and noise as strong as elsewhere."""
+    random = np.random.default_rng(2)
+    for path, grey in zip(small.images, (80, 120, 170)):
+        noise = random.normal(grey, 12, (3, SIZE[1], SIZE[0]))
+        write_image(path, np.clip(np.rint(noise), 1, 255).astype(np.uint8))
+    photoplan, folder = Here(capsys), small.folder / "products"
+    plain = ["mosaic", small.project, *OPTIONS]
+    assert photoplan(*plain, "--sources", "--name", "hard").code == 0
+    assert photoplan(*plain, "--feather", 48, "--name", "mean").code == 0
+    assert photoplan(*plain, "--feather", 48, "--blend", "multiband", "--name", "bands").code == 0
+    said = photoplan(*plain, "--feather", 48, "--blend", "multiband", "--name", "whole", "--tile", 512)
+    assert said.code == 0, said.err
+    hard, mean, bands = (made(folder / f"{name}.tif").astype(float) for name in ("hard", "mean", "bands"))
+    # Anchors of other tiles are known to hundredths of a pixel.
+    apart = np.abs(bands - made(folder / "whole.tif"))
+    assert apart.max() <= 1 and (apart > 0).mean() < 0.01
+    sources = made(folder / "hard_sources.tif")[0]
+    seam = np.zeros(sources.shape, bool)
+    seam[:, 1:] = (sources[:, 1:] != sources[:, :-1]) & (sources[:, 1:] > 0) & (sources[:, :-1] > 0)
+    near, far = (binary_dilation(seam, iterations=n) for n in (14, 60))
+    strip = near & ~binary_dilation(seam, iterations=4) & (np.abs(mean - hard).max(axis=0) > 2)
+    strip[185:] = False
+    strong = [np.std((each - uniform_filter(each, (0, 3, 3)))[:, strip]) for each in (hard, mean, bands)]
+    assert strip.sum() > 500 and strong[1] < 0.85 * strong[0] and strong[2] > 0.97 * strong[0]
+    smooth = [np.abs(np.diff(uniform_filter(each, (0, 9, 9)))) for each in (hard, bands)]
+    steps = [each[:, :185][:, seam[:185, 1:]].mean() for each in smooth]
+    assert steps[1] < 0.6 * steps[0]
+    np.testing.assert_array_equal(bands[:, ~far & (sources > 0)], hard[:, ~far & (sources > 0)])
+    said = photoplan(*plain, "--blend", "multiband", "--name", "x")
     assert said.code == 2 and "--feather" in said.err

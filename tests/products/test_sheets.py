@@ -9,6 +9,7 @@ import numpy as np
 import pyogrio.raw
 import pytest
 import rasterio
+import rasterio.features
 import shapely
 from tools.command import Here
 from tools.small_block import CRS, Block
@@ -22,6 +23,13 @@ def regions(path: Path, right: float) -> Path:
     box = shapely.box(500_330, 5_300_180, right, 5_300_220)
     pyogrio.raw.write(path, shapely.to_wkb(np.array([box])), [np.array(["three"], object)], ["image"],
                       layer="regions", driver="GPKG", geometry_type="Polygon", crs=CRS)  # fmt: skip
+    return path
+
+
+def polygons(path: Path, shapes: dict[str, shapely.Geometry]) -> Path:
+    path.unlink(missing_ok=True)
+    pyogrio.raw.write(path, shapely.to_wkb(np.array(list(shapes.values()))), [np.array(list(shapes), object)], ["name"],
+                      layer="sheets", driver="GPKG", geometry_type="Polygon", crs=CRS)  # fmt: skip
     return path
 
 
@@ -87,3 +95,78 @@ def test_sheets_that_cannot_be(small: Block, capsys: pytest.CaptureFixture[str])
     (folder / "m.vrt").write_text("mine")
     said = photoplan(*words, 200)
     assert said.code == 2 and "m.vrt" in said.err and not list(folder.glob("*.tif"))
+
+
+def test_drawn_sheets_are_the_mosaic_inside_their_lines(small: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    """A square, a triangle beside it whose box lies over it, and a polygon outside: each on its own, then as one."""
+    photoplan, folder = Here(capsys), small.folder / "products"
+    seams = regions(small.folder / "drawn.gpkg", 500_355)
+    words = ("mosaic", small.project, *OPTIONS, "--seams", seams)
+    whole = photoplan(*words, "--bounds", *BOUNDS)
+    assert whole.code == 0, whole.err
+    shapes = {
+        "North 1": shapely.box(500_250, 5_300_180, 500_380, 5_300_280),
+        "slope": shapely.Polygon([(500_380, 5_300_280), (500_380, 5_300_120), (500_480.5, 5_300_120.5)]),
+        "far": shapely.box(0, 0, 10, 10),
+    }
+    sheets = polygons(small.folder / "sheets.gpkg", shapes)
+    cut = (*words, "--sheets", sheets, "--name", "m", "--json")
+    said = photoplan(*cut)
+    assert said.code == 0 and "in 2 sheets" in said.err, said.err
+    names = [Path(each["path"]).name for each in json.loads(said.out)["products"]]
+    assert names == ["m_North 1.tif", "m_slope.tif"] or names == ["m_North_1.tif", "m_slope.tif"]
+    with rasterio.open(folder / "mosaic.tif") as file:
+        wanted, at = file.read().astype(int), file.transform
+    with rasterio.open(folder / "m.vrt") as file:
+        inside = rasterio.features.geometry_mask(
+            [shapes["North 1"], shapes["slope"]], file.shape, file.transform, invert=True
+        )
+        row, col = (round(v) for v in ((at.f - file.bounds.top), (file.bounds.left - at.c)))
+        same = wanted[:, row : row + file.height, col : col + file.width]
+        apart = np.abs(file.read().astype(int) - same)
+        assert apart[:, inside].max() <= 1 and (apart[:, inside] > 0).mean() < 1e-3 and inside.mean() > 0.5
+        assert not file.read()[:, ~inside].any()
+    item = json.loads((folder / "m_slope.stac.json").read_text())
+    assert len(item["geometry"]["coordinates"][0]) > 6 and shapely.geometry.shape(item["geometry"]).is_valid
+    # An edited seam inside the square alone, then another line of the triangle alone.
+    before = states(folder)
+    seams.unlink()
+    regions(seams, 500_345)
+    assert photoplan(*cut, "--overwrite").code == 0
+    assert {name for name, each in states(folder).items() if each != before[name]} == {names[0]}
+    before = states(folder)
+    shapes["slope"] = shapely.Polygon([(500_380, 5_300_280), (500_380, 5_300_120), (500_470.5, 5_300_120.5)])
+    polygons(sheets, shapes)
+    assert photoplan(*cut, "--overwrite").code == 0
+    assert {name for name, each in states(folder).items() if each != before[name]} == {names[1]}
+
+
+def test_drawn_sheets_of_a_plan_file(small: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan = Here(capsys)
+    shape = shapely.Polygon([(500_300, 5_300_280), (500_300, 5_300_180), (500_380.5, 5_300_180.5)])
+    sheets = polygons(small.folder / "sheets.gpkg", {"a": shape})
+    words = ("mosaic", small.project, *OPTIONS, "--sheets", sheets)
+    assert photoplan(*words).code == 0
+    sheets_of_plan = small.folder / "plan.gpkg"
+    said = photoplan(*words, "--name", "planned", "--plan", sheets_of_plan)
+    assert said.code == 0, said.err
+    sheets.unlink()
+    assert photoplan("run", sheets_of_plan, "--no-quicklook").code == 0
+    one, other = (small.folder / "products" / f"{name}_a.tif" for name in ("mosaic", "planned"))
+    with rasterio.open(one) as first, rasterio.open(other) as second:
+        np.testing.assert_array_equal(first.read(), second.read())
+
+
+def test_fault_12_drawn_sheets_that_cannot_be(small: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan, box = Here(capsys), shapely.box(500_250, 5_300_180, 500_380, 5_300_280)
+    words = ("mosaic", small.project, *OPTIONS, "--sheets")
+    for k, (shapes, told) in enumerate((
+        ({"a": box, "A": box}, "'a' and 'A' would have one file"),
+        ({"a": shapely.box(0, 0, 1, 1)}, "no polygon touches"),
+        ({"a": shapely.Polygon([(0, 0), (9, 9), (9, 0), (0, 9)])}, "cross themselves"),
+    )):  # fmt: skip
+        said = photoplan(*words, polygons(small.folder / f"{k}.gpkg", shapes))
+        assert said.code == 3 and told in said.err, said.err
+    said = photoplan(*words, small.folder / "none.gpkg")
+    assert said.code == 3 and "none.gpkg" in said.err
+    assert not list((small.folder / "products").glob("*.tif"))

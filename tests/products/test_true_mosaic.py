@@ -59,14 +59,14 @@ def town(small: Block) -> Block:
     return small
 
 
-@pytest.mark.parametrize("feather", [0, 30])
+@pytest.mark.parametrize(("feather", "blend"), [(0, "mean"), (30, "mean"), (30, "multiband")])
 def test_what_any_image_sees_is_there_once_and_where_it_stands(
-    town: Block, capsys: pytest.CaptureFixture[str], feather: float
+    town: Block, capsys: pytest.CaptureFixture[str], feather: float, blend: str
 ) -> None:
     """Also if images pass into each other over 30 m: roofs lie 30 m away in an image that does not see beside them."""
     photoplan = Here(capsys)
     words = ["--bounds", *BOUNDS, "--resolution", 1, "--tile", 128, "--kernel", "bilinear", "--no-quicklook", "--json"]
-    said = photoplan("mosaic", town.project, *words, "--sources", "--feather", feather)
+    said = photoplan("mosaic", town.project, *words, "--sources", "--feather", feather, "--blend", blend)
     assert said.code == 0, said.err
     (told,) = json.loads(said.out)["products"]
     with rasterio.open(town.folder / "products" / "mosaic.tif") as file:

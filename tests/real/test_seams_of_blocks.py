@@ -86,11 +86,12 @@ def test_four_frames_balanced(shared: Path, tmp_path: Path) -> None:
     balance_project(BalanceRequest(project, workers=2))
     seams = make_seams(SeamsRequest(project, resolution=5.0, workers=2)).path
     ratios = {}
-    for name, file, feather in (("score", None, 0.0), ("content", str(seams), 0.0), ("soft", str(seams), 20.0)):
-        choice = Choice(name, seams=file, feather=feather)
+    cases = [("score", None, 0.0, "mean"), ("content", str(seams), 0.0, "mean"), ("soft", str(seams), 20.0, "mean")]
+    for name, file, feather, blend in [*cases, ("bands", str(seams), 80.0, "multiband")]:
+        choice = Choice(name, seams=file, feather=feather, blend=blend)
         plan = plan_mosaic(load_project(project), resolution=5.0, sources=True, choice=choice)
         execute(plan, tmp_path / "products", Run(workers=2, quicklook=False))
         on, beside = across(tmp_path / "products", name)
         ratios[name] = on / beside
         print(f"\n{name}: across {on:.2f}, beside {beside:.2f} grey values, ratio {ratios[name]:.3f}")
-    assert ratios["soft"] < 1.0 < ratios["content"] < 1.1 < ratios["score"]
+    assert ratios["soft"] < 1.0 < ratios["content"] < 1.1 < ratios["score"] and ratios["bands"] <= 1.0

@@ -19,11 +19,13 @@ from photoplan.cli.options import PATH, choosing_options, executing, product_opt
               help="Regions with their images, that come before the score: an edited NAME_seams.gpkg.")  # fmt: skip
 @click.option("--feather", type=float, default=0.0, metavar="W",
               help="Images pass into each other along seams, over W metres, where both see [0].")  # fmt: skip
-@click.option("--sheets", type=float, metavar="SIZE",
-              help="Cut into squares of SIZE metres, each a file with a STAC item; NAME.vrt shows all.")  # fmt: skip
+@click.option("--blend", type=click.Choice(["mean", "multiband"]), default="mean", show_default=True,
+              help="All detail passes over the width, or fine detail at the seam and coarse over W.")  # fmt: skip
+@click.option("--sheets", metavar="SIZE|FILE",
+              help="Cut into squares of SIZE metres or named polygons, with STAC items; NAME.vrt shows all.")  # fmt: skip
 @executing
 def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str, ...], seams: Path | None,
-            feather: float, sheets: float | None, **options: Any) -> None:  # fmt: skip
+            feather: float, blend: Any, sheets: str | None, **options: Any) -> None:  # fmt: skip
     """Make one orthophoto of all images: each pixel from the best of those that see it.
 
     What no image sees is left empty and told in square metres. The same command continues a run that was interrupted.
@@ -39,8 +41,17 @@ def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str,
         prefer=prefer,
         seams=None if seams is None else str(seams.absolute()),
         feather=feather,
-        sheets=sheets,
+        blend=blend,
+        sheets=None if sheets is None else _sheets(sheets),
     )
     how = running.How.from_options(options)
     with running.telling(how) as events:
         running.planned(load_project(project), plan_mosaic, {**options, "choice": choice}, how, events)()
+
+
+def _sheets(given: str) -> float | str:
+    """A size, or the path of a file."""
+    try:
+        return float(given)
+    except ValueError:
+        return str(Path(given).absolute())

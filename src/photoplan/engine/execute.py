@@ -9,6 +9,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.engine.bands import detail_bands
 from photoplan.engine.base import Reader, Source
 from photoplan.engine.run import Made, Output
 from photoplan.geometry.grid import Window
@@ -110,7 +111,7 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
     """
     window, cameras = tile.window, {row: sources[row].camera for row in tile.sources}
     compiled = compile_tile(product, tile, cameras, surface)
-    every = [*compiled.layers, *(layer for _, layers in compiled.blends for layer in layers)]
+    every = [*compiled.layers, *(layer for blend in compiled.blends for layer in blend.tile.layers)]
     needed = max((_bytes(layer, sources[layer.source]) for layer in every), default=0)
     if needed <= MOST_SOURCE_BYTES or max(window.width, window.height) <= SMALLEST_PART:
         values, valid = execute_tile(compiled, sources, kernel)
@@ -135,18 +136,24 @@ def _blend(
     values, valid = onto
     if not tile.blends or not len(values):
         return
-    total, weights = np.zeros(values.shape, np.float64), np.zeros(valid.shape, np.float64)
-    for weight, layers in tile.blends:
-        shown, usable = execute_tile(replace(tile, layers=layers, blends=()), sources, kernel)
+    # In float64: the least weights are those of sources that stand alone in the end.
+    total = np.zeros((len(tile.reaches), *values.shape), np.float64)
+    weights = np.zeros((len(tile.reaches), *valid.shape), np.float64)
+    for blend in tile.blends:
+        shown, usable = execute_tile(blend.tile, sources, kernel)
         if len(shown):
-            # In float64: the least weights are those of sources that stand alone in the end.
-            mine = weight.astype(np.float64) * usable
-            total += mine * np.where(usable, shown, 0)
+            inner = tile.window.slices(blend.tile.window)
+            mine = blend.weights.astype(np.float64) * usable[inner]
             weights += mine
-    at = valid & (weights > 0)
-    mean = total[:, at] / weights[at]
-    whole = values.dtype.kind in "iu"
-    values[:, at] = (np.floor(mean + 0.5) if whole else mean).astype(values.dtype)
+            for k, band in enumerate(detail_bands(shown, usable, tile.reaches, inner)):
+                total[k] += mine[k] * band
+    # Where whoever was to paint has nothing, some bands may have no weight.
+    at = valid & (weights > 0).all(axis=0)
+    mean = (total[:, :, at] / weights[:, None, at]).sum(axis=0)
+    if values.dtype.kind in "iu":
+        limits = np.iinfo(values.dtype)
+        mean = np.clip(np.floor(mean + 0.5), limits.min, limits.max)
+    values[:, at] = mean.astype(values.dtype)
 
 
 def _refuse(tile: CompiledTile, valid: NDArray[np.bool_], refused: dict[int, NDArray[np.bool_]]) -> bool:

@@ -44,14 +44,16 @@ def write_virtual(path: Path, rasters: Sequence[Path]) -> None:
     size = round((right - left) / resolution), round((top - bottom) / resolution)
 
     def sources(band: str) -> str:
-        found = []
+        found, none = [], 0 if band.startswith("mask") else nodata
         for name, x, y, width, height in facts:
             to = f'xOff="{round((x - left) / resolution)}" yOff="{round((top - y) / resolution)}"'
             at = f'xSize="{width}" ySize="{height}"'
             found.append(
                 f'<ComplexSource><SourceFilename relativeToVRT="1">{escape(name)}</SourceFilename><SourceBand>{band}'
                 f'</SourceBand><SrcRect xOff="0" yOff="0" {at}/><DstRect {to} {at}/>'
-                + ("" if nodata is None or band.startswith("mask") else f"<NODATA>{nodata!r}</NODATA>")
+                # Where sheets of any outline lie over each other, what one does not show is the other's.
+                + ("" if none is None else f"<NODATA>{none!r}</NODATA>")
+                + ("<UseMaskBand>true</UseMaskBand>" if masked and not band.startswith("mask") else "")
                 + "</ComplexSource>"
             )
         return "\n".join(found)

@@ -3,7 +3,8 @@
 The weight of an image is the share of a square window around the pixel that it owns, twice over, so that weights bend
 at no place and, where three meet, still add up to one. An image that does not see a pixel, or hardly (beside its border
 and beside what hides ground from it), has no weight there, and gains it over half the width: nothing is carried across
-an occlusion, and no new seam appears at its edge.
+an occlusion, and no new seam appears at its edge. Where detail passes by bands (Burt and Adelson 1983), each band has
+such weights of its own, of the width of its detail.
 """
 
 from __future__ import annotations
@@ -37,11 +38,21 @@ class Feather:
     rule: Seeing
     width: int
     """Of the strip in which images pass into each other, pixels."""
+    bands: bool = False
+    """Whether finer detail passes in narrower strips: each half as wide as the next."""
 
     @property
     def reach(self) -> int:
         """Pixels around a tile that decide about its weights."""
         return 2 * ((self.width + 2) // 4)
+
+    @property
+    def reaches(self) -> tuple[int, ...]:
+        """`reach` of each band, from the finest; of one, if all detail passes alike."""
+        found = [self.reach]
+        while self.bands and found[0] >= 4:
+            found.insert(0, 2 * (found[0] // 4))
+        return tuple(found)
 
     def around(self, window: Window) -> Window:
         """A window of a product with what decides about it, also beyond the product."""
@@ -55,9 +66,9 @@ class Feather:
         window: Window,
         cameras: Mapping[int, Projection],
         surface: Surface,
-    ) -> dict[int, NDArray[np.float32]]:
-        """Weights of the images that share pixels of a window, by row of the table of sources; all 0 where one alone
-        paints.
+    ) -> dict[int, tuple[NDArray[np.float32], NDArray[np.bool_]]]:
+        """Weights of the images that share pixels of a window, by row of the table of sources, shape (bands, height,
+        width); all 0 where one alone paints. With each the pixels of `ground` that it sees or owns.
 
         Parameters
         ----------
@@ -73,22 +84,23 @@ class Feather:
         painted = owner[at] > 0
         found = {}
         for row in rows:
-            share = _twice(owner == row + 1, self.reach // 2)[at]
-            if not share.any():
+            mine = owner == row + 1
+            shares = [_twice(mine, reach // 2)[at] for reach in self.reaches]
+            if not shares[-1].any():
                 continue
             sees = self.rule.sees(ground, cameras[row], surface)
-            weight = share * _from_edge(sees, self.reach)[at]
-            weight[~painted] = 0.0
+            weights = np.stack([share * _from_edge(sees, r)[at] for share, r in zip(shares, self.reaches)])
+            weights[:, ~painted] = 0.0
             # Whom nobody else can stand in for keeps what is his.
-            weight[(owner[at] == row + 1) & (weight == 0)] = np.finfo(np.float32).tiny
-            found[row] = weight.astype(np.float32)
-        several = sum((weight > 0).astype(np.uint8) for weight in found.values()) > 1
-        shared = {row: np.where(several, weight, np.float32(0)) for row, weight in found.items()}
-        return {row: weight for row, weight in shared.items() if weight.any()}
+            weights[mine[at] & (weights == 0)] = np.finfo(np.float32).tiny
+            found[row] = weights.astype(np.float32), sees | mine
+        several = sum((weights[-1] > 0).astype(np.uint8) for weights, _ in found.values()) > 1
+        shared = {row: (np.where(several, weights, np.float32(0)), seen) for row, (weights, seen) in found.items()}
+        return {row: (weights, seen) for row, (weights, seen) in shared.items() if weights.any()}
 
 
-def feather_of(rule: Seeing, metres: float, resolution: float, tile: int) -> Feather | None:
-    """The feather of a width in metres; None: it is less than a pixel to both sides.
+def feather_of(rule: Seeing, metres: float, resolution: float, tile: int, bands: bool = False) -> Feather | None:
+    """The feather of a width in metres, by bands or not; None: it is less than a pixel to both sides.
 
     Raises
     ------
@@ -97,7 +109,7 @@ def feather_of(rule: Seeing, metres: float, resolution: float, tile: int) -> Fea
     """
     if not (np.isfinite(metres) and metres >= 0):
         raise UsageError(f"`feather` {metres:g}; a width in metres is needed, 0 for none")
-    made = Feather(rule, round(min(metres / resolution, 1e9)))
+    made = Feather(rule, round(min(metres / resolution, 1e9)), bands)
     if made.reach > tile:
         raise UsageError(
             f"`feather` {metres:g} m is {made.width} pixels; at most {2 * tile} are possible with tiles of {tile}: "

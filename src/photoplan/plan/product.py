@@ -14,6 +14,7 @@ from photoplan.geometry.grid import Window
 from photoplan.kernels.footprint import depth_tilt, footprint_levels
 from photoplan.kernels.position import tile_runs
 from photoplan.plan.anchors import Anchors
+from photoplan.plan.choice import Drawn
 from photoplan.plan.compile import FINEST, AnchorRule, compile_anchors
 from photoplan.plan.feather import Feather
 from photoplan.plan.ground import TileGround
@@ -47,6 +48,16 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
+class Blend:
+    """What an image gives where others paint, too."""
+
+    weights: NDArray[np.float32]
+    """By bands of detail from the finest, shape (bands, height, width) of the tile."""
+    tile: CompiledTile
+    """What it paints for that: of the tile, or with what is around it if there are several bands."""
+
+
+@dataclass(frozen=True, eq=False)
 class CompiledTile:
     """Relief, owner and anchors of a tile: all that the engine needs besides pixels."""
 
@@ -62,8 +73,10 @@ class CompiledTile:
     """See `Share.owner`."""
     hidden: NDArray[np.bool_] | None
     """See `Share.hidden`."""
-    blends: tuple[tuple[NDArray[np.float32], tuple[Layer, ...]], ...] = ()
-    """Weights of images along seams, shape (height, width), with the layers by which each paints where it has any."""
+    blends: tuple[Blend, ...] = ()
+    """Of images that pass into each other along seams."""
+    reaches: tuple[int, ...] = ()
+    """How far their detail spreads, band by band, see `Feather.reaches`."""
 
     @property
     def residual(self) -> float:
@@ -94,6 +107,8 @@ class ProductPlan:
     """Who paints which pixel; None: there is one source."""
     feather: Feather | None = None
     """How sources pass into each other along seams; None: they do not."""
+    clip: Drawn | None = None
+    """What of the target the product shows, where rows are not 0; None: all."""
 
     def __post_init__(self) -> None:
         if len(self.sources) != 1 and self.owners is None:
@@ -118,6 +133,8 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Project
         What the target's depth is taken from.
     """
     relief, tilt = _depth(product, tile.window, surface)
+    if product.clip is not None:
+        relief = np.where(product.clip.rows(tile.window) > 0, relief, np.float32(np.nan))
     ground = TileGround.of(product.target, tile.window, relief)
     if product.feather is not None:
         return _feathered(product, tile, cameras, (ground, tilt), surface)
@@ -142,11 +159,25 @@ def _feathered(
     owner = np.ascontiguousarray(share.owner[at])
     hidden = None if share.hidden is None else np.ascontiguousarray(share.hidden[at])
     made = _compiled(product, tile, cameras, depth, Share(owner, hidden))
-    blends = []
-    for row, weight in product.feather.weights(share.owner, ground, tile.window, cameras, surface).items():
-        mine = Share(np.where(weight > 0, np.uint16(row + 1), np.uint16(0)))
-        blends.append((weight, _compiled(product, tile, cameras, depth, mine).layers))
-    return replace(made, blends=tuple(blends))
+    feather, blends = product.feather, []
+    if len(feather.reaches) > 1:
+        tile, depth, at = replace(tile, window=wide), (ground, None), np.s_[:, :]
+    for row, (weights, seen) in feather.weights(share.owner, ground, made.window, cameras, surface).items():
+        wanted = np.zeros(seen.shape, np.bool_)
+        wanted[made.window.slices(wide)] = weights[-1] > 0
+        if len(feather.reaches) > 1:
+            wanted = _spread(wanted, feather.reaches[-2]) & seen
+        mine = Share(np.where(wanted[at], np.uint16(row + 1), np.uint16(0)))
+        blends.append(Blend(weights, _compiled(product, tile, cameras, depth, mine)))
+    return replace(made, blends=tuple(blends), reaches=feather.reaches)
+
+
+def _spread(some: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Pixels with one of some in the square around them."""
+    # Products without seams do without it, as of distances.
+    from scipy.ndimage import maximum_filter  # noqa: PLC0415
+
+    return np.asarray(maximum_filter(some, 2 * reach + 1, mode="constant"))
 
 
 def compile_next(

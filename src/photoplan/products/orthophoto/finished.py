@@ -136,10 +136,10 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool, picture: P
 
 
 def _without_seams(settings: OrthoSettings) -> OrthoSettings:
-    """Settings without the name of a file of seams: its content decides, which is part of the key."""
+    """Settings without the names of files of seams and of sheets: their content decides, which is part of the key."""
     if settings.choice is None:
         return settings
-    return replace(settings, choice=replace(settings.choice, seams=None))
+    return replace(settings, choice=replace(settings.choice, seams=None, sheets=None))
 
 
 def _is_there(path: Path) -> bool:

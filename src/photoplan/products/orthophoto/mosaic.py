@@ -27,7 +27,7 @@ from photoplan.products.orthophoto.plan import (
 )
 from photoplan.products.orthophoto.settings import Choice, OrthoSettings
 from photoplan.products.orthophoto.sharpness import with_blur
-from photoplan.products.orthophoto.sheets import sheets_of
+from photoplan.products.orthophoto.sheets import Sheet, drawn_sheets, sheets_of
 from photoplan.surfaces.objects import painted_surface
 
 
@@ -68,9 +68,12 @@ def plan_mosaic(
     looked = with_blur(looked, grid, chosen, events)
     assert chosen.choice is not None
     name, size = safe_stem(chosen.choice.name), chosen.choice.sheets
-    parts = [("", grid)] if size is None else sheets_of(grid, size)
+    if isinstance(size, str):
+        parts = drawn_sheets(grid, project.resolve(size))
+    else:
+        parts = [Sheet("", grid)] if size is None else sheets_of(grid, size)
     events.begin("finding tiles", len(looked) * len(parts), "images")
-    found = [_product(project, chosen, looked, name + end, part, events) for end, part in parts]
+    found = [_product(project, chosen, looked, name, part, events) for part in parts]
     products = tuple(each for each in found if each is not None)
     seen = {image for each in products for image in each.images}
     blind += [f"{one.name}: sees nothing inside the bounds" for one in looked if one.name not in seen]
@@ -79,10 +82,11 @@ def plan_mosaic(
 
 
 def _product(
-    project: Project, chosen: OrthoSettings, looked: Sequence[Looked], name: str, grid: MapGrid, events: Events
+    project: Project, chosen: OrthoSettings, looked: Sequence[Looked], name: str, sheet: Sheet, events: Events
 ) -> OrthoProduct | None:
     """A mosaic, or a sheet of one, of the images that see a part of it; None: none does."""
     assert chosen.choice is not None
+    name, grid = name + sheet.end, sheet.grid
     # Whose seams lie beside a tile decides about weights in it: also beyond the product.
     side = chosen.tile if chosen.choice.feather else 0
     margin = side * grid.resolution
@@ -114,7 +118,7 @@ def _product(
     looks = tuple(one.look for one in taking)
     every = tuple(one.name for one in looked)
     regions = drawn_regions(project, chosen, taken, grid, every)
-    plan = product_plan(name, taken, grid, shared, chosen, looks, regions)
+    plan = replace(product_plan(name, taken, grid, shared, chosen, looks, regions), clip=sheet.clip)
     return OrthoProduct(plan, looks, keyed(project, plan, chosen))
 
 

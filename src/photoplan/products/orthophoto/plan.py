@@ -221,7 +221,8 @@ def product_plan(
         owners = None if settings.hidden == "show" else InSight(paints_hidden=settings.hidden == "mark")
         return ProductPlan(name=name, sources=images, target=MapTarget(grid), rule=rule, tiles=tiles, owners=owners)
     best = _best(images, settings, settings.choice, looks, regions)
-    feather = feather_of(best, settings.choice.feather, grid.resolution, settings.tile)
+    choice = settings.choice
+    feather = feather_of(best, choice.feather, grid.resolution, settings.tile, choice.blend == "multiband")
     return ProductPlan(
         name=name, sources=images, target=MapTarget(grid), rule=rule, tiles=tiles, owners=best, feather=feather
     )
@@ -304,9 +305,15 @@ def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions
         "nodata": settings.nodata,
         "hidden": settings.hidden,
         "method": [settings.method, settings.fill],
-        "choice": None if settings.choice is None else {**asdict(settings.choice), "name": "", "seams": regions},
+        "choice": None if settings.choice is None else _facts(settings.choice, regions),
+        **({} if plan.clip is None else {"clip": plan.clip.digest(0.0)}),
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def _facts(choice: Choice, regions: str | None) -> dict[str, Any]:
+    """What of a choice decides pixels: of files what they say, not their names."""
+    return {**asdict(choice), "name": "", "seams": regions, "sheets": None}
 
 
 def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:

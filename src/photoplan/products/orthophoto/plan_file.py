@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from photoplan import __version__
@@ -21,6 +22,7 @@ from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tabl
 from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project
+from photoplan.io.regions import Regions
 from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint
 from photoplan.plan.product import compile_tile
@@ -272,6 +274,7 @@ def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
         "images": [_look_header(image, look) for image, look in zip(product.images, product.looks)],
         "tiles": tiles,
         **({} if product.part is None else {"part": asdict(product.part)}),
+        **({} if not isinstance(plan.clip, Regions) else {"clip": shapely.to_wkt(plan.clip.shapes[0][0], -1)}),
     }
 
 
@@ -317,5 +320,7 @@ def _product(
     looks = tuple(_look(each) for each in entry["images"])
     regions = drawn_regions(project, settings, images, grid, project.select(None))
     plan = product_plan(name, images, grid, tiles, settings, looks, regions)
+    if entry.get("clip") is not None:
+        plan = replace(plan, clip=Regions(grid, ((shapely.from_wkt(entry["clip"]), 1),)))
     part = entry.get("part")
     return OrthoProduct(plan, looks, key, part and SingleObject(tuple(part["objects"]), bool(part["below"])))

@@ -12,6 +12,7 @@ from photoplan.plan.choice import Weights
 Kernel = Literal["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"]
 Hidden = Literal["show", "nodata", "mark"]
 Method = Literal["indirect", "direct"]
+Blending = Literal["mean", "multiband"]
 Compression = Literal["deflate", "zstd", "lzw", "jpeg", "none"]
 
 
@@ -35,8 +36,18 @@ class Choice:
     feather: float = 0.0
     """Width in which images pass into each other along seams, metres; 0: they do not."""
 
-    sheets: float | None = None
-    """Side of the sheets that a mosaic is cut into, metres; None: it is one file."""
+    blend: Blending = "mean"
+    """``mean``: all detail passes over that width; ``multiband``: fine detail at the seam, coarse over the width."""
+
+    sheets: float | str | None = None
+    """Side of the squares that a mosaic is cut into, metres, or a file of polygons with names, relative to the
+    project's folder; None: it is one file."""
+
+    def __post_init__(self) -> None:
+        if self.blend not in get_args(Blending):
+            raise UsageError(f"`blend` {self.blend!r}; allowed are {', '.join(get_args(Blending))}")
+        if self.blend == "multiband" and self.feather == 0:
+            raise UsageError("`blend` multiband needs the width over which coarse detail passes; give `feather`")
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Choice:

@@ -1,19 +1,23 @@
-"""Mosaics in sheets: squares of the map whose lines do not depend on the flight, each a product of its own."""
+"""Mosaics in sheets: squares of the map or drawn polygons, whose lines do not depend on the flight, each a product of
+its own."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
+import shapely
 
-from photoplan.errors import UsageError
+from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.names import safe_stem
 from photoplan.io.naming import write_atomically
+from photoplan.io.polygons import read_features
+from photoplan.io.regions import Regions
 from photoplan.io.virtual import write_virtual
 from photoplan.products.orthophoto.finished import ProductResult
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
@@ -24,9 +28,56 @@ _MOST = 10_000
 _POINTS = 8
 
 
-def sheets_of(grid: MapGrid, size: float) -> list[tuple[str, MapGrid]]:
-    """Squares between multiples of a size that touch a grid, from north to south, with the end of their names: the
-    coordinates of their south-west corner.
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A part of a mosaic that is a file of its own."""
+
+    end: str
+    """Of its name."""
+    grid: MapGrid
+    clip: Regions | None = None
+    """What of the grid it shows; None: all."""
+
+
+def drawn_sheets(grid: MapGrid, path: Path) -> list[Sheet]:
+    """Polygons of a file that touch a grid, each on whole pixels of it; a pixel belongs to the polygon that holds its
+    centre, so that sheets with a common line share none.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used, see `read_features`, or two polygons have one name.
+    UsageError
+        There are too many polygons.
+    """
+    found: list[Sheet] = []
+    names: dict[str, str] = {}
+    extent = shapely.box(*grid.bounds)
+    for each in read_features(path, "Polygon", crs=grid.crs).items:
+        end = f"_{safe_stem(each.name)}"
+        # Many file systems do not tell capitals from small letters.
+        if end.casefold() in names:
+            raise InputError(
+                f"{path}: sheets {names[end.casefold()]!r} and {each.name!r} would have one file; give every polygon a "
+                "name of its own, in a column `name`"
+            )
+        names[end.casefold()] = each.name
+        shape = shapely.force_2d(each.geometry)
+        if not shape.intersection(extent).area > 0:
+            continue
+        sheet = MapGrid.covering(shape.bounds, grid.resolution, grid.crs)
+        whole = shapely.box(*sheet.bounds).buffer(-1e-6 * grid.resolution, join_style="mitre")
+        found.append(Sheet(end, sheet, None if shape.contains(whole) else Regions(sheet, ((shape, 1),))))
+    if not found:
+        raise InputError(f"{path}: no polygon touches the mosaic; see to its coordinates: bounds are {grid.bounds}")
+    if len(found) > _MOST:
+        raise UsageError(f"{path}: {len(found)} sheets, more than {_MOST}; choose among them by `bounds`")
+    return found
+
+
+def sheets_of(grid: MapGrid, size: float) -> list[Sheet]:
+    """Squares between multiples of a size that touch a grid, from north to south; their names end with the coordinates
+    of their south-west corner.
 
     Raises
     ------
@@ -49,7 +100,7 @@ def sheets_of(grid: MapGrid, size: float) -> list[tuple[str, MapGrid]]:
         for col in columns:
             bounds = (col * size, row * size, (col + 1) * size, (row + 1) * size)
             sheet = MapGrid.covering(bounds, grid.resolution, grid.crs)
-            found.append((f"_{_number(bounds[0])}_{_number(bounds[1])}", sheet))
+            found.append(Sheet(f"_{_number(bounds[0])}_{_number(bounds[1])}", sheet))
     return found
 
 
@@ -74,10 +125,10 @@ def _item(product: OrthoProduct, result: ProductResult) -> str:
     images were taken."""
     grid = product.grid
     left, bottom, right, top = grid.bounds
-    along = np.linspace(0, 1, _POINTS, endpoint=False)
-    corners = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
-    ring = np.concatenate([a + along[:, None] * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0))])
-    degrees = np.round(crs_step(grid.crs, "EPSG:4326", grid.bounds)(ring), 9)
+    clip = product.plan.clip
+    outline = shapely.box(left, bottom, right, top) if not isinstance(clip, Regions) else clip.shapes[0][0]
+    outline = shapely.segmentize(outline, max(right - left, top - bottom) / _POINTS)
+    degrees = shapely.transform(outline, crs_step(grid.crs, "EPSG:4326", grid.bounds))
     record = json.loads(result.path.with_suffix(".run.json").read_text(encoding="utf-8"))
     code = int(grid.crs.split(":")[1]) if grid.crs.upper().startswith("EPSG:") and grid.crs[5:].isdigit() else None
     properties = {
@@ -97,8 +148,8 @@ def _item(product: OrthoProduct, result: ProductResult) -> str:
         "stac_version": "1.0.0",
         "stac_extensions": ["https://stac-extensions.github.io/projection/v1.1.0/schema.json"],
         "id": result.path.stem,
-        "geometry": {"type": "Polygon", "coordinates": [[*degrees.tolist(), degrees[0].tolist()]]},
-        "bbox": [*degrees.min(axis=0).tolist(), *degrees.max(axis=0).tolist()],
+        "geometry": json.loads(shapely.to_geojson(shapely.set_precision(degrees, 1e-9))),
+        "bbox": [round(float(value), 9) for value in degrees.bounds],
         "properties": properties,
         "links": [],
         "assets": {"data": {"href": f"./{result.path.name}", "type": kind, "roles": ["data"]}},
