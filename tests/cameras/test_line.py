@@ -208,6 +208,15 @@ class TestStrip:
         ("radii", {"semimajor": 1.0, "semiminor": 2.0, "unit": "km"}, "radii"),
         ("instrument_position", {"unit": "m", "positions": [[0, 0, 0]], "ephemeris_times": [0]}, "single moment"),
         ("instrument_position", {"unit": "ft", "positions": [[0, 0, 0]] * 2, "ephemeris_times": [0, 1]}, "'ft'"),
+        (
+            "instrument_position",
+            {
+                "unit": "m",
+                "positions": [[7e6, 0, i * (7e6 if i == 3 else 7e3)] for i in range(9)],
+                "ephemeris_times": [*range(9)],
+            },
+            "from record 3 to 4, in 1 s, .* usual speed of 7e.03",
+        ),
         ("instrument_pointing", {"quaternions": [[2, 0, 0, 0]] * 2, "ephemeris_times": [0, 1]}, "the length 2"),
         ("instrument_pointing", {"quaternions": "none", "ephemeris_times": [0, 1]}, "not a table of numbers"),
     ],

@@ -45,6 +45,18 @@ def test_a_frame_image_as_polynomials(tilt: float) -> None:
     assert max(found.rms) <= found.worst
 
 
+@pytest.mark.parametrize("kappa", [-2.0, 0.1, 1.5])
+def test_a_low_flight_gives_no_pole(kappa: float) -> None:
+    """Over 300 m many quotients are the same function: what rounding leaves of them had poles in the image."""
+    frame = Pinhole(Pose.from_angles((500_300.0, 5_300_200.0, 400.0), (0.014, -0.02, kappa)), 200.0, (200, 150))
+    found = fit_rpc(frame, GROUND, (86.0, 114.0))
+    assert found.worst < 1e-6
+    XYZ = np.stack(frame.rays(np.array([[0.0, 0.0], [199.0, 149.0], [100.0, 75.0]])), axis=0)
+    ground = XYZ[0] + ((80.0 - XYZ[0, :, 2]) / XYZ[1, :, 2])[:, None] * XYZ[1]
+    seen = RpcCamera(found.functions, GROUND, frame.size)
+    assert np.abs(project(seen, ground) - project(frame, ground)).max() < 1e-3
+
+
 def test_polynomials_of_polynomials_over_a_part_of_the_heights() -> None:
     found = fit_rpc(camera(), GROUND, (100.0, 500.0))
     assert found.worst < 1e-6

@@ -14,6 +14,7 @@ from tools.rpc_images import functions
 from photoplan.cameras.rpc import RationalFunctions
 from photoplan.errors import InputError
 from photoplan.io.camera.rpc.file import is_rpc, read_rpc, rpc_beside, rpc_in
+from photoplan.io.raster_info import read_info
 from photoplan.products.describe import describe
 
 RPC = functions()
@@ -128,3 +129,13 @@ def test_an_image_without_them_says_what_may_be_given(tmp_path: Path) -> None:
         pass
     with pytest.raises(InputError, match=r"holds no rational polynomials.*\.rpb"):
         read_rpc(image)
+
+
+def test_fault_18_a_damaged_file_beside_an_image_is_named(tmp_path: Path) -> None:
+    """GDAL reads `NAME_RPC.TXT` of its own accord, and complains when something else is asked."""
+    image = tmp_path / "scene.tif"
+    with rasterio.open(image, "w", driver="GTiff", width=30, height=20, count=1, dtype="uint8"):
+        pass
+    (tmp_path / "scene_RPC.TXT").write_text(changed("scene_RPC.TXT", "LAT_SCALE", "LATSCALE"))
+    with pytest.raises(InputError, match=r"scene\.tif: .*scene_RPC\.TXT .*missing LAT_SCALE.*mend or remove"):
+        read_info(image)

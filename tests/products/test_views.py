@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from tools.command import inside
+from tools.command import inside, unfinished_numbers
 from tools.small_block import SIZE, X0, Y0, Block, write_block
 
 from photoplan.errors import GeometryError, InputError, UsageError
@@ -258,12 +258,22 @@ def test_fault_20_terrain_in_degrees_or_without_a_crs_is_refused(tmp_path: Path)
 
 
 def test_faults_30_32_absurd_numbers_and_pictures_are_refused(small: Block) -> None:
-    for words in (["--from", 1e300, 5e6], ["--from", X0, Y0, "--altitude", 1e300], ["--from", X0, Y0, "--height", 1e9],
-                  ["--from", 1e9, Y0, "--force"], ["--from", X0, Y0, "--altitude", 1e7, "--force"],
-                  ["--from", X0, Y0, "--size", 10**9, 5],
-                  ["--from", X0, Y0, "--fov", 1e-9], ["--from", X0, Y0, "--earth-radius", 6.38]):  # fmt: skip
+    stand = ["--from", X0, Y0]
+    for words in (["--from", 1e300, 5e6], [*stand, "--altitude", 1e300], [*stand, "--height", 1e9],
+                  [*stand, "--roll", 1e5], ["--from", 1e9, Y0, "--force"], [*stand, "--altitude", 1e7, "--force"],
+                  [*stand, "--exaggeration", 2, "--reference", 1e9], [*stand, "--size", 10**9, 5],
+                  [*stand, "--fov", 1e-9], [*stand, "--earth-radius", 6.38]):  # fmt: skip
         said = inside("view", small.terrain, *words, "--azimuth", 0, "--dry-run")
         assert said.code in (1, 2, 3) and "photoplan:" in said.err, said.err
+
+
+def test_picking_says_what_has_no_pixel_without_numbers_that_are_none(small: Block) -> None:
+    words = ["view", "pick", small.terrain, "--from", X0, Y0, "--azimuth", 0]
+    said = inside(*words, "--ground", X0 + 5, Y0 - 90, "--ground", 0, 0)
+    assert said.code == 0 and not unfinished_numbers(said.out), said.out
+    assert re.search(r"point 1: behind the camera = .*: not seen\n", said.out)
+    assert "point 2: 0.000 0.000: not seen (the terrain has no height there)" in said.out
+    assert inside(*words, "--pixel", 1e300, 0).code == 2
 
 
 def test_fault_06_a_bound_on_memory_is_kept_or_refused(small: Block, tmp_path: Path) -> None:

@@ -8,14 +8,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Camera, project
-from photoplan.cameras.rpc import RationalFunctions, terms
+from photoplan.cameras.rpc import BOUND, RationalFunctions, terms
 from photoplan.errors import GeometryError
 from photoplan.geometry.geodetic import GeodeticGround
 
 #: Rounds of the weighting by the denominator; it stands still after three.
 _ROUNDS = 6
-#: Singular values below this part of the largest tell nothing: several quotients are then the same function.
-_RANK = 1e-13
+#: Singular values below this part of the largest tell nothing: several quotients are then the same function. What
+#: rounding leaves of them may put a pole into the volume; then the next is tried, which takes one with less of them.
+_RANKS = (1e-13, 1e-11, 1e-9)
+#: A denominator is to stay above this part of its value in the middle, as far out as polynomials are followed.
+_POLE = 0.05
 #: Image points along a side and heights at which a camera is fitted, and those between them at which it is checked.
 _FIT, _CHECK = (21, 9), (18, 7)
 
@@ -57,8 +60,9 @@ def fitted_functions(geodetic: ArrayLike, xy: ArrayLike) -> RationalFunctions:
             f"{len(ground)} points with extents {', '.join(f'{2 * s:.3g}' for s in scale)} (column, row, longitude, "
             "latitude, height); polynomials need 39 and more that are spread over a volume"
         )
-    T = terms((ground - offset[2:]) / scale[2:])
-    quotients = [_quotient(T, v) for v in ((image - offset[:2]) / scale[:2]).T]
+    normalised = (ground - offset[2:]) / scale[2:]
+    T, beyond = terms(normalised), terms(BOUND * normalised)
+    quotients = [_without_pole(T, beyond, v) for v in ((image - offset[:2]) / scale[:2]).T]
     return RationalFunctions(
         image_offset=(float(offset[0]), float(offset[1])),
         image_scale=(float(scale[0]), float(scale[1])),
@@ -81,12 +85,14 @@ def fit_rpc(camera: Camera, ground: GeodeticGround, heights: tuple[float, float]
     Raises
     ------
     GeometryError
-        There is no volume, or the camera does not look down on it.
+        There is no volume, the camera does not look down on it, or polynomials do not follow it.
     """
     XYZ = _seen(camera, heights, _FIT)
     functions = fitted_functions(ground(XYZ), project(camera, XYZ))
     between = _seen(camera, heights, _CHECK)
     miss = functions(ground(between)) - project(camera, between)
+    if not np.isfinite(miss).all():
+        raise GeometryError("polynomials that follow it have a pole in the image; there are none to write")
     rms = np.sqrt((miss**2).mean(axis=0))
     return FittedRpc(functions, (float(rms[0]), float(rms[1])), float(np.hypot(*miss.T).max()))
 
@@ -109,12 +115,21 @@ def _seen(camera: Camera, heights: tuple[float, float], count: tuple[int, int]) 
     return np.concatenate(planes)
 
 
-def _quotient(T: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+def _without_pole(T: NDArray[np.float64], beyond: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The quotient of most terms whose denominator does not vanish; the last where all do."""
+    for rank in _RANKS:
+        found = _quotient(T, v, rank)
+        if min((T @ found[1]).min(), (beyond @ found[1]).min()) > _POLE:
+            break
+    return found
+
+
+def _quotient(T: NDArray[np.float64], v: NDArray[np.float64], rank: float) -> NDArray[np.float64]:
     """Numerator and denominator (2, 20), the first coefficient of which is 1, with v ≈ (T num) / (T den)."""
     weight: NDArray[np.float64] = np.ones(len(v))
     solution: NDArray[np.float64] = np.zeros(39)
     for _ in range(_ROUNDS):
         A = np.concatenate([T, -v[:, None] * T[:, 1:]], axis=1) * weight[:, None]
-        solution = np.asarray(np.linalg.lstsq(A, v * weight, rcond=_RANK)[0], np.float64)
+        solution = np.asarray(np.linalg.lstsq(A, v * weight, rcond=rank)[0], np.float64)
         weight = np.asarray(1.0 / (1.0 + T[:, 1:] @ solution[20:]), np.float64)
     return np.stack([solution[:20], np.concatenate([[1.0], solution[20:]])])

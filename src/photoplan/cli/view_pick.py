@@ -39,8 +39,17 @@ def command(matrix: Path | None, **options: Any) -> None:
         show(own["output"])
         return
     for each in found:
-        where = f"{each.E:.3f} {each.N:.3f} {each.H:.3f}" if each.E == each.E else "sky"
-        pixel = f"{each.x:.3f} {each.y:.3f}" if each.x == each.x else "behind the camera"
-        state = each.surface if each.seen else f"not seen ({each.surface})" if each.name.startswith("point") else "sky"
-        more = f", {each.distance:.2f} m away, pixel {each.pixel_m:.3g} m" if each.E == each.E else ""
-        show(f"{each.name}: {pixel} = {where}: {state}{more}")
+        show(f"{each.name}: {_told(each)}")
+
+
+def _told(each: Any) -> str:
+    """One line of a pixel or point."""
+    if each.E != each.E:
+        return f"{each.x:.3f} {each.y:.3f} = sky: sky"
+    if each.H != each.H:
+        return f"{each.E:.3f} {each.N:.3f}: not seen (the terrain has no height there)"
+    where = f"{each.E:.3f} {each.N:.3f} {each.H:.3f}"
+    if each.x != each.x:
+        return f"behind the camera = {where}: not seen"
+    state = each.surface if each.seen else f"not seen ({each.surface})"
+    return f"{each.x:.3f} {each.y:.3f} = {where}: {state}, {each.distance:.2f} m away, pixel {each.pixel_m:.3g} m"

@@ -13,6 +13,8 @@ from photoplan.errors import InputError
 _Floats = NDArray[np.float64]
 #: Values (n, k) at the times (n,), seconds.
 Course = Callable[[_Floats], _Floats]
+#: So many times its usual speed nothing flies.
+_JUMP = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +107,23 @@ def between(times: _Floats, quaternions: _Floats, t: _Floats) -> _Floats:
     wa = np.where(near, 1.0 - u, np.sin((1.0 - u) * angle) / sin)
     wb = np.where(near, u, np.sin(u * angle) / sin)
     return np.asarray(wa[:, None] * a + wb[:, None] * b)
+
+
+def odd_step(times: _Floats, places: _Floats) -> str | None:
+    """Where a track (n,), (n, 3) jumps as nothing does that flies: far more than its usual speed; None: nowhere.
+
+    A number in another unit, a wrong sign or a lost digit in a single record is finite, and no other test sees it.
+    """
+    steps, spans = np.linalg.norm(np.diff(places, axis=0), axis=1), np.diff(times)
+    usual = float(np.median(steps / spans))
+    # A metre is left to receivers that stand still.
+    row = int(np.argmax(steps - _JUMP * usual * spans))
+    if not steps[row] > _JUMP * usual * spans[row] + 1.0:
+        return None
+    return (
+        f"from record {row + 1} to {row + 2}, in {spans[row]:.3g} s, it is {steps[row]:.4g} m, at a usual speed of "
+        f"{usual:.3g} m/s"
+    )
 
 
 def continuous(quaternions: _Floats) -> _Floats:

@@ -18,7 +18,7 @@ from photoplan.io.checks import (
     check_sidecars,
     raster_driver,
 )
-from photoplan.io.gdal import gdal_settings, open_raster, warnings_of_gdal
+from photoplan.io.gdal import GDAL_ERRORS, first_cause, gdal_settings, open_raster, warnings_of_gdal
 from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout
 
 
@@ -199,7 +199,14 @@ def _describe(path: Path, driver: str | None, layout: TiffLayout | None, limits:
                 block=dataset.block_shapes[0][::-1],
                 stored=float(dataset.width * dataset.height * pixel_bytes) / path.stat().st_size,
             )
-        return _facts(path, dataset, layout)
+        try:
+            return _facts(path, dataset, layout)
+        except GDAL_ERRORS as error:
+            # Also of what stands beside it: GDAL reads `NAME_RPC.TXT` and others of its own accord.
+            raise InputError(
+                f"{path}: its metadata, or those of a file beside it, cannot be read ({first_cause(error)}); mend or "
+                "remove that file"
+            ) from error
 
 
 def _facts(path: Path, dataset: Any, layout: TiffLayout | None) -> RasterInfo:

@@ -15,7 +15,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.risen import EarthBend, Exaggeration
 from photoplan.cameras.warped import Warp
 from photoplan.errors import GeometryError, InputError, UsageError
-from photoplan.geometry.bounds import odd_place
+from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.grid import USUAL_TILE, refuse_absurd
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
@@ -80,6 +80,10 @@ class CameraRequest:
             flat = value if isinstance(value, tuple) else (value,)
             if any(isinstance(v, float | int) and not math.isfinite(v) for v in flat):
                 raise UsageError(f"`{name}` {value}; finite numbers are needed")
+        odd = odd_angles((self.azimuth or 0.0, self.roll), "deg", ("`azimuth`", "`roll`"))
+        far = odd_place((0.0, 0.0, self.reference or 0.0), camera=True)
+        if odd is not None or far is not None:
+            raise UsageError(odd or f"`reference`: {far}")
         if self.position is not None and (self.look_at is None) == (self.azimuth is None):
             raise UsageError("a standpoint needs either `look_at` X Y [Z] or `azimuth`")
         if self.look_at is not None and len(self.look_at) not in (2, 3):

@@ -21,6 +21,8 @@ from photoplan.surfaces.seen import Seen, ground_size
 
 #: Ground is what a ray meets if it lies no farther behind that than so much of its distance, and so many metres.
 _SAME, _SAME_METRES = 1e-5, 0.05
+#: Columns and rows beyond this belong to no picture.
+_FAR = 1e6
 NUMBERS = ("x", "y", "E", "N", "H", "distance", "incidence_deg", "pixel_m")
 
 
@@ -72,7 +74,7 @@ def pick(request: PickRequest) -> tuple[Picked, ...]:
     Raises
     ------
     UsageError
-        Nothing is asked, or the output exists.
+        Nothing is asked, a pixel lies beyond all pictures, or the output exists.
     InputError
         A file cannot be used.
     GeometryError
@@ -80,6 +82,9 @@ def pick(request: PickRequest) -> tuple[Picked, ...]:
     """
     if not (request.pixels or request.points or request.file):
         raise UsageError("nothing to pick; give `pixels` X Y, `points` X Y or a `file` of points")
+    for x, y in request.pixels:
+        if not max(abs(x), abs(y)) <= _FAR:
+            raise UsageError(f"`pixel` {x:g} {y:g}; positions up to {_FAR:g} are allowed, also outside the picture")
     if request.output is not None:
         check_output(request.output, [request.view.source], overwrite=request.overwrite)
     inputs = [request.view.source, request.file, request.view.matrix]

@@ -19,7 +19,17 @@ from numpy.typing import NDArray
 from photoplan.cameras.line_look import LineLook
 from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
-from photoplan.geometry.motion import EvenTable, between, conjugate, continuous, cubic, quaternions, rotations, times
+from photoplan.geometry.motion import (
+    EvenTable,
+    between,
+    conjugate,
+    continuous,
+    cubic,
+    odd_step,
+    quaternions,
+    rotations,
+    times,
+)
 from photoplan.io.camera.line.model import StatedLine
 
 _Floats = NDArray[np.float64]
@@ -100,6 +110,8 @@ class _Isd:
         """Positions and velocities of the camera in the inertial frame, metres."""
         unit = self._unit("instrument_position")
         positions = unit * self.numbers("instrument_position.positions", (len(self.moments("instrument_position")), 3))
+        if len(positions) > 2 and (odd := odd_step(self.moments("instrument_position"), positions)) is not None:
+            raise InputError(f"{self._path}: instrument_position: {odd}")
         stated = self.has("instrument_position.velocities")
         speeds = unit * self.numbers("instrument_position.velocities", positions.shape) if stated else None
         return positions, speeds

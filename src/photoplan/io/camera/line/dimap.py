@@ -21,7 +21,7 @@ from photoplan.cameras.line_look import LineLook
 from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
 from photoplan.geometry.body import EARTH_RADII
-from photoplan.geometry.motion import EvenTable
+from photoplan.geometry.motion import EvenTable, odd_step
 from photoplan.io.camera.line.model import StatedLine
 
 _Floats = NDArray[np.float64]
@@ -67,6 +67,9 @@ def _track(model: Element, lines: int) -> LineTrack:
     step = float(when[1] - when[0])
     if np.abs(np.diff(when) - step).max() > 1e-6:
         raise InputError("the points of Sensor_Ephemeris are not evenly spaced in time")
+    odd = odd_step(when, positions)
+    if odd is not None:
+        raise InputError(f"Sensor_Ephemeris: {odd}")
     table = EvenTable(float(when[0]), step, positions)
     offset, scale = (_number(model, f"Sensor_Attitudes/{name}") for name in ("OFFSET", "SCALE"))
     cubics = [_numbers(model, f"{_ATTITUDES}/{name}/COEFFICIENTS") for name in _quaternion_names(model)]

@@ -20,7 +20,8 @@ from photoplan.cameras.line_look import LineLook
 from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
 from photoplan.geometry.body import EARTH_RADII, BodyGround
-from photoplan.geometry.motion import between, continuous, cubic, quaternions
+from photoplan.geometry.bounds import odd_angles, odd_place
+from photoplan.geometry.motion import between, continuous, cubic, odd_step, quaternions
 from photoplan.geometry.rotation import ANGLE_UNITS, rotation_from_angles, rotation_opk
 from photoplan.io.camera.line.model import MAX_BYTES, StatedLine
 from photoplan.io.camera.model import Entry, Name, Number, Pixels, Positive, Triple
@@ -131,6 +132,7 @@ def read(path: Path, name: str | None) -> StatedLine:
 def _track(strip: StripFile, path: Path) -> LineTrack:
     flight = strip.flight
     table = _record(path.parent / flight.file)
+    _judge(table, flight, path.parent / flight.file)
     t = table[:, 0] + flight.time_offset - strip.clock.first
     ground = BodyGround(flight.crs, flight.height_system, EARTH_RADII)
     places = ground(table[:, 1:4])
@@ -169,6 +171,22 @@ def _record(path: Path) -> _Floats:
         row = int(np.argmin(np.diff(table[:, 0]))) + 1
         raise InputError(f"{path}: the time of row {row + 1} ({table[row, 0]:g}) is not after that of the row before")
     return np.ascontiguousarray(table)
+
+
+def _judge(table: _Floats, flight: StripFlight, path: Path) -> None:
+    """Refuse what is finite and still cannot be meant."""
+    worst = np.abs(table[:, 4:]).max(axis=1).argmax()
+    odd = odd_angles(table[worst, 4:].tolist(), flight.angle_unit, _COLUMNS.split(",")[4:])
+    if odd is not None:
+        raise InputError(f"{path}: row {worst + 1}: {odd}")
+    low, high = table[:, 3].argmin(), table[:, 3].argmax()
+    for row in {int(np.abs(table[:, 1:3]).max(axis=1).argmax()), int(low), int(high)}:
+        odd = odd_place(table[row, 1:4].tolist(), camera=True)
+        if odd is not None:
+            raise InputError(f"{path}: row {row + 1}: {odd}")
+    odd = odd_step(table[:, 0], table[:, 1:4])
+    if odd is not None:
+        raise InputError(f"{path}: {odd}; correct the record, or leave rows out")
 
 
 def _look(detectors: StripDetectors) -> LineLook:
