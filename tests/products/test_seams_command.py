@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyogrio
@@ -12,7 +16,12 @@ import rasterio.features
 import shapely
 from scipy.ndimage import gaussian_filter, map_coordinates
 from tools.command import Here
+from tools.forked import Mishap, forked
 from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
+
+from photoplan.io.lock import FileLock, lock_of
+from photoplan.products.orthophoto.shown import shown
+from photoplan.products.seams import run
 
 AWAY = (-60.0, 0.0, 60.0)
 NOISE = gaussian_filter(np.random.default_rng(5).normal(size=(3, 420, 420)), (0, 3, 3))
@@ -83,3 +92,84 @@ def test_dry_run_existing_files_and_single_images(block: Block, capsys: pytest.C
     assert said.code == 2 and "exists already" in said.err and path.read_bytes() == before
     said = photoplan("seams", block.project, "--images", NAMES[0], "-o", block.folder / "one.gpkg")
     assert said.code == 3 and "two at least" in said.err
+
+
+def regions_of(path: Path) -> dict[str, bytes]:
+    meta, _, geometry, columns = pyogrio.raw.read(path)
+    return dict(zip(columns[meta["fields"].tolist().index("image")], geometry))
+
+
+def test_odd_images_are_named(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan = Here(capsys)
+    words = ("seams", block.project, "--resolution", 4, "--no-picture")
+    write_image(block.images[2], np.zeros((3, *SIZE[::-1]), np.uint8))
+    said = photoplan(*words)
+    assert said.code == 0 and "left out: 'three' has the grey value 0 everywhere; look at its file" in said.err
+    assert set(regions_of(block.folder / "products" / "seams.gpkg")) == {"one", "two"}
+    text = block.project.read_text()
+    block.project.write_text(text.replace(f"{X0 + AWAY[0]:.1f}", f"{X0 - 400:.1f}"))
+    said = photoplan(*words, "--overwrite")
+    assert said.code == 0 and "no overlap with other images: 'one'; if it should have one" in said.err
+    assert "2 of 3 images joined at 4 m · no seams" in said.out
+    write_image(block.images[2], np.full((3, *SIZE[::-1]), 9, np.uint16))
+    for verb in ("seams", "mosaic"):
+        said = photoplan(verb, *words[1:4], "--overwrite")
+        assert said.code == 3 and "'three' has 3 bands of uint16" in said.err and "choose among them" in said.err
+
+
+def test_fault_22_an_image_owns_nothing_where_it_has_no_data(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    """A hole of nodata in the middle of an image: another is there."""
+    photoplan = Here(capsys)
+    middle = shapely.box(X0 - 66, Y0 - 6, X0 - 54, Y0 + 6)
+    with rasterio.open(block.images[0]) as file:
+        values = file.read()
+    values[:, SIZE[1] // 2 - 8 : SIZE[1] // 2 + 8, SIZE[0] // 2 - 8 : SIZE[0] // 2 + 8] = 0
+    write_image(block.images[0], values, nodata=0)
+    said = photoplan("seams", block.project, "--resolution", 3, "--no-picture", "-q")
+    assert said.code == 0, said.err
+    kept = regions_of(block.folder / "products" / "seams.gpkg")
+    found = {name: shapely.from_wkb(each) for name, each in kept.items()}
+    assert not found["one"].intersects(middle) and shapely.union_all(list(found.values())).contains(middle)
+
+
+def test_fault_26_more_workers_and_a_second_run(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan, words = Here(capsys), ("seams", block.project, "--resolution", 4, "--no-picture", "-q")
+    one, more = block.folder / "one.gpkg", block.folder / "more.gpkg"
+    assert photoplan(*words, "-o", one, "--workers", 1).code == photoplan(*words, "-o", more, "--workers", 3).code == 0
+    assert regions_of(one) == regions_of(more)
+    with FileLock(lock_of(block.folder / "third.gpkg")):
+        said = photoplan(*words, "-o", block.folder / "third.gpkg")
+    assert said.code == 2 and "another run" in said.err and not (block.folder / "third.gpkg").exists()
+
+
+def test_fault_05_an_image_that_cannot_be_read(
+    block: Block, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once: tried again; always: exit 4 with a reason, no file, nothing left beside."""
+    photoplan, words = Here(capsys), ("seams", block.project, "--resolution", 4, "--no-picture", "-q")
+    fails = [2]
+
+    def broken(*given: Any) -> Any:
+        fails[0] -= 1
+        if fails[0] == 0 or fails[0] < -100:
+            raise OSError("the disk has gone")
+        return shown(*given)
+
+    monkeypatch.setattr(run, "shown", broken)
+    assert photoplan(*words).code == 0
+    path, fails[0] = block.folder / "always.gpkg", -200
+    said = photoplan(*words, "-o", path)
+    assert said.code == 4 and "the disk has gone" in said.err and "nothing is written" in said.err
+    assert not path.exists() and not list(block.folder.glob(".*"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
+def test_faults_03_25_a_run_that_ended_early_leaves_nothing(block: Block, sign: signal.Signals, code: int) -> None:
+    words = ["seams", block.project, "--resolution", 4, "--no-picture", "--workers", 1]
+    before = sorted(block.folder.rglob("*"))
+    said = forked(words, block.folder.parent / "said", Mishap(end_at=1, sign=sign))
+    assert said.code == code, said.err
+    left = [p for p in sorted(block.folder.rglob("*")) if p not in before and p.suffix != ".lock" and not p.is_dir()]
+    assert left == []
+    assert forked(words, block.folder.parent / "again").code == 0

@@ -22,7 +22,7 @@ from photoplan.cli.options import PATH, choosing_options, executing, product_opt
 @click.option("--blend", type=click.Choice(["mean", "multiband"]), default="mean", show_default=True,
               help="All detail passes over the width, or fine detail at the seam and coarse over W.")  # fmt: skip
 @click.option("--sheets", metavar="SIZE|FILE",
-              help="Cut into squares of SIZE metres or named polygons, with STAC items; NAME.vrt shows all.")  # fmt: skip
+              help="Cut into squares of SIZE metres or polygons, with STAC items; NAME.vrt shows all.")  # fmt: skip
 @executing
 def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str, ...], seams: Path | None,
             feather: float, blend: Any, sheets: str | None, **options: Any) -> None:  # fmt: skip

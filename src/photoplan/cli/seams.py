@@ -44,11 +44,14 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
         show(found.path)
         if picture is not None:
             show(picture)
-        show(
-            f"{len(found.shapes)} of {len(found.survey.names)} images joined at {found.survey.grid.resolution:g} m · "
-            "fine detail of the two images along seams differs by "
-            f"{found.differences[1]:.2f} grey values, halfway between them by {found.differences[0]:.2f}"
-        )
+        halfway, best = found.differences
+        halfway, best = found.differences
+        along = "no seams"
+        if best is not None and halfway is not None:
+            along = f"fine detail of the two images along seams differs by {best:.2f} grey values"
+            along += f", halfway between them by {halfway:.2f}"
+        joined = f"{len(found.shapes)} of {len(found.survey.names)} images joined"
+        show(f"{joined} at {found.survey.grid.resolution:g} m · {along}")
     if not quiet:
         for note in found.notes:
             say(note)

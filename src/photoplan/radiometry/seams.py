@@ -111,6 +111,27 @@ def find_seams(
     return labels, level.difference(level.start()), level.difference(labels)
 
 
+def without_overlap(images: Sequence[Sequence[Layer]], store: Store, shape: tuple[int, int]) -> list[bool]:
+    """For each image with layers on a map whether no other shows what it shows, on pixels four times as large."""
+    counts = np.zeros([-(-n // 4) + 1 for n in shape], np.uint16)
+    whole = 0, 0, *counts.shape
+
+    def seen(layer: Layer) -> tuple[tuple[slice, slice], _Mask]:
+        box, values = layer.window(store, whole)
+        return _slices(box), ~np.isnan(values[..., -1])
+
+    coarse = [_layer(layers, 2) for layers in images]
+    for layer in coarse:
+        if layer is not None:
+            at, mask = seen(layer)
+            counts[at] += mask
+    found = []
+    for layers, layer in zip(images, coarse):
+        at, mask = (np.s_[:0, :0], np.zeros((0, 0), np.bool_)) if layer is None else seen(layer)
+        found.append(bool(layers) and not (counts[at][mask] > 1).any())
+    return found
+
+
 class _Level:
     """Images on pixels of one size, part by part."""
 

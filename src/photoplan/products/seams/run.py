@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from photoplan.io.scratch import Scratch
 from photoplan.products.balance.sample import Survey, survey
 from photoplan.products.orthophoto.shown import shown
 from photoplan.project.scene import input_files
-from photoplan.radiometry.seams import find_seams
+from photoplan.radiometry.seams import find_seams, without_overlap
 from photoplan.radiometry.shown import Layer, Shown, layers_of
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
@@ -69,8 +70,8 @@ class SeamsReport:
     """None after a dry run, as all that follows."""
     shapes: dict[str, Any] | None = None
     """Multipolygon of each image that has one."""
-    differences: tuple[float, float] | None = None
-    """Mean difference at a pixel of seam: halfway between the images, and as found; grey values."""
+    differences: tuple[float | None, float | None] | None = None
+    """Mean difference at a pixel of seam: halfway between the images, and as found; grey values. None: no seam."""
 
     def json_fields(self) -> dict[str, Any]:
         """Figures by name."""
@@ -108,10 +109,14 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     make_folder(request.path.parent)
     with FileLock(lock_of(request.path)), Scratch(request.path.parent) as store:
         images = _images(found, store, request.workers, events)
-        if not sum(each is not None for each in images) > 1:
-            raise GeometryError("fewer than two images show anything of the terrain; there is nothing to join")
+        notes += _odd(found, images, store)
+        layers = [each if isinstance(each, tuple) else () for each in images]
+        if not sum(map(bool, layers)) > 1:
+            told = "\n  ".join(["fewer than two images show anything of the terrain; there is nothing to join", *notes])
+            raise GeometryError(told)
         events.begin("finding seams", 0, "levels")
-        labels, halfway, best = find_seams([each or () for each in images], store, _weight(found), fixed, events.done)
+        labels, *means = find_seams(layers, store, _weight(found), fixed, events.done)
+        halfway, best = (None if np.isnan(mean) else mean for mean in means)
         polygons = label_polygons(labels.astype(np.int32), grid)
         shapes = {row: _multi(shape) for row, shape in sorted(polygons.items())}
         write_regions(request.path, found.names, shapes, grid.crs)
@@ -127,11 +132,24 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     return SeamsReport(found, notes, request.path, named, (halfway, best))
 
 
-def _images(found: Survey, store: Scratch, workers: int, events: Events) -> list[tuple[Layer, ...] | None]:
-    """What each image shows of the map, in a store; None: nothing."""
+def _images(found: Survey, store: Scratch, workers: int, events: Events) -> list[tuple[Layer, ...] | float | None]:
+    """What each image shows of the map, in a store; the grey value of one that has no other; None: nothing."""
     events.begin("reading", len(found.looked), "images")
     with steps("seams", workers, events) as run:
         return list(run(_Reading(found, store).image, range(len(found.looked))))
+
+
+def _odd(found: Survey, images: Sequence[tuple[Layer, ...] | float | None], store: Scratch) -> tuple[str, ...]:
+    """A line for each image that has no seam: all of one colour, or without another beside it."""
+    notes, shape = [], (found.grid.height, found.grid.width)
+    alone = without_overlap([each if isinstance(each, tuple) else () for each in images], store, shape)
+    for name, each, apart in zip(found.names, images, alone):
+        if isinstance(each, float):
+            notes.append(f"left out: {name!r} has the grey value {each:.0f} everywhere; look at its file, or take the "
+                         "image out of the project")  # fmt: skip
+        elif apart:
+            notes.append(f"no overlap with other images: {name!r}; if it should have one, look at its orientation")
+    return tuple(notes)
 
 
 class _Reading:
@@ -144,7 +162,7 @@ class _Reading:
             for row in tile.sources:
                 self._windows.setdefault(row, []).append(tile.window)
 
-    def image(self, row: int) -> tuple[Layer, ...] | None:
+    def image(self, row: int) -> tuple[Layer, ...] | float | None:
         """All that it shows, tile by tile, put together."""
         one, mine = self._survey.looked[row], self._windows.get(row)
         if not mine:
@@ -160,6 +178,9 @@ class _Reading:
                 values[(slice(None), *at)], valid[at] = made.values, made.valid
         if not valid.any():
             return None
+        grey = values[:, valid]
+        if grey.min() == grey.max():
+            return float(grey[0, 0])
         rows, cols = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
         at = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
         return layers_of(Shown(top + int(rows[0]), left + int(cols[0]), values[:, *at], valid[at]), self._store)
