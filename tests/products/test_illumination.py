@@ -15,6 +15,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from tools.command import Here
 from tools.small_block import write_image
 
+from photoplan.errors import GeometryError
+from photoplan.radiometry.illumination import Ground, estimate
+
 SUN = (135.0, 38.0)
 SIZE, PIXEL = 180, 10.0
 DIRECT, SKY, HAZE, PER_100 = np.array([120.0, 110, 80]), np.array([25.0, 30, 40]), 14.0, -1.5
@@ -133,3 +136,22 @@ def test_what_cannot_be_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[st
     said = photoplan("illumination", bare, "--terrain", mountain.terrain, "--sun", *SUN, "-o", tmp_path / "a.tif")
     assert said.code == 3 and "no georeference" in said.err
     assert not (tmp_path / "a.tif").exists()
+
+
+def test_small_pictures_have_standard_deviations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of 64 pixels a side all were one part, and without it nothing was left: an IndexError."""
+    photoplan, mountain = Here(capsys), render(tmp_path, haze=True)
+    small = tmp_path / "small.tif"
+    with rasterio.open(mountain.picture) as file:
+        write_image(small, file.read(window=((0, 64), (0, 64))), crs=file.crs, transform=file.transform)
+    words = ("illumination", small, "--terrain", mountain.terrain, "--sun", *SUN, "-o", tmp_path / "a.tif", "--dry-run")
+    said = photoplan(*words, "--correct", "c,haze-by-height", "--json")
+    assert said.code == 0, said.err
+    assert all(band["sigmas"][0] > 0 and band["sigmas"][3] > 0 for band in json.loads(said.out)["bands"]), said.out
+
+
+def test_fault_16_pixels_of_one_part_alone_are_refused() -> None:
+    n = 600
+    ground = Ground(np.linspace(0.2, 1, n), np.ones(n), np.linspace(0.0, 100, n), np.zeros(n, bool))
+    with pytest.raises(GeometryError, match="without one part of the picture 0 pixels"):
+        estimate(np.ones((1, n)), ground, np.zeros(n, int), ["haze-by-height"], 0.7)

@@ -170,11 +170,16 @@ def _open(request: IlluminationRequest) -> _Place:
 def _sample(place: _Place, events: Events) -> tuple[NDArray[np.float64], Ground, NDArray[np.int64]]:
     """Grey values (bands, n), ground (n,) and window (n,) of pixels all over the picture."""
     width, height = place.grid.width, place.grid.height
-    columns, rows = ({int(at) for at in np.linspace(0, max(side - _SIDE, 0), _ALONG)} for side in (width, height))
+    # Windows do not overlap: pixels that several have would leave nothing out with any of them.
+    across, down = (max(1, min(_SIDE, side // _ALONG)) for side in (width, height))
+    columns, rows = (
+        {int(at) for at in np.linspace(0, max(side - own, 0), _ALONG)}
+        for side, own in ((width, across), (height, down))
+    )
     events.begin("estimating", len(columns) * len(rows), "windows")
     values, grounds, parts = [], [], []
     for number, (col, row) in enumerate((c, r) for r in sorted(rows) for c in sorted(columns)):
-        window = Window(col, row, _SIDE, _SIDE) & place.grid.window
+        window = Window(col, row, across, down) & place.grid.window
         pixels, valid = place.read(window)
         ground = place.ground(window)
         use = valid & np.isfinite(ground.cos_i)

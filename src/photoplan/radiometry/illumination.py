@@ -152,6 +152,12 @@ def estimate(
             "terrain and picture overlap, and is the sun right?"
         )
     groups = np.unique(part, return_inverse=True)[1] % _PARTS
+    left = min(int((known & ground.lit & (groups != k)).sum()) for k in np.unique(groups))
+    if left < _LEAST // 2:
+        raise GeometryError(
+            f"without one part of the picture {left} pixels are left on which the sun shines; {_LEAST // 2} are needed: "
+            "does the terrain cover the picture?"
+        )
     bands = []
     for number, grey in enumerate(values, 1):
         whole = _estimate(empty, grey, ground, known)

@@ -12,7 +12,9 @@ import numpy as np
 
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.geometry.bounds import odd_place
 from photoplan.geometry.grid import MapGrid
+from photoplan.io.names import safe_stem
 from photoplan.io.point_cloud import check_cloud
 from photoplan.io.project.model import Project
 from photoplan.io.run_record import run_key
@@ -192,8 +194,11 @@ def check_start(project: Project, settings: SurfaceSettings) -> None:
     """
     if settings.reach is not None and not (math.isfinite(settings.reach) and settings.reach > 0):
         raise UsageError(f"reach {settings.reach}; a positive number of metres is needed")
-    if not settings.name.strip() or Path(settings.name).name != settings.name or settings.name in (".", ".."):
-        raise UsageError(f"name {settings.name!r}; give the name of a file without folder and extension")
+    name = settings.name
+    if not any(c.isalnum() for c in name) or safe_stem(name) != name.replace(" ", "_"):
+        raise UsageError(
+            f"name {name!r}; give the name of a file without folder and extension, of letters, digits, - and _"
+        )
     for path in settings.points:
         check_cloud(path)
     if settings.start == "terrain":
@@ -201,6 +206,9 @@ def check_start(project: Project, settings: SurfaceSettings) -> None:
     number = _number(settings.start)
     if number is not None and not math.isfinite(number):
         raise UsageError(f"start {settings.start}; give `terrain`, a height in metres, or a file of heights")
+    odd = None if number is None else odd_place((0.0, 0.0, number), camera=False)
+    if odd is not None:
+        raise UsageError(f"start: {odd}")
     if number is None:
         if not Path(settings.start).exists():
             raise UsageError(f"start {settings.start!r}: is no height and no file; give `terrain`, a height, or a file")
