@@ -25,6 +25,8 @@ from photoplan.geometry.local import Ellipsoid
 from photoplan.io.camera.line import csm
 from photoplan.io.camera.line.file import read_line
 from photoplan.io.camera.line.model import StatedLine
+from photoplan.plan.footprint import footprint
+from photoplan.surfaces.level import LevelSurface
 
 FILES = ["chandrayaan2_tmc2_isd", "ctxLineScan", "hirise_isd", "lrolroc_isd", "mexhrsc_isd", "constVelocityLineScan"]
 #: Here the reference intersects rays behind the camera: it looks away from the body.
@@ -186,6 +188,17 @@ class TestStrip:
         print(f"\nrms {error.std() / pixel:.4f} px, worst {np.abs(error).max() / pixel:.3f} px")
         assert valid.mean() > 0.8
         assert error.std() / pixel < 0.03 and np.abs(error).max() / pixel < 0.3
+
+    def test_a_record_that_ends_with_the_last_line_is_enough_for_the_whole_footprint(self) -> None:
+        """The outer edges of the first and last line have no orientation then, and their middles have."""
+        strip = Strip(beyond=1e-6)
+        camera = csm.read(strip.isd(), Path("strip.json")).camera(strip.crs, "ellipsoidal")
+        corner = np.array([[-0.5, -0.5]])
+        assert np.isnan(camera.rays(corner, 300.0)[0]).all()
+        seen = footprint(camera, LevelSurface(300.0), None)
+        assert seen.on_surface == 1.0
+        across, along = strip.columns * strip.pixel, strip.lines * strip.pixel
+        assert np.ptp(seen.outline[:, :2], axis=0) == pytest.approx([along, across], rel=0.15)
 
     def test_an_image_of_another_size_is_refused(self, tmp_path: Path) -> None:
         project_file = Strip().write(tmp_path, 300.0)

@@ -25,6 +25,8 @@ class Strip:
     origin: tuple[float, float] = (600_000.0, 5_340_000.0)
     waves: float = 0.004
     centre_time: float = 1000.0
+    #: Seconds by which the support data begin before the middle of the first line and end after that of the last.
+    beyond: float = 0.5
 
     @property
     def crs(self) -> str:
@@ -58,7 +60,7 @@ class Strip:
     def isd(self) -> dict[str, object]:
         """Support data as CSM has them."""
         span = self.lines * self.line_time
-        t = np.linspace(-0.7 * span, 0.7 * span, 400)
+        t = np.linspace(-span / 2 - self.beyond, span / 2 - self.line_time + self.beyond, 400)
         S, R = self.pose(t)
         q = np.array([_quaternion(each.T) for each in R])
         times = (t + self.centre_time).tolist()

@@ -47,7 +47,8 @@ class Footprint:
     """What one image sees of the ground."""
 
     outline: NDArray[np.float64]
-    """Ground points X, Y, Z of the image's border, shape (n, 3); NaN where the ray meets no surface."""
+    """Ground points X, Y, Z of the image's border, or of the middle of its outermost pixels where they alone meet the
+    surface, shape (n, 3); NaN where no ray does."""
     bounds: Bounds | None
     """Map bounds xmin, ymin, xmax, ymax of everything the image sees of the surface; None: nothing."""
     on_surface: float
@@ -166,6 +167,9 @@ def footprint(camera: Camera, terrain: Terrain, bounds: Bounds | None) -> Footpr
     low, high = (float(h) for h in terrain.height_range(seen))
     border = np.concatenate([image_border(camera.size), [[(s - 1) / 2 for s in camera.size]]])
     outline = intersect(camera, border, terrain, (low, high))
+    # A strip's record of the flight may end with the middle of its last line.
+    missed = np.isnan(outline[:, 0])
+    outline[missed] = intersect(camera, border[missed].clip(0, np.array(camera.size) - 1), terrain, (low, high))
     return Footprint(outline[:-1], seen, float(np.isfinite(outline[:, 0]).mean()), (low, high))
 
 
