@@ -30,6 +30,7 @@ KINDS = {"FrameCamera", "WarpedCamera", "corrected_camera", "curved_camera", "Li
 ALLOWED = {
     "cameras/line.py": "a kind",
     "cameras/line_correctable.py": "corrections of a kind",
+    "cameras/line_tremor.py": "what of a kind changes from line to line",
     "io/camera/line/model.py": "makes a kind of what files state",
     "__init__.py": "public names",
     "cameras/__init__.py": "public names",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -37,6 +38,46 @@ class ImageField(Protocol):
         ...
 
 
+class Tremor(Protocol):
+    """What of a mapping changes from line to line of the image, apart from the rest: a turbulent flight."""
+
+    def part(self, XYZ: NDArray[np.float64]) -> TremorPart | None:
+        """For the ground that points (n, 3) enclose; None: the image does not show it."""
+        ...
+
+
+class TremorPart(Protocol):
+    """Some lines of such an image.
+
+    The smooth part says where a ground point would lie, *ideally*; the real position differs by a shift that belongs to
+    the *real* row and the ideal column, and is linear in the height of the ground but for next to nothing.
+    """
+
+    @property
+    def smooth(self) -> Projection:
+        """The mapping without tremor."""
+        ...
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """First and last row at which anything of the ground can be seen."""
+        ...
+
+    @property
+    def columns(self) -> tuple[float, float]:
+        """First and last ideal column of the ground."""
+        ...
+
+    def shifts(
+        self, columns: NDArray[np.float64], rows: NDArray[np.float64], heights: Sequence[float]
+    ) -> NDArray[np.float64]:
+        """Real minus ideal positions of ground of some heights that is seen in rows (n,), at ideal columns (m,).
+
+        Shape (heights, n, m, 2). Between whole rows they are those of the rows around by cubic convolution.
+        """
+        ...
+
+
 class Projection(Protocol):
     """A mapping from ground to image in two factors: a projective or smooth one, and a field in the image.
 
@@ -56,8 +97,9 @@ class Projection(Protocol):
         ...
 
     @property
-    def breaks(self) -> Breaks | None:
-        """Where the first factor is bent, by its ideal positions (knots of a trajectory); None: nowhere."""
+    def breaks(self) -> Breaks | Tremor | None:
+        """Where the first factor is bent, by its ideal positions (knots of a trajectory), or what bends it at every
+        line; None: nowhere."""
         ...
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:

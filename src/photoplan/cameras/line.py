@@ -10,22 +10,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Vantage
 from photoplan.cameras.line_look import LineLook
+from photoplan.cameras.line_sight import LineSight, to_sphere
 from photoplan.cameras.line_track import LineTrack
+from photoplan.cameras.line_tremor import LineTremor, Moments, smoothed
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.body import BodyGround
 
 _Floats = NDArray[np.float64]
-#: A moment is found when it changes by less than this, lines; or by less than the second and not less than before.
-_FOUND, _ROUNDED = 1e-10, 1e-6
-#: Steps over which the slope is taken anew, lines.
-_SMOOTH = 1e-3
-_ITERATIONS = 40
 #: Rows beyond either end of the image that still have positions: a part of its height, and lines.
 _ROOM = (0.25, 256.0)
 #: Heights of any ground, metres: of the earth, and of other bodies.
 _EARTH, _ELSEWHERE = (-500.0, 9_000.0), (-10_000.0, 25_000.0)
 #: Half the distance over which the change of a ray on the map is taken, metres.
 _REACH = 50.0
+#: Half the time over which the change of what a shaken line sees is taken, lines.
+_SHORT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +32,8 @@ class LineCamera:
     """An image of one detector line that was carried over the ground, over the ground of a project.
 
     A ground point is seen at the moment at which it lies in the plane (or the cone, with a lens) of the line; `project`
-    finds it by the secant method from a linear start. Rows are counted by lines; the centre of a line's exposure is a
-    whole number.
+    finds it by the secant method from a linear start; where a turbulent flight sees it several times, see `moments`.
+    Rows are counted by lines; the centre of a line's exposure is a whole number.
     """
 
     track: LineTrack
@@ -51,16 +50,41 @@ class LineCamera:
         """All is in the first factor."""
         return None
 
-    @property
-    def breaks(self) -> None:
-        """The trajectory is smooth."""
-        return None
+    @cached_property
+    def breaks(self) -> LineTremor | None:
+        """What of a turbulent flight changes from line to line; None: the trajectory is smooth."""
+        if not self.track.per_line:
+            return None
+        return smoothed(self)
+
+    @cached_property
+    def sight(self) -> LineSight:
+        """What it sees in the axes of the body."""
+        return LineSight(self.track, self.look)
+
+    def moments(self, XYZ: ArrayLike) -> Moments:
+        """All moments at which ground points (n, 3) are seen: where turbulence is strong, more than one.
+
+        `project` takes the first by which the point lies on the other side of the line of detectors at the next whole
+        row: what turns back within a row does not count there. Moments outside the image and at lines without
+        orientation are not among them.
+        """
+        P = self.ground(np.asarray(XYZ, float).reshape(-1, 3))
+        if self.breaks is None:
+            xy = self.seen_from(P)
+            point = np.flatnonzero(np.isfinite(xy[:, 0]))
+            xy = xy[point]
+        else:
+            point, rows, _ = self.breaks.passages(P)
+            xy = self.sight.between(P[point], rows)
+        inside = ((xy >= -0.5) & (xy <= np.array(self.size) - 0.5)).all(axis=1) & ~self._unoriented(xy[:, 1])
+        return Moments(point[inside], xy[inside])
 
     def project_homogeneous(self, XYZ: ArrayLike) -> _Floats:
         """Ground (..., 3) to (x, y, 1); NaN behind the camera, and at lines whose orientation is not known."""
         XYZ = np.asarray(XYZ, float)
         out = np.ones(XYZ.shape)
-        out[..., :2] = self._project(self.ground(XYZ).reshape(-1, 3)).reshape(*XYZ.shape[:-1], 2)
+        out[..., :2] = self.seen_from(self.ground(XYZ).reshape(-1, 3)).reshape(*XYZ.shape[:-1], 2)
         out[np.isnan(out[..., 0])] = np.nan
         return out
 
@@ -69,15 +93,16 @@ class LineCamera:
         XYZ = np.asarray(XYZ, float)
         flat = XYZ.reshape(-1, 3)
         P = self.ground(flat)
-        x, y = self._project(P).T
+        x, y = self.seen_from(P).T
         with np.errstate(all="ignore"):
             S, R = self.track(y)
             d = np.einsum("nij,ni->nj", R, P - S)
             tangents = d[:, :2] / d[:, 2:]
             by_ground = (R[:, :, :2] - R[:, :, 2:] * tangents[:, None, :]) / d[:, 2, None, None]
-            later, earlier = self._tangents(P, y + 0.5), self._tangents(P, y - 0.5)
+            half = 0.5 if self.breaks is None else _SHORT
+            later, earlier = self.sight.tangents(P, y + half), self.sight.tangents(P, y - half)
             # The tangents of the ground point are those of its column: they change together.
-            J = np.stack([self.look.slope(x), earlier - later], axis=-1)
+            J = np.stack([self.look.slope(x), (earlier - later) / (2 * half)], axis=-1)
             A = np.linalg.solve(np.where(np.isfinite(J), J, np.eye(2)), np.swapaxes(by_ground, 1, 2))
             out = A @ self.ground.jacobian(flat)
         out[np.isnan(x)] = np.nan
@@ -107,11 +132,8 @@ class LineCamera:
 
     def body_rays(self, xy: _Floats) -> tuple[_Floats, _Floats]:
         """Projection centres and unit directions of image points (n, 2) in the axes of the body, each (n, 3)."""
-        x, y = xy.T
-        S, R = self.track(np.nan_to_num(y))
-        unknown = ~np.isfinite(xy).all(axis=1) | self._unoriented(y)
-        d = np.concatenate([self.look.tangents(np.nan_to_num(x)), np.ones((len(x), 1))], axis=1)
-        d = np.einsum("nij,nj->ni", R, d / np.linalg.norm(d, axis=1, keepdims=True))
+        unknown = ~np.isfinite(xy).all(axis=1) | self._unoriented(xy[:, 1])
+        S, d = self.sight.rays(np.nan_to_num(xy))
         S[unknown], d[unknown] = np.nan, np.nan
         return S, d
 
@@ -136,47 +158,24 @@ class LineCamera:
         inside = (y >= -0.5) & (y <= self.size[1] - 0.5)
         return np.asarray(inside & ~self.track.is_oriented(y))
 
-    def _tangents(self, P: _Floats, y: _Floats) -> _Floats:
-        """Tangents (n, 2) of points in the body's axes, from where the camera was at rows (n,)."""
-        S, R = self.track(y)
-        d = np.einsum("nij,ni->nj", R, P - S)
-        return np.asarray(np.where(d[:, 2:] > 0, d[:, :2] / d[:, 2:], np.nan))
-
-    def _across(self, P: _Floats, y: _Floats) -> tuple[_Floats, _Floats]:
-        """How far points lie beside the line at rows (n,), as tangents, and their columns."""
-        tangents = self._tangents(P, y)
-        e, n = self.look.axes
-        column = self.look.column(tangents @ e)
-        return (tangents - self.look.tangents(column)) @ n, column
-
-    def _project(self, P: _Floats) -> _Floats:
+    def seen_from(self, P: _Floats) -> _Floats:
         """Positions (n, 2) of points (n, 3) in the axes of the body."""
-        room = _ROOM[0] * self.size[1] + _ROOM[1]
-        low, high = -room, self.size[1] - 1 + room
-        out = np.full((len(P), 2), np.nan)
-        todo = np.flatnonzero(np.isfinite(P).all(axis=1))
-        with np.errstate(all="ignore"):
-            at = np.clip(self._start(P[todo]), low, high)
-            miss, _ = self._across(P[todo], at)
-            slope = self._across(P[todo], at + 1.0)[0] - miss
-            step = -miss / slope
-            for _ in range(_ITERATIONS):
-                at = at + step
-                before, (miss, column) = miss, self._across(P[todo], at)
-                # Over small steps the slope is rounding; it does not change over them.
-                slope = np.where(np.abs(step) > _SMOOTH, (miss - before) / step, slope)
-                step, last = -miss / slope, step
-                settled = (np.abs(step) < _ROUNDED) & (np.abs(step) > np.abs(last) / 2)
-                found = (np.abs(step) < _FOUND) | settled
-                out[todo[found]] = np.column_stack([column, at + step])[found]
-                # Only what is still on its way goes on; twice the room is left for a step too far.
-                going = ~found & (np.abs(at + step - (low + high) / 2) < high - low)
-                todo, at, step = todo[going], at[going], step[going]
-                miss, slope = miss[going], slope[going]
-                if not len(todo):
-                    break
-        out[(out[:, 1] < low) | (out[:, 1] > high) | self._unoriented(out[:, 1])] = np.nan
+        room = self._room
+        tremor = self.breaks
+        if tremor is None:
+            out = self.sight.found(P, self._start(P), *room)
+        else:
+            out = np.full((len(P), 2), np.nan)
+            point, rows = tremor.first(P)
+            out[point] = self.sight.between(P[point], rows)
+        out[(out[:, 1] < room[0]) | (out[:, 1] > room[1]) | self._unoriented(out[:, 1])] = np.nan
         return out
+
+    @property
+    def _room(self) -> tuple[float, float]:
+        """First and last row that have positions."""
+        room = _ROOM[0] * self.size[1] + _ROOM[1]
+        return -room, self.size[1] - 1 + room
 
     def _start(self, P: _Floats) -> _Floats:
         """Rows at which to begin."""
@@ -190,7 +189,7 @@ class LineCamera:
         rows, columns = np.linspace(first, last, 9), np.linspace(0, self.size[0] - 1, 5)
         xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         S, d = self.body_rays(xy)
-        r = _to_sphere(S, d, self._radius(S))
+        r = to_sphere(S, d, self._radius(S))
         good = np.isfinite(r)
         if not good.any():
             raise InputError("the camera does not look at the body; are positions and attitudes in the same axes?")
@@ -205,7 +204,7 @@ class LineCamera:
 
     def _meet(self, S: _Floats, d: _Floats, heights: _Floats) -> tuple[_Floats, _Floats]:
         """Map points (n, 3) of rays at heights (n,), and the same in the axes of the body."""
-        r = _to_sphere(S, d, self._radius(S) + heights)
+        r = to_sphere(S, d, self._radius(S) + heights)
         at = S + r[:, None] * d
         cos = np.einsum("ni,ni->n", at, d) / np.linalg.norm(at, axis=1)
         for _ in range(12):
@@ -219,12 +218,3 @@ class LineCamera:
         point[~(np.abs(point[:, 2] - heights) < 1e-6)] = np.nan
         point[:, 2] = np.where(np.isnan(point[:, 0]), np.nan, heights)
         return point, at
-
-
-def _to_sphere(S: _Floats, d: _Floats, radius: ArrayLike) -> _Floats:
-    """Distances (n,) along rays to the near side of a sphere; NaN where they pass it. From inside, to the far side."""
-    along = np.einsum("ni,ni->n", S, d)
-    with np.errstate(invalid="ignore"):
-        half = np.sqrt(along**2 - np.einsum("ni,ni->n", S, S) + np.square(radius))
-    near = -along - half
-    return np.asarray(np.where(near > 0, near, -along + half))

@@ -16,6 +16,8 @@ _Floats = NDArray[np.float64]
 _DEGREE = 16
 #: The curve leaves what it stands for by less than this, in columns.
 _TOLERANCE = 1e-9
+#: Coefficients below this are left out, in columns.
+_NOTHING = 1e-11
 #: Columns beyond either end of the line over which the curve goes on, by its width; further out it is straight.
 _ROOM = 0.05
 
@@ -47,6 +49,9 @@ class LineLook:
             raise InputError("detectors of the line have no direction; are the numbers of its lens right?")
         coefficients = chebyshev.chebfit(nodes, values, _DEGREE)
         look = cls(columns, np.asarray(coefficients, float))
+        # Most lenses are of low degree; what is next to nothing is not computed a million times.
+        tiny = np.abs(coefficients).max(axis=1) < _NOTHING * look.pitch
+        look = cls(columns, look.coefficients[: max(2, len(tiny) - int(np.argmin(tiny[::-1])))])
         miss = float(np.abs(chebyshev.chebval(nodes, look.coefficients).T - values).max())
         if miss > _TOLERANCE * look.pitch:
             raise InputError(f"the line's lens is not smooth: polynomials miss it by {miss / look.pitch:.2g} columns")
@@ -83,7 +88,7 @@ class LineLook:
 
     def column(self, along: _Floats) -> _Floats:
         """The columns (n,) with these tangents along the chord (n,), by Newton's method."""
-        first, last = self.along(self._ends[0]), self.along(self._ends[1])
+        first, last = self._along_ends
         at = self._ends[0] + (along - first) * (self._ends[1] - self._ends[0]) / (last - first)
         for _ in range(12):
             step = (self.tangents(at) @ self.axes[0] - along) / (self.slope(at) @ self.axes[0])
@@ -91,6 +96,11 @@ class LineLook:
             if not (np.abs(step) > 1e-11 * self.columns).any():
                 break
         return np.asarray(at)
+
+    @cached_property
+    def _along_ends(self) -> tuple[float, float]:
+        """Tangents of the ends along the chord."""
+        return self.along(self._ends[0]), self.along(self._ends[1])
 
     @property
     def _ends(self) -> tuple[float, float]:

@@ -9,11 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.motion import Course, rotations
+from photoplan.geometry.motion import Course, continuous, cubic_convolution, rotations
 
 _Floats = NDArray[np.float64]
 #: Lines by which tables may end before the image, since large times are rounded.
 _SLACK = 1e-3
+#: Lines over which the mean rate at the ends is taken.
+_AVERAGED = 128
+#: Rows beyond either end of the image that have poses of their own: a part of its height, and lines.
+_ROOM = (0.25, 256.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +44,10 @@ class LineTrack:
     """Quaternions (n, 4) of the rotation from camera axes to those of the body, scalar first."""
     known: tuple[float, float]
     """First and last moment of which both are known, seconds."""
+    per_line: bool = False
+    """Whether only whole rows have poses of their own: what lies between them is then interpolated as grey values are,
+    by cubic convolution. An image shows nothing of how a camera shook between two lines; geometry that went its own
+    way there would be another one than that of the resampled grey values. For clocks without pauses."""
 
     def __post_init__(self) -> None:
         ends = self.moments[:-1] + self.rates[:-1] * np.diff(self.knots)
@@ -79,6 +87,48 @@ class LineTrack:
 
         Beyond what is known the camera flies on as it flew at the end: what lies just outside the image has positions.
         """
+        S, q = self._between(line) if self.per_line else self._flown(line)
+        return S, rotations(q)
+
+    @cached_property
+    def poses(self) -> tuple[int, _Floats]:
+        """The first row, and positions and quaternions (n, 7) from it on: of the image and a room around it."""
+        first, last = self.whole_rows
+        S, q = self._flown(np.arange(first, last + 1.0))
+        inside = np.concatenate([S, continuous(q)], axis=1)
+        room = round(_ROOM[0] * self.lines + _ROOM[1]) + 2
+        # Beyond what is known the camera flies on as it flew on average at the end.
+        some = min(_AVERAGED, last - first)
+        before, after = np.arange(-room - first, 0.0), np.arange(1.0, self.lines + room - last)
+        ahead = inside[0] + before[:, None] * (inside[some] - inside[0]) / some
+        beyond = inside[-1] + after[:, None] * (inside[-1] - inside[-1 - some]) / some
+        return -room, np.concatenate([ahead, inside, beyond])
+
+    @property
+    def whole_rows(self) -> tuple[int, int]:
+        """First and last whole row whose pose is known, of the image and the room around it."""
+        room = round(_ROOM[0] * self.lines + _ROOM[1]) + 2
+        first, last = (self.knots[0] + (known - self.moments[0]) / self.rates[0] for known in self.known)
+        first, last = max(float(np.ceil(first - _SLACK)), -room), min(float(np.floor(last + _SLACK)), self.lines + room)
+        if last <= first:
+            raise InputError("positions and attitudes are known at fewer than two lines of the image")
+        return int(first), int(last)
+
+    def _between(self, line: _Floats) -> tuple[_Floats, _Floats]:
+        """Positions (n, 3) and quaternions (n, 4) between the lines."""
+        first, poses = self.poses
+        at = np.clip(np.asarray(line, float) - first, 1.0, len(poses) - 2.0)
+        row = np.minimum(np.floor(at), len(poses) - 3.0)
+        weights = cubic_convolution(at - row)
+        row = np.nan_to_num(row, nan=1.0).astype(np.int64)
+        values = poses[row]
+        # Against the row itself: positions are large, and sums of them are rounded.
+        for k in (-1, 1, 2):
+            values = values + weights[:, k + 1, None] * (poses[row + k] - poses[row])
+        return values[:, :3], values[:, 3:]
+
+    def _flown(self, line: _Floats) -> tuple[_Floats, _Floats]:
+        """Positions (n, 3) and quaternions (n, 4) as the courses have them."""
         t = self.time(line)
         inside = np.clip(t, *self.known)
         beyond = (t - inside)[:, None]
@@ -92,7 +142,7 @@ class LineTrack:
             before = self.attitudes(back)
             before *= np.where(np.einsum("nk,nk->n", before, q[away]) < 0, -1.0, 1.0)[:, None]
             q[away] += turns * (q[away] - before)
-        return S, rotations(q)
+        return S, q
 
     def time(self, line: _Floats) -> _Floats:
         """Times (n,) of the middle of the exposure of rows (n,), seconds."""

@@ -92,6 +92,14 @@ def cubic(times: _Floats, values: _Floats, slopes: _Floats | None, t: _Floats) -
     return np.asarray(h00 * left + h10 * width * slopes[row] + h01 * right + h11 * width * slopes[row + 1])
 
 
+def cubic_convolution(u: _Floats) -> _Floats:
+    """Weights (n, 4) of the neighbours at −1, 0, 1, 2 of places (n,) from 0 to 1 (Keys 1981, eq. 4, a = −1/2)."""
+    return np.stack(
+        [((2 - u) * u - 1) * u / 2, ((3 * u - 5) * u * u + 2) / 2, ((4 - 3 * u) * u + 1) * u / 2, (u - 1) * u * u / 2],
+        axis=-1,
+    )
+
+
 def between(times: _Floats, quaternions: _Floats, t: _Floats) -> _Floats:
     """Unit quaternions (m, 4) at t (m,), along the great circle between those of a table (n, 4), scalar first."""
     if len(times) == 1:

@@ -26,7 +26,8 @@ from photoplan.kernels.scale import LOOK_CLOSER, largest_scales, stretch_runs
 from photoplan.kernels.weights import KERNELS, weight_table
 
 AnchorArrays = tuple[NDArray[Any], ...]
-"""rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3), field_frame (5,), field (rows, cols, 2)."""
+"""rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3), field_frame (5,), field (rows, cols, 2);
+or, of a flight that changes from line to line, (6,) and (rows, cols + 1, 4)."""
 
 Border = tuple[float, float, float, float]
 """Outer edges of the image x_min, y_min, x_max, y_max in pixels of the source window."""
@@ -72,7 +73,8 @@ def rectify_tile(
     ----------
     anchors : tuple of arrays
         rects (m, 4) int32, box_start (m + 1,) int32, box_heights (n, 2) float64, corners (n, 8, 3) float64,
-        field_frame (5,) float64, field (rows, cols, 2) float32: the fields of `photoplan.plan.Anchors`.
+        field_frame (5,) float64, field (rows, cols, 2) float32, or (6,) and (rows, cols + 1, 4): the fields of
+        `photoplan.plan.Anchors`.
     relief : ndarray, shape (rows, cols), float32
         Height of every pixel, metres; NaN where there is no surface.
     source : ndarray, shape (bands, height, width)

@@ -201,7 +201,8 @@ def slopes_of_run(
                 if heights[i] >= low:
                     for k in range(6):
                         slopes[k, i] = higher[k, i]
-    if field.size > 0:
+    # What a pixel covers is that of the smooth part of a flight; from line to line it changes at random.
+    if field.size > 0 and field.shape[2] == 2:
         find_cells(frame, field, origin, slopes[0, :n], slopes[3, :n], cells)
         _bend_slopes(frame, field, (cells[0][:n], cells[1], cells[2]), slopes)
     return True

@@ -39,10 +39,13 @@ class Anchors:
     field; w > 0 and is scaled to be about 1 inside a tile."""
     field_frame: NDArray[np.float64]
     """(5,): x and y of the field's first node, in the coordinates of `corners`; nodes per pixel along x and y; largest
-    factor by which the field makes a distance longer."""
+    factor by which the field makes a distance longer. With a field that belongs to rows (6,): also the
+    height of its values, metres."""
     field: NDArray[np.float32]
     """(rows, columns, 2): what is added to x and y at the nodes; (0, 0, 2): the projection has no field. Positions
-    beyond the nodes are not in the image."""
+    beyond the nodes are not in the image. (rows, columns + 1, 4): a field that belongs to rows (a turbulent flight):
+    nodes lie at ideal x and *real* y; the last two are the changes per metre of height; the last column holds the
+    furthest ideal row, in nodes, that any row up to it sees, whatever the x and the height."""
     residual: float
     """Worst difference to the strict position, pixels: of the boxes, measured at their centre, face and edge middles,
     plus of the field, measured in and beside its cells' middles, and at declared breaks."""

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Projection
+from photoplan.cameras.base import Projection, Tremor
 from photoplan.errors import UsageError
+from photoplan.geometry.breaks import Breaks
 from photoplan.geometry.grid import Window
 from photoplan.kernels.boxes import blocks_in_image, judge_boxes
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.anchors import Anchors, Positions, bend_errors
 from photoplan.plan.field import FieldGrid, FieldTable, field_grid
 from photoplan.plan.ground import CORNERS, SQUARE, Boxes, TileGround
+from photoplan.plan.tremor import TremorTable, tremor_table
 
 #: Pixels of a reduced source that stay for every target pixel at least: the kernel, widened to them, decides what the
 #: product looks like, not the means before it.
@@ -24,6 +26,9 @@ FINEST = 2.0
 SMALLEST_BEHIND = 4
 #: More layers than this over one rectangle do not pay; the residual that is left is reported.
 MOST_LAYERS = 64
+
+#: Where a flight is turbulent, shares of the tolerance are smaller by this: what is missed grows from line to line.
+_FINER = 4.0
 
 Piles = tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]
 """Boxes that are settled: rectangles (n, 4), heights (n, 2), homogeneous corners (n, 8, 3)."""
@@ -66,10 +71,14 @@ class _Image:
     grid: FieldGrid | None
     tolerance: float
     """What of the tolerance is left for the anchors, in ideal pixels."""
+    tremor: TremorTable | None = None
+    """What changes from line to line."""
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """x_min, y_min, x_max, y_max of all that lies in the image."""
+        if self.tremor is not None:
+            return self.tremor.bounds(self.size)
         return (-0.5, -0.5, self.size[0] - 0.5, self.size[1] - 0.5) if self.grid is None else self.grid.bounds
 
 
@@ -105,15 +114,29 @@ def compile_anchors(
     if projection.field is not None:
         grid = field_grid(projection.field, projection.size, rule.tolerance / 2)
         image = _Image(projection.size, grid, (rule.tolerance - min(grid.miss, rule.tolerance / 2)) / grid.stretch)
+    breaks = projection.breaks
+    if breaks is not None and not isinstance(breaks, Breaks):
+        tremor = _tremor(breaks, ground, image)
+        if tremor is None:
+            return None
+        # Shifts belong to a height of the ground: where h is none, boxes have to do.
+        if ground.is_height:
+            image, projection, breaks = (
+                replace(image, tolerance=rule.tolerance / 2, tremor=tremor),
+                tremor.part.smooth,
+                None,
+            )
+        else:
+            breaks = Breaks(rows=tuple(np.arange(*tremor.part.rows) + 0.0))
     boxes = ground.first
     done: list[Piles] = []
     residual = 0.0
     while len(boxes.rects):
         lattice = projection.project_homogeneous(boxes.lattice)
         errors = np.zeros((len(boxes.rects), 4))
-        if projection.breaks is not None:
+        if breaks is not None:
             strict = _strict(projection, ground, boxes)
-            np.maximum.at(errors, boxes.rect, bend_errors(projection.breaks, lattice[:, CORNERS], strict))
+            np.maximum.at(errors, boxes.rect, bend_errors(breaks, lattice[:, CORNERS], strict))
         keep, behind = np.zeros((2, len(errors)), bool)
         judge_boxes(lattice, boxes.rect, image.bounds, float(rule.radius), errors, keep, behind)
         errors[behind] = np.inf
@@ -130,6 +153,13 @@ def compile_anchors(
     if not done:
         return None
     return _assemble(image, done, ground.ranges if wanted is None else wanted, residual, (rule.radius, longest))
+
+
+def _tremor(tremor: Tremor, ground: TileGround, image: _Image) -> TremorTable | None:
+    """The table of a tile; None: it shows nothing of the image."""
+    heights = float(ground.first.heights[:, 0].min()), float(ground.first.heights[:, 1].max())
+    part = tremor.part(ground.first.lattice.reshape(-1, 3))
+    return None if part is None else tremor_table(part, image.size[0], heights, image.tolerance / 2 / _FINER)
 
 
 def _strict(projection: Projection, ground: TileGround, boxes: Boxes) -> Positions:
@@ -202,7 +232,11 @@ def _assemble(
     if not len(xy):
         return None
     (low, high), scales, slack = found[:2].T, (float(found[2, 0]), float(found[2, 1])), 0.0
-    table, origin, frame = None, np.zeros(2), np.zeros(5)
+    table, origin, frame, nodes = None, np.zeros(2), np.zeros(5), np.empty((0, 0, 2), np.float32)
+    tremor = image.tremor
+    if tremor is not None:
+        residual, nodes = residual * tremor.stretch + tremor.residual, tremor.nodes
+        low, high = low + tremor.low, high + tremor.high
     if image.grid is not None:
         table = image.grid.table(low, high)
         scales = scales[0] * max(0.0, 2.0 - image.grid.stretch), scales[1] * image.grid.stretch
@@ -210,11 +244,13 @@ def _assemble(
         slack = _bend_beyond(image.grid, table, xy)
         xy = image.grid.field(xy)
         low, high = np.nanmin(xy, axis=(0, 1)), np.nanmax(xy, axis=(0, 1))
-        origin = table.origin
+        origin, nodes = table.origin, table.nodes
     source = _source_window(low, high, slack + radius * max(1.0, scales[1], longest), image.size)
     origin = np.array([source.col, source.row]) - origin
     if table is not None and image.grid is not None:
         frame = np.array([*(table.first - origin), *(1.0 / np.array(image.grid.spacing)), image.grid.stretch])
+    if tremor is not None:
+        frame = np.array([*(tremor.first - origin), 1.0 / tremor.spacing, 1.0, 1.0, tremor.height])
     corners /= corners[..., 2:].mean(axis=1, keepdims=True)
     corners[..., :2] -= origin * corners[..., 2:]
     return Anchors(
@@ -223,7 +259,7 @@ def _assemble(
         box_heights=heights,
         corners=corners,
         field_frame=frame,
-        field=np.empty((0, 0, 2), np.float32) if table is None else table.nodes,
+        field=nodes,
         residual=residual,
         source_window=source,
         scales=scales,

@@ -68,6 +68,13 @@ class TileGround:
         first = _boxes(target, window, rects, heights, np.ones(len(rects), np.int64))
         return cls(target=target, window=window, relief=relief, ranges=np.ascontiguousarray(ranges), first=first)
 
+    @property
+    def is_height(self) -> bool:
+        """Whether h is the height of the ground: on a map."""
+        level = self.first.lattice[:, :, 2] - self.first.heights[:, :1]
+        rise = np.ptp(self.first.heights, axis=1)[:, None]
+        return bool((np.abs(level - _LATTICE[:, 0] * rise) < 1e-6 * (1.0 + np.abs(self.first.heights).max())).all())
+
     def boxes(self, rects: NDArray[np.int32], layers: NDArray[np.int64]) -> Boxes:
         """Boxes of rectangles; those without a surface are dropped."""
         return _boxes(self.target, self.window, rects, height_ranges(self.relief, rects), layers)

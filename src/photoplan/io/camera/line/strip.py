@@ -149,7 +149,12 @@ def _track(strip: StripFile, path: Path) -> LineTrack:
     clock = np.array([0.0]), np.array([0.0]), np.array([strip.clock.line])
     known = float(t[0]), float(t[-1])
     return LineTrack(
-        strip.lines, *clock, lambda when: cubic(t, S, speed, when), lambda when: between(t, q, when), known
+        strip.lines,
+        *clock,
+        positions=lambda when: cubic(t, S, speed, when),
+        attitudes=lambda when: between(t, q, when),
+        known=known,
+        per_line=True,
     )
 
 

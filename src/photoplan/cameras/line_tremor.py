@@ -1,0 +1,248 @@
+"""Turbulent flights: what a trajectory does from line to line, apart from its smooth part."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_lsq_spline
+
+from photoplan.cameras.line_sight import LineSight, to_sphere
+from photoplan.cameras.line_track import LineTrack
+from photoplan.geometry.body import BodyGround
+from photoplan.geometry.motion import Course
+
+if TYPE_CHECKING:
+    from photoplan.cameras.line import LineCamera
+
+_Floats = NDArray[np.float64]
+_Rows = NDArray[np.int64]
+#: Lines between the knots of the smooth part, at least; twice as many, and so on, until it flies evenly.
+_KNOTS = 128
+#: Evenly: a point that stays in the line's way is met this much earlier or later than half way along, at most.
+_EVEN = (0.6, 1.7)
+#: What moves a pixel by less than this from where the smooth part has it is not worth a table.
+_LEAST = 0.05
+#: Lines whose largest shift is kept.
+_BLOCK = 64
+#: The lowest ground, metres: from there shifts are largest.
+_LOWEST = -500.0
+#: Shifts are looked for to this, lines; and at columns as near as this to those that are asked for.
+_CLOSE, _NEAR = 1e-5, 0.05
+#: Rows by which the smooth part may bend between the points that enclose a piece of ground.
+_AROUND = 16.0
+#: Rows between which points are looked for whose row is known but for the shift.
+_ANY = (-1e6, 1e6)
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Moments at which points are seen."""
+
+    point: _Rows
+    """Number of the point, (k,), not decreasing."""
+    xy: _Floats
+    """Position in the image, (k, 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LineTremor:
+    """A trajectory as a smooth one, and shifts against it that change from line to line (see `cameras.base.Tremor`)."""
+
+    smooth: LineCamera
+    """As the smooth part of the trajectory would see the ground."""
+    rough: LineCamera
+    """The whole."""
+    largest: _Floats
+    """Largest shifts along x and y of blocks of lines, the first before, the last behind the image, (k, 2), pixels."""
+
+    def part(self, XYZ: _Floats) -> StraightPart | None:
+        """See `Tremor`."""
+        seen = self.smooth.project_homogeneous(XYZ)[..., :2].reshape(-1, 2)
+        seen = seen[np.isfinite(seen[:, 0])]
+        if not len(seen):
+            return None
+        rows = self._rows(float(seen[:, 1].min()) - _AROUND, float(seen[:, 1].max()) + _AROUND)
+        first, last = max(rows[0], -1), min(rows[1], self.rough.size[1])
+        if last <= first:
+            return None
+        straight = replace(self.rough, track=_straight_track(self.rough.track, first, last))
+        ideal = straight.project_homogeneous(XYZ)[..., 0]
+        return StraightPart(straight, self.rough, (first, last), (float(np.nanmin(ideal)), float(np.nanmax(ideal))))
+
+    def _rows(self, low: float, high: float) -> tuple[int, int]:
+        """First and last row at which anything can be seen that the smooth part sees from row `low` to `high` on."""
+        begin = np.arange(len(self.largest)) * _BLOCK - _BLOCK
+        far = self.largest[:, 1]
+        some = (begin + _BLOCK + far >= low) & (begin - far <= high)
+        if not some.any():
+            return int(np.floor(low)), int(np.ceil(high))
+        first = np.maximum(begin, low - far)[some].min()
+        return int(np.floor(first)), int(np.ceil(np.minimum(begin + _BLOCK, high + far)[some].max()))
+
+    def passages(self, P: _Floats) -> tuple[_Rows, _Floats, NDArray[np.bool_]]:
+        """Where points (n, 3), in the axes of the body, pass through the line; see `LineSight.crossings`.
+
+        From the first point to the last, and of each from the first row to the last.
+        """
+        near = self.smooth.seen_from(P)[:, 1]
+        block = np.clip(np.nan_to_num(near) // _BLOCK + 1, 0, len(self.largest) - 1).astype(np.int64)
+        reach = np.where(np.isfinite(near), self._local[block], -1)
+        parts = [(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, bool))]
+        for each in np.unique(reach[reach >= 0]).tolist():
+            mine = np.flatnonzero(reach == each)
+            point, rows, stays = self.rough.sight.crossings(P[mine], near[mine], each)
+            parts.append((mine[point], rows, stays))
+        point, rows, stays = (np.concatenate(column) for column in zip(*parts))
+        order = np.lexsort((rows[:, 0], point))
+        return point[order], rows[order], stays[order]
+
+    def first(self, P: _Floats) -> tuple[_Rows, _Floats]:
+        """The passage of each point that counts: number of the point (k,), and the rows between which it is (k, 2).
+
+        That is the first by which it is on the other side at the next line, from the line before the image on; where
+        there is none, the last before.
+        """
+        point, rows, stays = self.passages(P)
+        point, rows = point[stays], rows[stays]
+        line = np.floor(rows[:, 0])
+        order = np.lexsort((np.where(line >= -1, line, 1e9 - line), point))
+        point, rows = point[order], rows[order]
+        one = np.r_[True, point[1:] != point[:-1]] if len(point) else np.empty(0, bool)
+        return point[one], rows[one]
+
+    @cached_property
+    def _local(self) -> _Rows:
+        """Rows as far as which passages can lie from a block of lines, to powers of two, (k,)."""
+        count = len(self.largest)
+        away = np.maximum(np.abs(np.arange(count)[:, None] - np.arange(count)[None]) - 1, 0) * _BLOCK
+        far = np.where(away <= self.largest[None, :, 1], self.largest[None, :, 1], 0.0).max(axis=1)
+        return np.asarray(2 ** np.ceil(np.log2(np.maximum(far, 1.0) + 1.0)), np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class StraightPart:
+    """Some lines against a flight that is straight and does not turn (see `cameras.base.TremorPart`).
+
+    From there a point is met earlier or later by a time that grows with its distance, and at a column that does not
+    depend on it: what is left of the trajectory is linear in the height.
+    """
+
+    smooth: LineCamera
+    rough: LineCamera
+    rows: tuple[int, int]
+    columns: tuple[float, float]
+
+    def shifts(self, columns: _Floats, rows: _Floats, heights: Sequence[float]) -> _Floats:
+        """See `TremorPart`."""
+        sight, ground, size = self.smooth.sight, self.rough.ground, (len(rows), len(columns), 2)
+        wanted, y = np.tile(columns, size[0]), np.repeat(rows, size[1])
+        # First as the straight flight is turned at the same moment: all but what it flies on until it sees the point.
+        S, d = self.rough.sight.rays(np.column_stack([wanted, y]))
+        real, near = 2 * wanted - sight.across(S + d, y)[1], y
+        sea = np.linalg.norm(S, axis=1) - ground.height(S)
+        out = []
+        for height in heights:
+            lift = self._lift(height)
+            for _ in range(3):
+                S, d = self.rough.sight.rays(np.column_stack([real, y]))
+                P = S + to_sphere(S, d, sea + lift)[:, None] * d
+                seen = sight.found(P, near, *_ANY, _CLOSE)
+                miss, near = wanted - seen[:, 0], seen[:, 1]
+                shift = np.column_stack([real, y]) - seen
+                real = real + miss
+                if not (np.abs(miss) > _NEAR).any():
+                    break
+            out.append(shift.reshape(size))
+        return np.stack(out)
+
+    def _lift(self, height: float) -> float:
+        """Height above the ellipsoid of a height on the ground of the project, in the middle."""
+        middle = np.array([[(self.rough.size[0] - 1) / 2, (self.rows[0] + self.rows[1]) / 2]])
+        point = self.smooth.rays(middle, height)[0]
+        lift = float(self.rough.ground.height(self.rough.ground(point))[0])
+        return lift if np.isfinite(lift) else height
+
+
+def smoothed(camera: LineCamera) -> LineTremor | None:
+    """A trajectory without what changes from line to line, and that; None: there is next to nothing of it."""
+    knots = _KNOTS
+    while True:
+        smooth = replace(camera, track=_smooth_track(camera.track, knots))
+        largest, even = _largest(camera.sight, smooth.sight, camera.ground)
+        if even or knots >= 2 * camera.track.lines:
+            break
+        knots *= 2
+    return LineTremor(smooth, camera, largest) if largest[1:-1].max() > _LEAST else None
+
+
+def _straight_track(track: LineTrack, first: int, last: int) -> LineTrack:
+    """Positions at an even speed and one attitude, as the lines from `first` to `last` have on average."""
+    start, poses = track.poses
+    rows = np.arange(first, last + 1.0)
+    some = poses[first - start : last + 1 - start]
+    middle, q = some[:, :3].mean(axis=0), some[:, 3:].mean(axis=0)
+    away = rows - rows.mean()
+    speed = away @ (some[:, :3] - middle) / (away @ away)
+    return _by_rows(
+        track,
+        lambda row: middle + (row - rows.mean())[:, None] * speed,
+        lambda row: np.broadcast_to(q, (len(row), 4)).copy(),
+    )
+
+
+def _smooth_track(track: LineTrack, knots: int) -> LineTrack:
+    """Splines through the poses of all lines; its times are rows."""
+    first, poses = track.poses
+    begin, end = track.whole_rows
+    rows, poses = np.arange(begin, end + 1.0), poses[begin - first : end + 1 - first]
+    origin = poses.mean(axis=0)
+    inner = np.linspace(rows[0], rows[-1], max(1, len(rows) // knots) + 1)
+    spline = make_lsq_spline(rows, poses - origin, np.r_[[inner[0]] * 3, inner, [inner[-1]] * 3], k=3)
+    within = rows[0], rows[-1]
+
+    def at(row: _Floats) -> _Floats:
+        # Beyond its ends a spline swings.
+        inside = np.clip(row, *within)
+        return np.asarray(spline(inside) + origin + (row - inside)[:, None] * spline(inside, 1))
+
+    return _by_rows(track, lambda row: at(row)[:, :3], lambda row: at(row)[:, 3:])
+
+
+def _by_rows(track: LineTrack, positions: Course, attitudes: Course) -> LineTrack:
+    """A trajectory whose times are rows."""
+    return replace(
+        track,
+        knots=np.zeros(1),
+        moments=np.zeros(1),
+        rates=np.ones(1),
+        positions=positions,
+        attitudes=attitudes,
+        known=(-1e9, 1e9),
+        per_line=False,
+    )
+
+
+def _largest(rough: LineSight, smooth: LineSight, ground: BodyGround) -> tuple[_Floats, bool]:
+    """Largest shifts of blocks of lines, (k, 2), and whether the smooth part flies evenly.
+
+    The first block lies before the image, the last behind it.
+    """
+    lines, columns = rough.track.lines, np.array([0.0, (rough.look.columns - 1) / 2, rough.look.columns - 1.0])
+    rows = np.arange(-_BLOCK, (-(-lines // _BLOCK) + 1) * _BLOCK, dtype=float)
+    y, x = np.repeat(rows, 3), np.tile(columns, len(rows))
+    S, d = rough.rays(np.column_stack([x, y]))
+    P = S + to_sphere(S, d, np.linalg.norm(S, axis=1) - ground.height(S) + _LOWEST)[:, None] * d
+    miss, column = smooth.across(P, y)
+    slope = smooth.across(P, y + 1.0)[0] - miss
+    usual = np.median(slope)
+    shift = np.abs(np.column_stack([x - column, miss / np.where(slope * usual > 0.1 * usual**2, slope, usual)]))
+    part = slope / usual
+    even = bool((part > _EVEN[0]).all() and (part < _EVEN[1]).all())
+    blocks = np.nan_to_num(shift).reshape(-1, 3 * _BLOCK, 2).max(axis=1)
+    # Shifts are those of a straight flight from line to line; they hold to a tenth.
+    return 1.1 * blocks + 0.01, even

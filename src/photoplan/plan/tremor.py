@@ -1,0 +1,141 @@
+"""The shifts of a turbulent flight as a table: nodes on the lines of the image, for what a tile needs of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import TremorPart
+from photoplan.geometry.motion import cubic_convolution
+
+_Floats = NDArray[np.float64]
+#: Spacing of nodes along a line, pixels; finer where that misses more than a part of the tolerance.
+_SPACINGS = (512.0, 256.0, 128.0, 64.0, 32.0)
+#: Places along a line at which shifts are computed.
+_PLACES = 3
+#: Lines that are measured strictly.
+_MEASURED = 16
+#: Half the range of heights at least, metres: shifts change with height, and have to be told from rounding.
+_HEIGHTS = 20.0
+#: Where points pass through the line at less than this part of its speed, a position has no accuracy: not reported.
+_SLOW = 0.2
+#: What is missed beside the places that are measured.
+_BESIDE = 1.3
+
+
+@dataclass(frozen=True, eq=False)
+class TremorTable:
+    """The nodes that one tile needs."""
+
+    part: TremorPart
+    first: tuple[float, float]
+    """Ideal x and real y of the first node."""
+    spacing: float
+    """Of the nodes along x, pixels; along y they lie on the lines."""
+    height: float
+    """Of the values, metres."""
+    nodes: NDArray[np.float32]
+    """(rows, columns + 1, 4): real minus ideal position, and its change per metre of height; and how far rows come, see
+    `Anchors.field`."""
+    residual: float
+    """Worst difference to the strict position, pixels, but for points that pass through the line very slowly."""
+    stretch: float
+    """Pixels in the image of a pixel of the ideal position at most, but for such points."""
+    low: _Floats
+    """Lowest shift (x, y)."""
+    high: _Floats
+    """Highest shift (x, y)."""
+
+    def bounds(self, size: tuple[int, int]) -> tuple[float, float, float, float]:
+        """Ideal positions x_min, y_min, x_max, y_max of all that lies in an image."""
+        left, top = (-0.5 - self.high).tolist()
+        right, bottom = (np.array(size) - 0.5 - self.low).tolist()
+        return left, top, right, bottom
+
+
+def tremor_table(part: TremorPart, width: int, heights: tuple[float, float], tolerance: float) -> TremorTable:
+    """Nodes of some lines of an image of a width, over a range of heights."""
+    rows = np.arange(part.rows[0] - 2.0, part.rows[1] + 3.0)
+    left, right = max(part.columns[0], -0.5 - width), min(part.columns[1], 2.0 * width)
+    middle, half = (heights[0] + heights[1]) / 2, max((heights[1] - heights[0]) / 2, _HEIGHTS)
+    # Along a line shifts are smooth: a few places tell what all others are.
+    places = (left + right) / 2 + (right - left + 4.0) / 2 * chebyshev.chebpts1(_PLACES)
+    low, high = part.shifts(places, rows, (middle - half, middle + half))
+    strict = np.concatenate([(low + high) / 2, (high - low) / (2 * half)], axis=-1)
+    for spacing in _SPACINGS:
+        first = spacing * np.floor((left - 2.0) / spacing)
+        columns = first + spacing * np.arange(int((right + 2.0 - first) // spacing) + 2)
+        nodes = _along(strict, places, columns)
+        middles = _along(strict, places, (columns[1:] + columns[:-1]) / 2)[..., :2]
+        bent = (nodes[:, 1:, :2] + nodes[:, :-1, :2]) / 2 - middles
+        if np.hypot(bent[..., 0], bent[..., 1]).max() <= tolerance / 4:
+            break
+    stretch = _stretch(nodes, half)
+    k = np.unique(np.r_[np.argsort(stretch)[-_MEASURED:], np.linspace(0, len(stretch) - 1, _MEASURED)].astype(np.int64))
+    missed = float((_missed(part, columns, rows, nodes, (middle, half), k + 1) * stretch[k]).max())
+    kept = np.zeros((len(rows), len(columns) + 1, 4), np.float32)
+    kept[:, :-1] = nodes
+    come = np.arange(len(rows))[:, None] - nodes[..., 1] + half * np.abs(nodes[..., 3])
+    kept[:, -1, 0] = np.maximum.accumulate(come.max(axis=1)) + 1e-3
+    rounding = float(np.spacing(np.abs(kept[:, :-1, :2]).max())) + half * float(np.spacing(np.abs(kept[..., 2:]).max()))
+    around = half * np.abs(nodes[..., 2:]).max(axis=(0, 1))
+    return TremorTable(
+        part=part,
+        first=(float(first), float(rows[0])),
+        spacing=spacing,
+        height=middle,
+        nodes=kept,
+        residual=_BESIDE * missed + rounding,
+        stretch=float(stretch.max()),
+        low=nodes[..., :2].min(axis=(0, 1)) - around - 1.0,
+        high=nodes[..., :2].max(axis=(0, 1)) + around + 1.0,
+    )
+
+
+def _along(values: _Floats, places: _Floats, columns: _Floats) -> _Floats:
+    """Values (n, k, 4) at places (k,) along the lines as polynomials, at columns (m,)."""
+    weights = np.ones((len(columns), len(places)))
+    for j in range(len(places)):
+        for other in np.delete(places, j):
+            weights[:, j] *= (columns - other) / (places[j] - other)
+    return np.asarray(np.einsum("mk,nkc->nmc", weights, values))
+
+
+def _stretch(nodes: _Floats, half: float) -> _Floats:
+    """Pixels in the image of a pixel of the ideal position at most, between rows (n − 3,), at places not too slow.
+
+    A point that passes the line slowly is found at another row, and all that the line does meanwhile comes with it.
+    """
+    n = len(nodes)
+    worst = np.ones(n - 3)
+    for u in (0.0, 0.25, 0.5, 0.75):
+        w = ((4 - 3 * u) * u - 1) / 2, (9 * u - 10) * u / 2, ((8 - 9 * u) * u + 1) / 2, (3 * u - 2) * u / 2
+        slope = np.asarray(sum(w[k] * nodes[k : n - 3 + k] for k in range(4)))
+        along = np.abs(slope[..., 0]) + half * np.abs(slope[..., 2])
+        pace = 1.0 - slope[..., 1] - half * np.abs(slope[..., 3])
+        longer = np.where(pace > _SLOW, np.hypot(1.0, along) / np.where(pace > _SLOW, pace, 1.0), 1.0)
+        worst = np.maximum(worst, longer.max(axis=1))
+    return np.asarray(np.hypot(1.0, worst))
+
+
+def _missed(
+    part: TremorPart,
+    columns: _Floats,
+    rows: _Floats,
+    nodes: _Floats,
+    heights: tuple[float, float],
+    k: NDArray[np.int64],
+) -> _Floats:
+    """What the table misses between columns and heights, between rows k (m,) and the next; (m,), ideal pixels."""
+    w = cubic_convolution(np.full(len(k), 0.5))
+    between = np.asarray(sum(w[:, j, None, None] * nodes[k - 1 + j] for j in range(4)))
+    between = (between[:, 1:] + between[:, :-1]) / 2
+    worst, away = np.zeros(len(k)), (0.0, 0.5 * heights[1])
+    strict = part.shifts((columns[1:] + columns[:-1]) / 2, rows[k] + 0.5, [heights[0] + each for each in away])
+    for each, found in zip(away, strict):
+        miss = between[..., :2] + each * between[..., 2:] - found
+        worst = np.maximum(worst, np.hypot(miss[..., 0], miss[..., 1]).max(axis=1))
+    return worst
