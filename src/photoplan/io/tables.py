@@ -351,6 +351,8 @@ def _check_roles(roles: Sequence[str], given: int, columns: Columns, text: str) 
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a comma-separated table with a header; it appears complete or not at all, in a folder that is made.
 
+    Numbers that are not known (NaN, infinite) are empty fields.
+
     Raises
     ------
     ResourceError, UsageError
@@ -359,7 +361,7 @@ def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[objec
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerows(["" if isinstance(v, float) and not math.isfinite(v) else v for v in row] for row in rows)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
