@@ -155,8 +155,8 @@ def estimate(
     left = min(int((known & ground.lit & (groups != k)).sum()) for k in np.unique(groups))
     if left < _LEAST // 2:
         raise GeometryError(
-            f"without one part of the picture {left} pixels are left on which the sun shines; {_LEAST // 2} are needed: "
-            "does the terrain cover the picture?"
+            f"without one part of the picture {left} pixels are left on which the sun shines; {_LEAST // 2} are needed"
+            ": does the terrain cover the picture?"
         )
     bands = []
     for number, grey in enumerate(values, 1):
