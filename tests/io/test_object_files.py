@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import shapely
 
-from photoplan.errors import InputError
+from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.objects import mesh
 from photoplan.io.objects.file import read_objects
@@ -394,3 +395,23 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         read_objects(written(tmp_path, "x,y,z\n1,2,3\n", "points.csv"))
     with pytest.raises(InputError, match="there is no such file"):
         read_objects(tmp_path / "none.gpkg")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no limit of the size of files")
+@pytest.mark.parametrize("limit", [100, 3_000, 30_000, 90_000])
+def test_fault_04_a_full_disk_is_told_from_a_place_without_rights(tmp_path: Path, limit: int) -> None:
+    """Libraries of vector files raise the same for both, or whatever SQLite says where a table is not there."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    layer = VectorLayer("points", "Point", shapely.points(np.zeros((5000, 2))), {"n": np.arange(5000)})
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        with pytest.raises(ResourceError, match="free some space"):
+            write_geopackage(tmp_path / "a.gpkg", [layer], "EPSG:32632")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(UsageError, match="choose a folder"):
+        write_geopackage(tmp_path / "a.gpkg", [VectorLayer("x", "Nonsense", layer.shapes, layer.columns)], "EPSG:32632")
+    assert not list(tmp_path.iterdir())

@@ -13,10 +13,9 @@ import numpy as np
 import pyogrio.raw
 import shapely
 from numpy.typing import NDArray
-from pyogrio.errors import DataLayerError, DataSourceError
 
 from photoplan.errors import UsageError
-from photoplan.io.disk import disk_error
+from photoplan.io.disk import disk_error, library_error
 from photoplan.io.lock import FileLock
 from photoplan.io.naming import give_name, together
 from photoplan.io.product import check_output
@@ -136,8 +135,8 @@ def write_contours(
         finally:
             shutil.rmtree(folder, ignore_errors=True)
             lock.release()
-    except (DataSourceError, DataLayerError) as error:
-        raise disk_error(path, OSError(None, str(error))) from error
+    except RuntimeError as error:
+        raise library_error(path, error) from error
     except OSError as error:
         raise disk_error(path, error) from error
     return files

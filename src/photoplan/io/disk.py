@@ -9,6 +9,8 @@ from pathlib import Path
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
 
+#: Bytes that must be free where a library says no more than that it cannot write.
+_TRIAL = 1 << 20
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM}
 
 
@@ -21,6 +23,23 @@ def disk_error(path: Path, error: OSError, doing: str = "written") -> PhotoplanE
             "run the same command again; if it makes tiles, finished tiles are kept"
         )
     return UsageError(f"{path}: cannot be {doing} ({reason}); choose a folder that can be written")
+
+
+def library_error(path: Path, error: BaseException) -> PhotoplanError:
+    """The same for what libraries of rasters and vector files raise, which do not tell a full disk from other reasons.
+
+    A trial does: as much as the file is likely to need is written beside it, and removed.
+    """
+    trial = path.with_name(f".{path.name}.{os.getpid()}.trial")
+    try:
+        with trial.open("wb") as file:
+            write_all(file.fileno(), bytes(_TRIAL))
+            os.fsync(file.fileno())
+    except OSError as reason:
+        return disk_error(path, reason)
+    finally:
+        trial.unlink(missing_ok=True)
+    return UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written")
 
 
 def free_megabytes(path: Path) -> int:

@@ -13,11 +13,9 @@ import numpy as np
 import pyogrio.raw
 import shapely
 from numpy.typing import NDArray
-from pyogrio.errors import DataSourceError
 
 from photoplan.cameras.observed import ImagePoints
-from photoplan.errors import UsageError
-from photoplan.io.disk import disk_error
+from photoplan.io.disk import disk_error, library_error
 from photoplan.io.naming import give_name
 from photoplan.io.tables import write_table
 
@@ -68,10 +66,10 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str | None)
             give_name(partial, path)
         finally:
             partial.unlink(missing_ok=True)
-    except DataSourceError as error:
-        raise UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written") from error
     except OSError as error:
         raise disk_error(path, error) from error
+    except RuntimeError as error:
+        raise library_error(path, error) from error
 
 
 @dataclass(frozen=True, eq=False)

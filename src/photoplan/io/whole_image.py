@@ -13,7 +13,7 @@ import rasterio
 from numpy.typing import NDArray
 
 from photoplan.errors import PhotoplanError, UsageError
-from photoplan.io.disk import disk_error
+from photoplan.io.disk import disk_error, library_error
 from photoplan.io.gdal import GDAL_ERRORS, gdal_settings
 from photoplan.io.naming import give_name
 
@@ -67,7 +67,7 @@ def write_whole_image(path: Path, values: NDArray[Any], tags: Mapping[str, str] 
     except OSError as error:
         raise disk_error(path, error) from error
     except GDAL_ERRORS as error:
-        raise disk_error(path, OSError(0, f"{error}")) from error
+        raise library_error(path, error) from error
 
 
 def _check(part: Path, bands: NDArray[Any], path: Path) -> None:

@@ -14,10 +14,10 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan import __version__
-from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MOST_TILES, MapGrid
-from photoplan.io.disk import disk_error, free_megabytes
+from photoplan.io.disk import disk_error, library_error
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
@@ -191,10 +191,7 @@ def write_plan(
     except OSError as error:
         raise disk_error(path, error) from error
     except (RuntimeError, sqlite3.Error) as error:
-        # What the libraries of vector files and of SQLite raise does not tell a full disk from a place without rights.
-        if free_megabytes(path) < 1:
-            raise ResourceError(f"{path}: cannot be written, the disk is full; free some space") from error
-        raise UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written") from error
+        raise library_error(path, error) from error
 
 
 def check_plan_path(path: Path, plan: OrthoPlan, overwrite: bool = False) -> None:
