@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +30,31 @@ def project_file(folder: Path, strip: ShakenStrip, vienna: Vienna, names: dict[s
     terrain = '[terrain]\nfile = "dtm.tif"\nheight_system = "ellipsoidal"\n'
     path.write_text(f'format = 1\ncrs = "{strip.crs}"\n{terrain}{"".join(entries)}')
     return path
+
+
+def test_check_and_the_record_tell_how_turbulent_a_flight_is(tmp_path: Path) -> None:
+    """A strip of pitch and roll over level ground: part of it is seen three times."""
+    strip = ShakenStrip(columns=120, lines=300, vibration=(2.0, 1.2, 0.0), events=(10.0, 20.0, 0.0), event_lines=20.0)
+    strip.strip_file(tmp_path)
+    with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", width=120, height=300, count=1, dtype="uint8") as file:
+        file.write(np.full((1, 300, 120), 99, np.uint8))
+    path = tmp_path / "project.toml"
+    terrain = '[terrain]\nheight = 300.0\nheight_system = "ellipsoidal"\n'
+    image = '[[images]]\nname = "a"\nfile = "a.tif"\nline = "strip.toml"\ndetectors = "nadir"\n'
+    path.write_text(f'format = 1\ncrs = "{strip.crs}"\n{terrain}{image}')
+    told = inside("check", path)
+    words = " ".join((told.out + told.err).split())
+    found = re.search(
+        r"turbulent flight: lines lie up to ([\d.]+) pixels beside, ([\d.]+) before or behind .*; ([\d.]+) %", words
+    )
+    assert found is not None, words
+    assert 5 < float(found[1]) < 25 and 5 < float(found[2]) < 40 and 10 < float(found[3]) < 90
+    assert "the first moment counts" in words
+    product = inside("ortho", path, "--resolution", 0.3, "--no-quicklook").out.split()[0]
+    record = json.loads(Path(product).with_suffix(".run.json").read_text())
+    assert record["images"][0]["tremor"] in words
+    with rasterio.open(product) as file:
+        assert (file.read(1)[file.read_masks(1) > 0] == 99).all() and (file.read_masks(1) > 0).mean() > 0.5
 
 
 @pytest.mark.slow

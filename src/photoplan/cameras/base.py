@@ -45,6 +45,10 @@ class Tremor(Protocol):
         """For the ground that points (n, 3) enclose; None: the image does not show it."""
         ...
 
+    def told(self, height: float) -> str:
+        """How strong it is, and how much of the ground at a height is seen several times: a sentence."""
+        ...
+
 
 class TremorPart(Protocol):
     """Some lines of such an image.
@@ -177,3 +181,9 @@ def project(projection: Projection, XYZ: ArrayLike) -> NDArray[np.float64]:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ideal = np.where(w > 0, h[..., :2] / w, np.nan)
     return ideal if projection.field is None else projection.field(ideal)
+
+
+def tremor_of(projection: Projection) -> Tremor | None:
+    """What of it changes from line to line; None: nothing does."""
+    breaks = projection.breaks
+    return None if breaks is None or isinstance(breaks, Breaks) else breaks

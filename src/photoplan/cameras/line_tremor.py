@@ -33,6 +33,8 @@ _BLOCK = 64
 _LOWEST = -500.0
 #: Shifts are looked for to this, lines; and at columns as near as this to those that are asked for.
 _CLOSE, _NEAR = 1e-5, 0.05
+#: Lines at which it is told how often ground is seen.
+_TOLD = 300
 #: Rows by which the smooth part may bend between the points that enclose a piece of ground.
 _AROUND = 16.0
 #: Rows between which points are looked for whose row is known but for the shift.
@@ -114,6 +116,25 @@ class LineTremor:
         point, rows = point[order], rows[order]
         one = np.r_[True, point[1:] != point[:-1]] if len(point) else np.empty(0, bool)
         return point[one], rows[one]
+
+    def told(self, height: float) -> str:
+        """See `Tremor`; of pixels spread over the image."""
+        width, lines = self.rough.size
+        rows = np.unique(np.linspace(0, lines - 1, _TOLD).round())
+        columns = np.linspace(0, width - 1, 5)
+        ground = self.rough.rays(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2), height)[0]
+        ground = ground[np.isfinite(ground[:, 0])]
+        x, y = self.largest[1:-1].max(axis=0)
+        shaken = (
+            f"a turbulent flight: lines lie up to {x:.1f} pixels beside, {y:.1f} before or behind the smooth course"
+        )
+        count = np.bincount(self.rough.moments(ground).point, minlength=len(ground)) if len(ground) else np.zeros(1)
+        if not (count > 1).any():
+            return f"{shaken}; no ground is seen twice"
+        return (
+            f"{shaken}; {100 * (count > 1).mean():.2g} % of the pixels show ground that is seen several times, up to "
+            f"{count.max()} times: the first moment counts"
+        )
 
     @cached_property
     def _local(self) -> _Rows:

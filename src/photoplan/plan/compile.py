@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Projection, Tremor
+from photoplan.cameras.base import Projection, Tremor, tremor_of
 from photoplan.errors import UsageError
 from photoplan.geometry.breaks import Breaks
 from photoplan.geometry.grid import Window
@@ -114,9 +114,9 @@ def compile_anchors(
     if projection.field is not None:
         grid = field_grid(projection.field, projection.size, rule.tolerance / 2)
         image = _Image(projection.size, grid, (rule.tolerance - min(grid.miss, rule.tolerance / 2)) / grid.stretch)
-    breaks = projection.breaks
-    if breaks is not None and not isinstance(breaks, Breaks):
-        tremor = _tremor(breaks, ground, image)
+    breaks, shaken = projection.breaks, tremor_of(projection)
+    if shaken is not None:
+        tremor = _tremor(shaken, ground, image)
         if tremor is None:
             return None
         # Shifts belong to a height of the ground: where h is none, boxes have to do.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import Camera, tremor_of
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.io.project.model import Project
@@ -164,6 +164,9 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
             fault=fault,
             notes=notes,
         )
+    tremor = tremor_of(camera)
+    if tremor is not None:
+        notes = (*notes, tremor.told(float(np.nanmean(seen.outline[:, 2]))))
     relief, curvature = _sensitivity(camera, seen)
     xmin, ymin, xmax, ymax = seen.bounds
     return ImageCheck(
