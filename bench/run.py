@@ -5,7 +5,8 @@
 One real aerial frame, enlarged 6 and 12 times; cubic, three bands, uncompressed, no overviews, one thread where the
 program lets itself be told. Whole processes are measured, from start to end. Runs of the programs alternate, medians
 are compared. Whatever is missing (a program, the data) is named and its rows are left out. Terrain models from
-measured points (terrain.py), orientation (orientation.py), the rate of filters (filter.py) and views (views.py) follow.
+measured points (terrain.py), orientation (orientation.py), the rate of filters (filter.py), mosaics (mosaics.py; otb.py
+beside OTB) and views (views.py) follow.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from filter import report_filter
 from mosaics import report_mosaics
 from oblique import report_oblique
 from orientation import report_orientation
+from otb import report_otb
 from owners import report_owners
 from planning import report_planning
 from prepare import DATA, LARGE, SMALL, WORK, Source, prepare
@@ -217,6 +219,7 @@ def main() -> int:
     results["orientation"] = report_orientation(options.quick)
     results["planning"] = report_planning(options.quick)
     results["mosaics"] = report_mosaics(options.quick)
+    results["otb"] = report_otb(options.quick)
     results["views"] = report_views(options.quick, options.repeat)
     if options.json:
         options.json.write_text(json.dumps(results, indent=2) + "\n")

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +15,10 @@ from numpy.typing import NDArray
 from rasterio.transform import from_origin
 from scipy.ndimage import gaussian_filter, map_coordinates
 from tools.command import Here
+from tools.forked import Mishap, forked
 from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
 
+from photoplan.io.lock import FileLock, lock_of
 from photoplan.io.project.file import load_project
 from photoplan.products.balance.run import BalanceRequest, balance_project
 
@@ -165,6 +171,51 @@ def test_an_image_without_overlap_is_named(block: Block, capsys: pytest.CaptureF
     assert said.code == 3 and "no two of 2 images show enough of the same ground" in said.err
     said = photoplan("balance", block.project, "--reference-image", "one", "--overwrite", "--no-picture")
     assert said.code == 2 and "shows no ground that another image shows" in said.err
+
+
+def tables(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("*.toml")}
+
+
+def test_fault_26_more_workers_and_a_second_run(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan, words = Here(capsys), ("balance", block.project, "--resolution", 3, "--no-picture", "-q")
+    folders = [block.folder / "one", block.folder / "more"]
+    for folder, workers in zip(folders, (1, 3)):
+        said = photoplan(*words, "--workers", workers, "-o", folder)
+        assert said.code == 0, said.err
+    assert tables(folders[0]) == tables(folders[1]) != {}
+    project = block.project.read_bytes()
+    with FileLock(lock_of(folders[0] / "overlaps.csv")):
+        said = photoplan(*words, "-o", folders[0], "--overwrite")
+    assert said.code == 2 and "another run" in said.err and block.project.read_bytes() == project
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
+def test_faults_03_25_a_run_that_ended_early_leaves_the_project(block: Block, sign: signal.Signals, code: int) -> None:
+    words = ["balance", block.project, "--resolution", 3, "--no-picture", "--workers", 1]
+    before = {path: path.read_bytes() for path in block.folder.rglob("*") if path.is_file()}
+    said = forked(words, block.folder.parent / "said", Mishap(end_at=1, sign=sign))
+    assert said.code == code, said.err
+    after = {path: path.read_bytes() for path in block.folder.rglob("*") if path.is_file() and path.suffix != ".lock"}
+    assert after == before
+
+
+def test_fault_22_what_has_no_data_counts_nothing(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    """A third of an image is nodata, darker than all else: its tables are those of the rest."""
+    photoplan, words = Here(capsys), ("balance", block.project, "--resolution", 3, "--no-picture", "-q")
+    assert photoplan(*words, "-o", block.folder / "whole").code == 0
+    with rasterio.open(block.images[1]) as file:
+        values = file.read()
+    values[:, SIZE[1] // 3 : SIZE[1] * 2 // 3] = 0
+    write_image(block.images[1], values, nodata=0)
+    assert photoplan(*words, "-o", block.folder / "part").code == 0
+    becomes = []
+    for folder in ("whole", "part"):
+        found = tomllib.loads((block.folder / folder / "two.toml").read_text())
+        becomes.append(np.array([band["becomes"] for band in found["bands"]]))
+    # Grey values of the ground lie between 60 and 200; without nodata they move by 25.
+    assert np.abs(becomes[0] - becomes[1])[:, 8:24].max() < 8
 
 
 def test_check_says_that_colours_differ_until_they_are_balanced(

@@ -71,10 +71,11 @@ def true_ortho(inputs: Path, out: Path) -> list[object]:
 
 
 def mosaic(inputs: Path, out: Path) -> list[object]:
-    """Of ground with objects."""
+    """Of ground with objects, blended by bands of detail."""
     project = inputs / "block" / "town.toml"
     bounds = ["--bounds", 500_200, 5_300_100, 500_520, 5_300_300, "--resolution", 1, "--tile", 128]
-    return ["mosaic", project, *bounds, "--sources", "--no-quicklook", "--output", out]
+    blend = ["--feather", 24, "--blend", "multiband"]
+    return ["mosaic", project, *bounds, *blend, "--sources", "--no-quicklook", "--output", out]
 
 
 def single(inputs: Path, out: Path) -> list[object]:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.balance_file import BalanceBand, write_balance_file
+from photoplan.io.disk import make_folder
+from photoplan.io.lock import FileLock, lock_of
 from photoplan.io.names import safe_stem
 from photoplan.io.naming import together
 from photoplan.io.product import check_output
@@ -135,13 +137,27 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     notes = [f"left out, sees no terrain: {line}" for line in found.blind]
     if request.dry_run:
         return BalanceReport(found, tuple(notes))
+    make_folder(request.folder)
+    with FileLock(lock_of(request.table)):
+        report = _made(request, found, fixed, notes, events)
+        _keep(request, project, report, times())
+    return report
+
+
+def _made(request: BalanceRequest, found: Survey, fixed: str | None, notes: list[str], events: Events) -> BalanceReport:
+    """Tables of the images of a survey."""
     reference = _reference(request, found, notes)
     cells = sample(found, reference, request.workers, events)
     if reference is not None and not np.isfinite(cells.reference).any():
         raise GeometryError(f"{reference.path}: shows nothing of the ground that the images show")
     made, pairs = _adjusted(request, cells, found, fixed, events, notes)
     files = tuple(request.folder / f"{safe_stem(found.names[k])}.toml" for k in made.images.tolist())
-    report = BalanceReport(found, tuple(notes), cells, made, pairs, files)
+    return BalanceReport(found, tuple(notes), cells, made, pairs, files)
+
+
+def _keep(request: BalanceRequest, project: Project, report: BalanceReport, times: dict[str, Any]) -> None:
+    """Write the files and the record, and enter them into the project."""
+    found = report.survey
     files_in = [request.project, *(one.scene.reader.path for one in found.looked)]
     inputs = [input_entry(path) for path in (*files_in, *([request.reference] if request.reference else []))]
     settings = pick(request, "reference_image", "degree", "factor", "resolution")
@@ -151,12 +167,11 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
             request.table,
             key=run_key("balance", settings, inputs),
             inputs=inputs,
-            run={"workers": request.workers, **times()},
+            run={"workers": request.workers, **times},
             kind="balance",
             product=report,
             settings=settings,
         )
-    return report
 
 
 def _adjusted(
