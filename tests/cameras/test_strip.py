@@ -110,3 +110,23 @@ def test_detectors_are_chosen_by_name(tmp_path: Path) -> None:
         read_line(path)
     with pytest.raises(InputError, match="no line of detectors 'back'; there are nadir, forward"):
         read_line(path, "back")
+
+
+@pytest.mark.parametrize(
+    ("record", "told"),
+    [
+        (np.zeros((5, 7), complex), "complex128; real numbers are needed"),
+        (np.zeros(5, [("a", "f8")]), "real numbers are needed"),
+        (b"\x93NUMPY\x01\x00\x06\x00{'a(9\n", "flight.npy: cannot be read"),
+        (np.zeros((5, 7))[:, :6], "needed are two rows or more"),
+    ],
+)
+def test_fault_31_damaged_arrays_are_named(tmp_path: Path, record: np.ndarray | bytes, told: str) -> None:
+    path = Strip(lines=60).strip_file(tmp_path)
+    path.write_text(path.read_text().replace("flight.csv", "flight.npy"))
+    if isinstance(record, bytes):
+        (tmp_path / "flight.npy").write_bytes(record)
+    else:
+        np.save(tmp_path / "flight.npy", record)
+    with pytest.raises(InputError, match=told):
+        read_line(path, "nadir")

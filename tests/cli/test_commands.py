@@ -198,6 +198,7 @@ def test_run_executes_a_plan_and_nothing_else(photoplan: Here, small: Block, und
         ("a.gpkg", b"SQLite format 3\0 no more", "not a plan of photoplan"),
         ("a.json", b'{"a": 1}', "no run record of photoplan"),
         ("a.json", b"{", "no readable JSON"),
+        ("deep.json", b"[" * 200_000, "no readable JSON"),
         ("a.toml", b"= 3", "a.toml"),
         ("absent.tif", None, "no such file"),
     ],

@@ -172,6 +172,7 @@ def test_geojson_is_wgs_84_and_what_states_no_crs_is_not_guessed(small: Block, w
         ("@dash=3", InputError, "strokes and gaps"),
         ("@label=nobody", InputError, "no such attribute"),
         ("@shade=3", UsageError, "options are KEY=VALUE"),
+        ("@width=nan", InputError, "0.1 to 200"),
     ],
 )
 def test_what_cannot_be_drawn_is_said(small: Block, ways: Path, options: str, error: type, said: str) -> None:

@@ -73,7 +73,7 @@ def take_camera(options: dict[str, Any]) -> Any:
         return CameraRequest(image=camera, **given)
     try:
         stated = tomllib.loads(Path(camera).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{camera}: is no file of a camera ({error})") from error
     return CameraRequest.from_dict(
         {**stated, **{n: list(v) if isinstance(v, tuple) else v for n, v in given.items()}}, camera

@@ -170,7 +170,7 @@ def _noted(path: Path) -> dict[str, Any]:
     """What a run that died has noted: all files that were to get their names, and which one this is."""
     try:
         noted = json.loads(_note(path).read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         noted = None
     return noted if isinstance(noted, dict) and noted.keys() == {"files", "identity"} else {"files": [], "identity": []}
 

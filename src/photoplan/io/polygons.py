@@ -107,7 +107,7 @@ def _states_crs(path: Path, head: bytes) -> bool:
         return True
     try:
         return "crs" in json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, OSError):
+    except (ValueError, OSError, RecursionError):
         return False
 
 

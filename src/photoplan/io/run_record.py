@@ -55,7 +55,7 @@ def recorded_result(product: Path, key: str, result: Callable[[dict[str, Any], A
     try:
         record = json.loads(record_path(product).read_text(encoding="utf-8"))
         return result(record["product"], record["settings"]) if record["key"] == key else None
-    except (OSError, ValueError, KeyError, TypeError, UsageError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, UsageError):
         return None
 
 
@@ -79,7 +79,7 @@ def refuse_foreign_record(path: Path) -> None:
 def _read_record(path: Path) -> dict[str, Any] | None:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) and {"file", "key", "inputs", "versions"} <= record.keys() else None
 

@@ -128,7 +128,7 @@ def _plan(path: Path) -> dict[str, Any]:
 def _record(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: no readable JSON ({error}){looks_like(path)}") from None
     if not isinstance(content, dict) or "product" not in content:
         raise InputError(f"{path}: no run record of photoplan{looks_like(path)}")

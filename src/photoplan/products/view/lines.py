@@ -269,9 +269,10 @@ class _Values:
     def rank(self, row: int) -> float:
         """Lower ones come first."""
         name = self.options.get("rank", "").casefold()
-        if not name:
+        text = self._text(name, row) if name else ""
+        if not text:
             return float("nan")
-        return _number(self._text(name, row) or "nan", f"{self.table.path}: feature {row + 1}: rank", -1e12, 1e12)
+        return _number(text, f"{self.table.path}: feature {row + 1}: rank", -1e12, 1e12)
 
     def _of(self, key: str, row: int, default: str, read: Callable[[str], T], also: str = "") -> T:
         stated = self.options.get(key)
@@ -302,8 +303,6 @@ def _number(text: str, where: str, least: float, most: float) -> float:
         value = float(text)
     except ValueError:
         value = least - 1
-    if text == "nan":
-        return value
     if not least <= value <= most:
         raise InputError(f"{where} {text[:40]!r}; {least:g} to {most:g} is allowed")
     return value

@@ -214,17 +214,21 @@ def camera_request(request: ViewRequest) -> CameraRequest:
         return request.camera
     if request.matrix is None:
         raise UsageError("a view needs one `camera`: an image of the project, or a standpoint `position` X Y")
+    return CameraRequest.from_dict(_stated_camera(MatrixFile(request.matrix)), str(request.matrix))
+
+
+def _stated_camera(file: MatrixFile) -> dict[str, Any]:
+    """Which camera a matrix says it is of."""
     try:
-        values = json.loads(MatrixFile(request.matrix).description)["camera"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{request.matrix}: does not say which view it is of; make it again") from error
-    return CameraRequest.from_dict(values, str(request.matrix))
+        return dict(json.loads(file.description)["camera"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{file.info.path}: does not say which view it is of; make it again") from error
 
 
 def _fitting(path: Path, camera: ViewCamera) -> Path:
     """A matrix, if it is of this view."""
     file = MatrixFile(path)
-    stated = json.loads(file.description).get("camera")
+    stated = _stated_camera(file)
     if file.info.size != camera.target.bundle.size or stated != plain(camera.json_fields()["camera"]):
         raise InputError(f"{path}: is of another view; leave out the camera to take that of the matrix")
     return path

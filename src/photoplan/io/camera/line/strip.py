@@ -162,7 +162,7 @@ def _record(path: Path) -> _Floats:
     """The table of the flight, shape (n, 7)."""
     try:
         if path.suffix.lower() == ".npy":
-            table = np.load(path, allow_pickle=False, mmap_mode="r").astype(float)
+            table = _from_npy(path)
         else:
             header, _, body = read_text(path, MAX_BYTES).partition("\n")
             if header.replace(" ", "").lower() != _COLUMNS:
@@ -176,6 +176,20 @@ def _record(path: Path) -> _Floats:
         row = int(np.argmin(np.diff(table[:, 0]))) + 1
         raise InputError(f"{path}: the time of row {row + 1} ({table[row, 0]:g}) is not after that of the row before")
     return np.ascontiguousarray(table)
+
+
+def _from_npy(path: Path) -> _Floats:
+    try:
+        table = np.load(path, allow_pickle=False, mmap_mode="r")
+        kind = table.dtype
+    except (OSError, ValueError):
+        raise
+    except Exception as error:
+        # Its header is a line of Python: a damaged one ends in whatever the parser raises.
+        raise ValueError(f"no array in NPY form: {error}") from None
+    if kind.kind not in "fiu":
+        raise ValueError(f"it holds {kind}; real numbers are needed")
+    return np.asarray(table, float)
 
 
 def _judge(table: _Floats, flight: StripFlight, path: Path) -> None:
