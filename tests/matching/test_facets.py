@@ -98,7 +98,8 @@ def test_standard_deviations_hold_whatever_the_ground_is_like(kind: str) -> None
             solve_heights(equations(), right, 500, 1e-4, x)
         return out
 
-    smoother = Smoother(solve, noise, inside)
+    signs = rng.choice((-1.0, 1.0), size=(3, *inside.shape))
+    smoother = Smoother(solve, noise, inside, np.ones(inside.shape), signs)
     for _ in range(8):
         (heights,) = solve([seen / sigma**2])
         rough = rough.estimated(heights, smoother)

@@ -22,36 +22,43 @@ pytest.importorskip("cv2")
 NAMES = ("img_01", "img_02", "img_03")
 
 
-@pytest.mark.slow
-def test_tie_points_of_a_triplet_bring_it_together(shared: Path, tmp_path: Path) -> None:
-    """`tie`, then `adjust`, with heights of another program's surface at the tie points as height control.
-
-    README of the data: a shift of each image has to bring the medians to zero, with a spread of 0.14 and 0.25 px.
-    """
-    folder = shared / "data/pleiades_triplet_s2p"
+def brought_together(shared: Path, folder: Path) -> Path:
+    """Project of the triplet after `tie` and `adjust`, with heights of another program's surface at the tie points as
+    height control."""
+    data = shared / "data/pleiades_triplet_s2p"
     text = 'format = 1\ncrs = "EPSG:32631"\n[terrain]\nheight = 170.0\nheight_system = "ellipsoidal"\n[observations]\n'
     for name in NAMES:
-        shutil.copy(folder / f"{name}.tif", tmp_path)
+        shutil.copy(data / f"{name}.tif", folder)
         text += f'[[images]]\nname = "{name}"\nfile = "{name}.tif"\nrpc = "tags"\n'
-    path = tmp_path / "project.toml"
+    path = folder / "project.toml"
     path.write_text(text)
     report = find_ties(TieRequest(path))
     assert report.points > 400 and report.sigma < 0.1
     first = adjust_project(AdjustRequest(path))
     assert first.figures.rms_pixels < 0.05 and first.figures.rejected < 10
     assert "position of the block in Z" in first.data["determined_by_priors_alone"]
-    with rasterio.open(folder / "s2p_dsm.tif") as file:
+    with rasterio.open(data / "s2p_dsm.tif") as file:
         Z, T = file.read(1), file.transform
-    _, _, shapes, (names, *_) = pyogrio.raw.read(tmp_path / "adjustment/points.gpkg", layer="points")
+    _, _, shapes, (names, *_) = pyogrio.raw.read(folder / "adjustment/points.gpkg", layer="points")
     at = shapely.get_coordinates(shapely.from_wkb(shapes))
     col, row = (np.floor(v).astype(int) for v in ~T * at.T)
     inside = (col >= 0) & (col < Z.shape[1]) & (row >= 0) & (row < Z.shape[0])
     known = [(names[k], float(Z[row[k], col[k]])) for k in np.flatnonzero(inside) if np.isfinite(Z[row[k], col[k]])]
-    (tmp_path / "heights.csv").write_text("name,x,y,z\n" + "".join(f"{n},,,{z:.3f}\n" for n, z in known))
+    (folder / "heights.csv").write_text("name,x,y,z\n" + "".join(f"{n},,,{z:.3f}\n" for n, z in known))
     stated = '[observations]\ncontrol = ["heights.csv"]\nsigma_control = [1.0, 0.5]'
     path.write_text(path.read_text().replace("[observations]", stated, 1))
     second = adjust_project(AdjustRequest(path, overwrite=True))
     assert "position of the block in Z" not in second.data["determined_by_priors_alone"]
+    return path
+
+
+@pytest.mark.slow
+def test_tie_points_of_a_triplet_bring_it_together(shared: Path, tmp_path: Path) -> None:
+    """README of the data: a shift of each image has to bring the medians to zero, with a spread of 0.14 and 0.25 px."""
+    folder = shared / "data/pleiades_triplet_s2p"
+    path = brought_together(shared, tmp_path)
+    with rasterio.open(folder / "s2p_dsm.tif") as file:
+        Z, T = file.read(1), file.transform
     opened = load_project(path)
     cameras = [camera_without_pixels(opened, name) for name in NAMES]
     images = []

@@ -11,6 +11,12 @@ from tools.command import inside
 from tools.facet_scene import write_scene
 from tools.small_block import X0, Y0
 
+from photoplan.geometry.grid import Window
+from photoplan.io.project.file import load_project
+from photoplan.plan.tiles import Tile
+from photoplan.products.surface.job import SurfaceJob
+from photoplan.products.surface.plan import SurfaceSettings, plan_surface
+
 pytestmark = pytest.mark.slow
 BOUNDS = (X0 - 30, Y0 - 45, X0 + 30, Y0 + 45)
 
@@ -46,3 +52,20 @@ def test_heights_and_what_they_claim(
     assert both[0] < rms and 0.8 < both[1] < 1.3
     # Waves of three pixels are more than the facets can follow where there is hardly any noise.
     assert 0.9 < both[2] < (1.25 if finest == 3 and snr == 50 else 1.1)
+
+
+def test_seams_between_tiles(tmp_path: Path) -> None:
+    """The same ground as one tile and as two, each of which goes from coarse to fine by itself."""
+    scene = write_scene(tmp_path, 4, seed=5, base=60, size=(280, 200))
+    bounds = (X0 - 45, Y0 - 36, X0 + 45, Y0 + 36)
+    plan = plan_surface(load_project(scene.path), SurfaceSettings(1.5, bounds=bounds))
+    job = SurfaceJob(plan.address, plan.grid, plan.scheme, "terrain")
+    width, height = plan.grid.width, plan.grid.height
+    windows = (Window(0, 0, width, height), Window(0, 0, width // 2, height))
+    windows += (Window(width // 2, 0, width - width // 2, height),)
+    made = [job(Tile(n, window)) for n, window in enumerate(windows)]
+    (whole, sigma), *halves = [[layer[0][0] for layer in one.layers[:2] if layer is not None] for one in made]
+    off = np.abs(np.hstack([heights for heights, _ in halves]) - whole) / sigma
+    seam = off[:, width // 2 - 4 : width // 2 + 4]
+    print("sigma apart", np.median(off), np.percentile(off, 95), off.max(), "at the seam", np.median(seam), seam.max())
+    assert np.median(seam) < 0.1 and seam.max() < 0.7

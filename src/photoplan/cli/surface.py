@@ -83,5 +83,7 @@ def _tell(result: Any, plan: Any, draw: bool, events: Any) -> None:
     corrections = ", ".join(f"{c:.3f}" for c in result.corrections[::-1])
     events.talk(f"  last corrections, coarse to fine: {corrections} px")
     events.talk("  sigma0 of grey values: " + ", ".join(f"{name} {value:.3g}" for name, value in known.items()))
+    for note in result.notes:
+        events.talk(f"  {note}")
     if draw and has_matplotlib():
         events.talk(f"  drawn in {draw_surface(result.path, result.path.with_suffix('.png'))}")

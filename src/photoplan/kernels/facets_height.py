@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from photoplan.kernels.facets_grey import grey_at
-from photoplan.kernels.jit import kernel
+from photoplan.kernels.jit import inner, kernel
 
 #: Rows and columns between the two posts of an entry.
 OFFSETS = ((0, 0), (0, 1), (0, 2), (1, -1), (1, 0), (1, 1), (2, 0))
@@ -33,20 +33,43 @@ def add_means(places, weights, sums):
                 sums[j, i, 2] += p * places[r, c, 3]
 
 
+@inner
+def sign_at(i, j):
+    """1 or −1, by chance, but always the same at a place (MurmurHash3's mixing, Appleby 2011)."""
+    mixed = np.uint64(i) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(j) * np.uint64(0xC2B2AE3D27D4EB4F)
+    mixed = (mixed ^ (mixed >> np.uint64(33))) * np.uint64(0xFF51AFD7ED558CCD)
+    mixed = (mixed ^ (mixed >> np.uint64(33))) * np.uint64(0xC4CEB9FE1A85EC53)
+    return 1.0 if (mixed >> np.uint64(40)) & np.uint64(1) else -1.0
+
+
+@kernel
+def signs_at(col, row, out):
+    """`sign_at` of the places of a grid whose first one is (col, row), for each of the layers of `out`, (k, m, n)."""
+    for k in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            for i in range(out.shape[2]):
+                out[k, j, i] = sign_at((col + i) * 4 + k, row + j)
+
+
 @kernel
 def add_heights(
-    places, grey, weights, values, ratio, means, sigma, limit, system, right, noise, residuals, factors, sums
-):
+    first, places, grey, weights, values, ratio, means, trust, sigma, limit, system, right, noise, residuals,
+    factors, sums, telling,
+):  # fmt: skip
     """Add the equations of an image to the normal equations of the heights; residuals and robust factors.
 
     Parameters
     ----------
+    first : (int, int)
+        Column and row of the first pixel in its image: errors are drawn the same way whatever window is looked at.
     places, grey, weights
         See `facets_grey.add_grey`.
     values, ratio
         Coefficients of the grey facets, and how many lie along a side of a height facet.
     means : ndarray, shape (rows − 1, columns − 1, 2)
         Mean change of place with height of the pixels of all images in a facet.
+    trust : ndarray, shape (rows − 1, columns − 1)
+        Part of the sensitivities in a facet that is texture, not noise: a factor of the weights.
     sigma, limit : float
         Standard deviation of the grey values, and the multiple of it from which weights fall (Huber 1964).
     system : ndarray, shape (7, rows, columns); right, noise : ndarray, shape (rows, columns)
@@ -55,10 +78,11 @@ def add_heights(
         Grey value of the surface less that of the pixel (NaN: no pixel), and the robust factor of its weight.
     sums : ndarray, shape (3,)
         Added: Σ f, Σ f (v/σ)², pixels.
+    telling : ndarray, shape (rows − 1, columns − 1, 2)
+        Added, by facet: Σ p a², and Σ p |k − k̄|², with k the change of place in grey facets per metre.
     """
     x, y, dx, dy, found = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(3)
     phi = np.empty(4)
-    state = np.uint64(88172645463325252)
     for r in range(places.shape[0]):
         for c in range(places.shape[1]):
             p = weights[r, c]
@@ -75,15 +99,15 @@ def add_heights(
             sums[1] += factor * size * size
             sums[2] += 1.0
             i, j = min(int(u), means.shape[1] - 1), min(int(v), means.shape[0] - 1)
-            a = ratio * (found[1] * (places[r, c, 2] - means[j, i, 0]) + found[2] * (places[r, c, 3] - means[j, i, 1]))
+            ku, kv = ratio * (places[r, c, 2] - means[j, i, 0]), ratio * (places[r, c, 3] - means[j, i, 1])
+            a = found[1] * ku + found[2] * kv
+            telling[j, i, 0] += p * a * a
+            telling[j, i, 1] += p * (ku * ku + kv * kv)
+            p *= trust[j, i]
             f, g = u - i, v - j
             phi[0], phi[1], phi[2], phi[3] = (1 - f) * (1 - g), f * (1 - g), (1 - f) * g, f * g
             pa = p * a
-            # The sign of the error is that of xorshift (Marsaglia 2003).
-            state ^= state << np.uint64(13)
-            state ^= state >> np.uint64(7)
-            state ^= state << np.uint64(17)
-            error = a * np.sqrt(p) * (1.0 if state & np.uint64(65536) else -1.0)
+            error = a * np.sqrt(p) * sign_at(first[0] + c, first[1] + r)
             for k in range(4):
                 right[j + k // 2, i + k % 2] -= pa * phi[k] * misfit
                 noise[j + k // 2, i + k % 2] += phi[k] * error

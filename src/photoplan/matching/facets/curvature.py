@@ -40,6 +40,10 @@ class Smoother:
     """A right-hand side of errors of the pixels, shape (rows, columns)."""
     inside: NDArray[np.bool_]
     """Posts that tell: seen by some images, and away from the border."""
+    texture: _Doubles
+    """Part of what pixels say of a post that is texture, not noise, 0 to 1, shape (rows, columns)."""
+    signs: _Doubles
+    """Of the curvatures that are drawn, 1 or −1, shape (3, rows, columns)."""
 
     def mean(self, values: _Doubles, shared: float) -> _Doubles:
         """Means of what tells over patches and, in the part `shared`, of all of the block, (rows, columns)."""
@@ -87,7 +91,8 @@ class Roughness:
         # In parts of what is usual at a place, all places count alike.
         change = mean((weighed - noise) / usual, _SHARED) / np.maximum(mean(drawn / usual, _SHARED), 1e-30)
         # Of smooth terrain it falls with the 2.5th power of the variance: whole steps would not settle.
-        squares = self.squares * np.sqrt(np.clip(change, 1 / _MOST, _MOST))
+        # Where there is no texture nothing is learnt: that nothing moves does not say that ground is smooth.
+        squares = self.squares * np.clip(change, 1 / _MOST, _MOST) ** (0.5 * mean(smoother.texture, _SHARED))
         single = curvatures(heights) ** 2 / squares
         return Roughness(squares, np.where(self.factors > 0, (_FREEDOM + 1) / (_FREEDOM + single), 0.0))
 
@@ -117,8 +122,7 @@ class Roughness:
     def _bands(self, heights: _Doubles, smoother: Smoother, count: int) -> tuple[list[_Doubles], _Doubles]:
         """(N⁻¹ R)ⁿ of a smoothed surface, n = 1 … count: of heights, and expected ones of independent curvatures and
         of noise, each of shape (3, rows, columns); and what smoothing takes away of the second, not yet smoothed."""
-        signs = np.random.default_rng(5).integers(0, 2, self.squares.shape) * 2.0 - 1.0
-        drawn = _transposed(np.sqrt(self.weights) * signs)
+        drawn = _transposed(np.sqrt(self.weights) * smoother.signs)
         first, taken, noise = smoother.solve([self.gradient(heights), drawn, smoother.noise])
         again = smoother.solve([self.gradient(taken), self.gradient(noise)])
         bands = [np.stack([first, taken - again[0], again[1]])]

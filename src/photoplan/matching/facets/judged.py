@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from photoplan.geometry.grid import Window
 from photoplan.kernels.facets_grey import OFFSETS, add_grey, sample_grey
 from photoplan.kernels.facets_residuals import add_residuals, sample_slopes
-from photoplan.matching.facets.block import Block, smoothed, solved_exactly
+from photoplan.matching.facets.block import Block, means_around, smoothed, solved_exactly
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
@@ -60,7 +60,7 @@ def grey_sigmas(block: Block, at: _Doubles, height_variances: _Doubles) -> _Floa
     sample_grey(error, ratio, places, drawn_there)
     sample_grey(smoothed(density), ratio, places, known)
     single = 1 / np.maximum(known.reshape(at.shape[:2]), np.float32(1e-3 * max(float(density.mean()), 1e-30)))
-    times = _mean(drawn_there.reshape(at.shape[:2]) ** 2 / single)
+    times = means_around(drawn_there.reshape(at.shape[:2]) ** 2 / single, _PATCH)
     slopes = np.empty((len(places), 2), np.float32)
     sample_slopes(block.values, ratio, places, slopes)
     j, i = (
@@ -78,7 +78,7 @@ def fit(block: Block) -> _Doubles:
     sums = np.zeros((*block.facets.shape, 3))
     for sight, residuals in zip(block.sights, standardised(block)):
         add_residuals(sight.places, residuals, 1, sums)
-    count, squares = _mean(sums[..., 0], 3), _mean(sums[..., 2], 3)
+    count, squares = means_around(sums[..., 0], 3), means_around(sums[..., 2], 3)
     free = np.maximum(count - block.facets.ratio**2 - 1, _LEAST * count)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(sums[..., 0] > 0, np.sqrt(squares / free), np.nan)
@@ -105,18 +105,3 @@ def standardised(block: Block) -> list[_Floats]:
         left = (block.surface_at(sight, w) - g) / np.float32(sigma)
         found.append(np.where(w > 0, left, np.float32(np.nan)))
     return found
-
-
-def _mean(values: NDArray[np.floating], patch: int = _PATCH) -> _Doubles:
-    """Means over patches, fewer at the border."""
-    out = np.asarray(values, float)
-    half = patch // 2
-    for axis in (0, 1):
-        count = out.shape[axis]
-        sums = np.insert(np.cumsum(out, axis=axis), 0, 0.0, axis=axis)
-        k = np.arange(count)
-        first, last = np.maximum(k - half, 0), np.minimum(k + half + 1, count)
-        out = (sums.take(last, axis) - sums.take(first, axis)) / (last - first).reshape(
-            (-1, 1) if axis == 0 else (1, -1)
-        )
-    return out

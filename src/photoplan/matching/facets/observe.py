@@ -89,6 +89,8 @@ class Sight:
     step: int
     levels: tuple[float, float]
     """Heights of the two levels, metres."""
+    first: tuple[int, int]
+    """Column and row of the first pixel."""
     places: _Floats = field(default_factory=lambda: np.empty((0, 0, 4), np.float32))
     """Where the pixels lie on the surface, see `facets_transfer.transfer`."""
 
@@ -151,7 +153,7 @@ def _followed(
             mean = (cross[:-1, :-1] + cross[1:, :-1] + cross[:-1, 1:] + cross[1:, 1:]) / 4
             off = max(off, float(np.nanmax(np.abs(found - mean), initial=0.0)) * facets.ratio)
         if off <= _OFF or step == 1:
-            return Sight(raw, low, high, step, levels)
+            return Sight(raw, low, high, step, levels, (window.col, window.row))
         step = max(1, step // 2)
 
 

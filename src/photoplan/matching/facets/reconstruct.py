@@ -19,8 +19,9 @@ from photoplan.matching.facets.radiometry import Transfer, first_guess
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
 
-#: Posts around a window that are adjusted with it and belong to its neighbours.
-MARGIN = 12
+#: Posts around a window that are adjusted with it and belong to its neighbours: half a patch of the roughness, the
+#: border of which nothing is learnt, and some more.
+MARGIN = 24
 #: Iterations of the coarsest level and of others until roughness is estimated; for the last level and others, how many
 #: estimates follow each other, and iterations after each series.
 _FIRST, _THEN = (4, 2), (((3, 1), (2, 2)), ((3, 1),))
@@ -32,6 +33,8 @@ _FEW = 16
 _ROOM, _FAR = 16.0, 0.15
 #: Distance of the heights that are tried on the coarsest level, pixels of parallax, and how many up and down at most.
 _TRIAL, _MOST_TRIALS = 0.5, 24
+#: Part of the misfit of the start below which another height is taken: without texture none fits better than others.
+_BETTER = 0.8
 #: Standard deviation of grey values until it is estimated, part of their contrast.
 _NOISE = 0.1
 
@@ -175,7 +178,9 @@ def _lifted(block: Block, reach: float) -> _Doubles:
     if len(trials) == 1:
         return block.heights
     lifted = [block.heights + k * _TRIAL * pixel for k in trials]
-    return lifted[int(np.argmin([block.misfit(heights) for heights in lifted]))]
+    misfits = [block.misfit(heights) for heights in lifted]
+    best = int(np.argmin(misfits))
+    return lifted[best if misfits[best] < _BETTER * misfits[0] else 0]
 
 
 def _room(view: View, facets: Facets, span: tuple[float, float], before: Block | None) -> float:

@@ -85,6 +85,7 @@ class SurfaceJob:
             "sigmas": float(np.nansum(sigmas)),
             "heights": int(np.isfinite(sigmas).sum()),
             "misfits": int((fit > MISFIT).sum()),
+            "greys": [float(np.isfinite(grey).sum()), *(float(np.nansum(grey.astype(float) ** n)) for n in (1, 2))],
         }
         known, seen = np.isfinite(heights[0]), np.isfinite(grey[0])
         layers: list[Output] = [

@@ -12,7 +12,7 @@ import numpy as np
 
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.bounds import odd_place
+from photoplan.geometry.bounds import MOST_HEIGHT, odd_place
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.names import safe_stem
 from photoplan.io.point_cloud import check_cloud
@@ -192,8 +192,8 @@ def check_start(project: Project, settings: SurfaceSettings) -> None:
     InputError
         The file cannot be used.
     """
-    if settings.reach is not None and not (math.isfinite(settings.reach) and settings.reach > 0):
-        raise UsageError(f"reach {settings.reach}; a positive number of metres is needed")
+    if settings.reach is not None and not 0 < settings.reach <= MOST_HEIGHT:
+        raise UsageError(f"reach {settings.reach}; a positive number of metres is needed, {MOST_HEIGHT:g} at most")
     name = settings.name
     if not any(c.isalnum() for c in name) or safe_stem(name) != name.replace(" ", "_"):
         raise UsageError(

@@ -24,6 +24,7 @@ from photoplan.io.run_record import input_entry, versions, write_run_record
 from photoplan.plain import pick
 from photoplan.plan.tiles import Tiles
 from photoplan.products.run import BASE_MEMORY, Run, clock, refuse_inputs
+from photoplan.products.surface.findings import findings
 from photoplan.products.surface.job import SurfaceJob
 from photoplan.products.surface.plan import TILE, SurfacePlan
 from photoplan.project.scene import input_files
@@ -66,6 +67,8 @@ class SurfaceResult:
     """Heights around which residuals are more than twice as large as expected, among all, 0 to 1."""
     corrections: tuple[float, ...]
     """Mean last correction of the heights on each level, the finest first, pixels of parallax."""
+    notes: tuple[str, ...]
+    """What speaks against it, and what helps."""
     tiles: int
     resumed: int
     """Tiles taken over from an earlier run."""
@@ -73,7 +76,18 @@ class SurfaceResult:
     def json_fields(self) -> dict[str, Any]:
         """All figures, with units."""
         more = {"sigma_m": "sigma", "corrections_px": "corrections", "resumed_tiles": "resumed"}
-        own = ("path", "images", "seconds", "valid_share", "sigma0", "redundancy", "sigma_px", "misfit_share", "tiles")
+        own = (
+            "path",
+            "images",
+            "seconds",
+            "valid_share",
+            "sigma0",
+            "redundancy",
+            "sigma_px",
+            "misfit_share",
+            "notes",
+            "tiles",
+        )
         return pick(self, *own, other_files="others", **more)
 
 
@@ -202,20 +216,27 @@ def _result(
     """Figures of all tiles."""
     totals, parts = tally.totals, max(tally.totals["parts"], 1)
     pairs = zip(totals["squares"], totals["redundancy"])
-    sigma0 = [float(np.sqrt(square / free)) if free > 0 else None for square, free in pairs]
+    spreads = [float(np.sqrt(square / free)) if free > 0 else None for square, free in pairs]
+    sigma0 = dict(zip(plan.images, spreads))
     sigma = totals["sigmas"] / totals["heights"] if totals["heights"] else None
+    sigma_px = None if sigma is None else sigma / plan.height_error
+    misfits = totals["misfits"] / totals["heights"] if totals["heights"] else 0.0
+    corrections = tuple(move / parts for move in totals["moves"])
+    seen, total, squares = totals["greys"]
+    contrast = float(np.sqrt(max(squares / seen - (total / seen) ** 2, 0.0))) if seen else 0.0
     return SurfaceResult(
         path=files["heights"].path,
         others=(*(file.path for kind, file in files.items() if kind != "heights"), *plan.settings.points),
         images=plan.images,
         seconds=seconds,
         valid_share=share,
-        sigma0=dict(zip(plan.images, sigma0)),
+        sigma0=sigma0,
         redundancy=sum(totals["redundancy"]),
         sigma=sigma,
-        sigma_px=None if sigma is None else sigma / plan.height_error,
-        misfit_share=totals["misfits"] / totals["heights"] if totals["heights"] else 0.0,
-        corrections=tuple(move / parts for move in totals["moves"]),
+        sigma_px=sigma_px,
+        misfit_share=misfits,
+        corrections=corrections,
+        notes=findings(plan, sigma0, contrast, sigma_px, misfits, corrections[0]),
         tiles=len(files["heights"].windows),
         resumed=tally.resumed,
     )

@@ -1,0 +1,67 @@
+"""What the figures of a surface tell against it, and the command that mends it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from photoplan.products.surface.plan import SurfacePlan
+
+#: An image whose sigma0 is so many times the median of the others is told of; or all, if sigma0 is this part of the
+#: contrast of the surface. Parts of the heights that fit badly, last corrections, and standard deviations, pixels of
+#: parallax, from which it is told.
+_ALONE, _NOISY, _MISFITS, _MOVING, _VAGUE = 1.6, 0.35, 0.02, 0.2, 1.0
+
+
+def findings(
+    plan: SurfacePlan,
+    sigma0: dict[str, float | None],
+    contrast: float,
+    sigma_px: float | None,
+    misfit_share: float,
+    correction: float,
+) -> tuple[str, ...]:
+    """Lines about a surface that should not be trusted as it is; none if nothing speaks against it.
+
+    Parameters
+    ----------
+    plan : SurfacePlan
+    sigma0 : dict
+        Standard deviation of a grey value by image.
+    contrast : float
+        Standard deviation of the surface's grey values.
+    sigma_px, misfit_share, correction
+        Of the heights: see `SurfaceResult`; the last correction of the finest level.
+    """
+    lines = []
+    known = {name: value for name, value in sigma0.items() if value is not None}
+    others = {
+        name: float(np.median([v for other, v in known.items() if other != name])) for name in known if len(known) > 2
+    }
+    alone = [name for name, usual in others.items() if known[name] > _ALONE * usual]
+    usual = float(np.median([*known.values()])) if known else 0.0
+    if alone:
+        listed = ", ".join(f"{name} {known[name]:.3g} ({others[name]:.3g})" for name in alone[:6])
+        lines.append(
+            f"sigma0 of {listed} is far above that of the other images (in brackets): its orientation is wrong, or it "
+            "shows something else. `photoplan tie` and `photoplan adjust` orient anew; `--images` leaves it out"
+        )
+    elif contrast > 0 and usual > _NOISY * contrast:
+        lines.append(
+            f"sigma0 is {usual / contrast:.0%} of the contrast of the ground: images do not show the same, or no "
+            "texture. Orientations are wrong (`photoplan tie`, `photoplan adjust`), or the start was too far away "
+            "(`--start`, `--reach`)"
+        )
+    if misfit_share > _MISFITS:
+        lines.append(
+            f"{misfit_share:.1%} of the heights fit badly: see {plan.settings.name}_fit.tif. They lie at edges and "
+            "moving things, or in regions that went wrong; `--reach` and a better `--start` help these"
+        )
+    if correction > _MOVING:
+        lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; `--resolution` helps")
+    if sigma_px is not None and sigma_px > _VAGUE:
+        lines.append(
+            f"the mean standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "
+            "images do not determine follows its surroundings; mask it by the standard deviations, or choose a coarser "
+            "`--resolution`"
+        )
+    return tuple(lines)

@@ -1,0 +1,165 @@
+"""Faults and bad inputs of `photoplan surface`: refused by name, or told with the command that mends it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from cli import test_place_faults
+from tools.command import Here, Said, inside, patience, sabotage, start, wait_for
+from tools.effort import at_most
+from tools.facet_scene import write_scene
+from tools.small_block import X0, Y0, Block
+
+BOUNDS = (X0 - 15, Y0 - 27, X0 + 15, Y0 + 27)
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"), 3).path
+
+
+@pytest.fixture
+def project(rendered: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(rendered.parent, tmp_path / "scene")) / rendered.name
+
+
+def surface(project: Path, *words: object) -> Said:
+    return inside("surface", project, *options(), *words)
+
+
+def options() -> list[object]:
+    return ["--resolution", 1.5, "--bounds", *BOUNDS, "--workers", 1, "--no-quicklook"]
+
+
+def change(image: Path, how: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Replace the pixels of an image."""
+    with rasterio.open(image) as file:
+        pixels, profile = file.read(), file.profile
+    with rasterio.open(image, "w", **profile) as file:
+        file.write(how(pixels).astype(np.uint8))
+
+
+def notes(said: Said) -> str:
+    assert said.code == 0, said.err
+    return " ".join(json.loads(said.out)["notes"])
+
+
+def test_an_orientation_that_is_wrong_by_five_pixels_is_named(project: Path) -> None:
+    """Across the flight, where no height makes up for it; along it the image contradicts the two others."""
+    change(project.parent / "rendered" / "i3.tif", lambda pixels: np.roll(pixels, 5, axis=1))
+    told = notes(surface(project, "--json"))
+    assert "sigma0 of" in told and "i3" in told
+    assert "`photoplan tie` and `photoplan adjust`" in told
+
+
+def test_images_without_texture_are_told(project: Path) -> None:
+    noise = np.random.default_rng(2)
+    for image in sorted((project.parent / "rendered").glob("*.tif")):
+        change(image, lambda pixels: 120 + noise.normal(0, 1.0, pixels.shape))
+    said = surface(project, "--json")
+    assert "no texture" in notes(said)
+    with rasterio.open(project.parent / "products" / "surface.tif") as file:
+        off = file.read(1) - 100
+    with rasterio.open(project.parent / "products" / "surface_sigma.tif") as file:
+        sigma = file.read(1)
+    # Heights follow noise for some metres, where texture gives them to 0.02 m, and say so.
+    assert np.sqrt(np.mean(off**2)) < 3 * np.median(sigma) and np.median(sigma) > 0.5
+
+
+def test_heights_that_texture_does_not_tell_have_a_large_sigma(tmp_path: Path) -> None:
+    """A bare strip of twenty metres: what stands there follows its surroundings, and its sigma says how well."""
+    scene = write_scene(tmp_path, 3, bare=10.0)
+    assert surface(scene.path).code == 0
+    with rasterio.open(tmp_path / "products" / "surface.tif") as file:
+        heights, to_map = file.read(1), file.transform
+    with rasterio.open(tmp_path / "products" / "surface_sigma.tif") as file:
+        sigma = file.read(1)
+    col, row = np.meshgrid(np.arange(heights.shape[1]) + 0.5, np.arange(heights.shape[0]) + 0.5)
+    X, Y = to_map @ (col, row)
+    off = heights - scene.heights(X, Y)
+    bare, textured = np.abs(Y - Y0) < 7, np.abs(Y - Y0) > 16
+    assert np.median(sigma[bare]) > 5 * np.median(sigma[textured])
+    assert np.sqrt(np.mean((off / sigma)[bare] ** 2)) < 2 and np.sqrt(np.mean((off / sigma)[textured] ** 2)) < 1.5
+
+
+def test_images_without_overlap_are_told(project: Path) -> None:
+    said = surface(project, "--bounds", X0 + 4000, Y0, X0 + 4010, Y0 + 10)
+    assert said.code == 3 and "no two images see anything there; together they see" in said.err
+
+
+def test_fault_02_undeclared_height_systems(project: Path) -> None:
+    project.write_text(project.read_text().replace('height_system = "same"', ""))
+    said = surface(project)
+    assert said.code == 3 and "declare one" in said.err
+
+
+def test_fault_07_a_bomb_is_refused_from_its_header(project: Path) -> None:
+    surface(project, "--dry-run")  # what is loaded once does not count
+    bomb = project.parent / "rendered" / "i1.tif"
+    profile = {"driver": "GTiff", "width": 400_000, "height": 400_000, "count": 3, "dtype": "uint8", "SPARSE_OK": True}
+    with rasterio.open(bomb, "w", tiled=True, blockxsize=4096, blockysize=4096, bigtiff="YES", **profile):
+        pass
+    with at_most(1):
+        said = surface(project)
+    assert said.code == 3 and f"{bomb}: the header promises 400000 × 400000 pixels" in said.err
+
+
+def test_fault_14_gon_declared_as_degrees(photoplan: Here, small: Block) -> None:
+    """Refused before any pixel is touched, with the unit that fits."""
+    test_place_faults.TestFaults14And18Tables.strip(small, [0, 90, 180, 270, 90, 0, 270, 180], 400 / 360)
+    declare = ["--height-system", "same", "--overwrite"]
+    assert photoplan("init", small.folder, *small.init_options(), *declare).code == 0
+    said = photoplan("surface", small.project, "--resolution", 3)
+    assert said.code == 3 and "--angle-unit gon" in said.err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["--resolution", "1e300"], 2, "resolution"),
+        (["--resolution", "nan"], 2, "resolution"),
+        (["--resolution", "-1"], 2, "resolution"),
+        (["--start", "1e300"], 2, "start"),
+        (["--start", "nan"], 2, "start"),
+        (["--reach", "1e300"], 2, "reach"),
+        (["--bounds", 0, 0, 1e300, 1e300], 2, "bounds"),
+    ],
+)
+def test_fault_30_finite_nonsense(project: Path, words: list[object], code: int, text: str) -> None:
+    said = surface(project, *words, "--dry-run")
+    assert (said.code, said.out) == (code, ""), said.err
+    assert text in said.err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+    ids=["fault_03_killed", "fault_25_ended"],
+)
+def test_a_run_that_is_ended_goes_on(project: Path, number: signal.Signals) -> None:
+    """Two tiles: of the first one images see nothing, the second one is held up."""
+    bounds = (X0 - 430, Y0 - 12, X0 + 4, Y0 + 12)
+    words = ["surface", project, "--resolution", 1.5, "--bounds", *bounds, "--workers", 1]
+    products, begun = project.parent / "products", project.parent / "begun"
+    begun.mkdir()
+    job = "photoplan.products.surface.job:SurfaceJob"
+    running = start(*words, "--no-quicklook", env=sabotage(job=job, hold=begun / "go", quick=1, begun=begun))
+    wait_for(lambda: any(begun.iterdir()), running)
+    os.kill(running.pid, number)
+    _, err = running.communicate(timeout=patience(20))
+    assert not (products / "surface.tif").exists()
+    if number == signal.SIGTERM:
+        assert running.returncode == 130 and "same command continues" in err.splitlines()[-1]
+    said = inside(*words, "--no-quicklook", "--json")
+    assert said.code == 0, said.err
+    assert json.loads(said.out)["resumed_tiles"] == 1
+    assert not [path for path in products.iterdir() if path.name.startswith(".")]
