@@ -98,6 +98,12 @@ class FrameCamera:
         linear = axes @ np.array([[T.a1, T.a4, 0.0], [T.a2, T.a5, 0.0], [T.a3, T.a6, 1.0]])
         object.__setattr__(self, "_linear", None if wide else linear)
 
+    def turned(self, R: NDArray[np.float64], longer: float = 1.0) -> FrameCamera:
+        """It with its axes turned by R, shape (3, 3), about themselves, and a camera constant that is longer."""
+        interior = dataclasses.replace(self.interior, c=self.interior.c * longer)
+        pose = Pose(self.pose.center, self.pose.R_ground_camera @ R)
+        return dataclasses.replace(self, interior=interior, pose=pose)
+
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the image in pixels."""

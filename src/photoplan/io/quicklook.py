@@ -54,7 +54,7 @@ def write_quicklook(product: Path, picture: Path, *, max_side: int = 1600) -> Pa
     with _opened(product) as dataset, gdal_settings():
         factor = max(1.0, max(dataset.width, dataset.height) / max_side)
         rgba = _look(product, dataset, _scaled(dataset.width, factor), _scaled(dataset.height, factor))
-    return _write_png(picture, rgba)
+    return write_png(picture, rgba)
 
 
 def read_reduced(product: Path, *, max_side: int) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
@@ -109,7 +109,7 @@ def write_overview(products: Sequence[Path], picture: Path, *, max_side: int = 1
             rgba = _look(sheet.path, dataset, width, height)
         part = canvas[:, row : row + height, col : col + width]
         np.copyto(part, rgba, where=rgba[3] > 0)
-    return _write_png(picture, canvas)
+    return write_png(picture, canvas)
 
 
 def refuse_foreign_overview(picture: Path) -> None:
@@ -196,8 +196,8 @@ def _stretched(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.uin
     return np.clip(scaled, 0, 255).astype(np.uint8)
 
 
-def _write_png(picture: Path, rgba: NDArray[np.uint8]) -> Path:
-    """Encode in memory and put the file in place at once."""
+def write_png(picture: Path, rgba: NDArray[np.uint8]) -> Path:
+    """Write red, green, blue and alpha, shape (4, height, width): encoded in memory, put in place at once."""
     with not_georeferenced(), gdal_settings(GDAL_PAM_ENABLED=False), rasterio.MemoryFile() as memory:
         profile = {"driver": "PNG", "width": rgba.shape[2], "height": rgba.shape[1], "count": 4, "dtype": "uint8"}
         profile["WRITE_METADATA_AS_TEXT"] = "YES"

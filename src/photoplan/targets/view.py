@@ -60,6 +60,10 @@ class Posed(CentralCamera, Protocol):
         """Directions (..., 3) of the rays of image points (..., 2), as long as it takes to go one metre into depth."""
         ...
 
+    def turned(self, R: NDArray[np.float64], longer: float) -> Posed:
+        """It with its axes turned by R, shape (3, 3), about themselves, and a camera constant that is longer."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class FrameBundle:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -260,11 +261,9 @@ def _bundle(
     request: CameraRequest, center: NDArray[np.float64], warps: tuple[Warp, ...], look_at: NDArray[np.float64] | None
 ) -> Bundle:
     """Rays of a standpoint, in the space that the warps lead to."""
-    origin, axes = center, np.eye(3)
+    origin, axes = center, map_axes(warps, center)
     for warp in warps:
         origin = warp(origin)
-        if isinstance(warp, LocalFrame):
-            axes = warp.axes(center)
     if look_at is not None:
         way = look_at
         for warp in warps:
@@ -289,6 +288,11 @@ def _bundle(
     interior = Interior.digital(request.size, (focal, focal * request.pixel_aspect))
     R = axes @ _rotation(azimuth, pitch, math.radians(request.roll))
     return ViewTarget.of_camera(oriented_camera(interior, NoLens(), Pose(origin, R))).bundle
+
+
+def map_axes(warps: Sequence[Warp], center: NDArray[np.float64]) -> NDArray[np.float64]:
+    """East, north and up of the map at a standpoint in the space that warps lead to, as columns, shape (3, 3)."""
+    return next((warp.axes(center) for warp in warps if isinstance(warp, LocalFrame)), np.eye(3))
 
 
 def _rotation(azimuth: float, pitch: float, roll: float) -> NDArray[np.float64]:
@@ -332,10 +336,7 @@ def _resolved(made: ViewCamera, bundle: Bundle) -> CameraRequest:
         assert request.reference is not None
         altitude = Exaggeration(request.reference, request.exaggeration)(target.center)[2]
     bare = [warp for warp in target.warps if not isinstance(warp, Exaggeration)]
-    axes = np.eye(3)
-    for warp in bare:
-        if isinstance(warp, LocalFrame):
-            axes = warp.axes(target.center)
+    axes = map_axes(bare, target.center)
     azimuth, pitch = math.radians(request.azimuth or 0.0), math.radians(request.pitch)
     if request.look_at is not None and isinstance(bundle, Panorama):
         north = axes @ (0.0, 1.0, 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,19 @@ from photoplan.io.polygons import write_features
 from photoplan.io.product import check_output
 from photoplan.io.run_record import recording
 from photoplan.io.tables import write_table
-from photoplan.products.view.camera import view_camera
-from photoplan.products.view.ground import open_view_ground
+from photoplan.products.view.camera import ViewCamera, view_camera
+from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.job import seen_surface
 from photoplan.products.view.make import ViewRequest, camera_request
+from photoplan.products.view.photo_skyline import PhotoMatch, PhotoSkylineRequest, against_photo, draw_match
+from photoplan.products.view.refined import RefinedCamera, refined_camera, write_refined
+from photoplan.surfaces.seen import Seen
+from photoplan.surfaces.skyline import skyline_of
+from photoplan.targets.view import ViewTarget
 
-#: Rows between the rays that look for ground in each column, pixels: what is less high and hangs in the sky is missed.
-_COARSE = 8
-#: Halvings from there on: a thousandth of a pixel.
-_HALVINGS = 13
 COLUMNS = ("x", "y", "E", "N", "H", "distance", "azimuth_deg")
+#: Columns of a photograph: row of the sky's edge, and how far below the skyline of the terrain it lies.
+OF_PHOTO = ("y_photo", "residual")
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,8 @@ class SkylineRequest:
     output: Path
     """``.csv``: a table; ``.gpkg``: points on the map."""
     overwrite: bool = False
+    photo: PhotoSkylineRequest | None = None
+    """A photograph that it is compared with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,76 +53,93 @@ class Skyline:
     columns: int
     """Of the picture."""
     output: Path
+    before: PhotoMatch | None = None
+    match: PhotoMatch | None = None
+    """A photograph beside it, with the camera as stated and with the one that this skyline belongs to; None: there is
+    none."""
+    refined: RefinedCamera | None = None
+    """The camera that the photograph asks for; None: it was not asked."""
 
     def json_fields(self) -> dict[str, Any]:
-        """Its points by name."""
-        return {"output": self.output, "columns": self.columns, "points": len(self.points)}
+        """Counts, and what the photograph says."""
+        out = {"output": self.output, "columns": self.columns, "points": len(self.points)}
+        if self.before is not None and self.match is not None:
+            out |= {"photo": self.before.figures, "control": self.match.control}
+        if self.refined is not None and self.match is not None:
+            out |= {"refined": self.refined, "photo_refined": self.match.figures}
+        return out
 
 
 def skyline(request: SkylineRequest) -> Skyline:
-    """Find the skyline of a view, and write it.
-
-    A column that shows no sky, or no ground, has no point. Terrain without overhangs has one border between ground and
-    sky in a vertical plane: it is found by halving.
+    """Find the skyline of a view, compare it with that of a photograph if there is one, and write it.
 
     Raises
     ------
     UsageError
-        The output exists, or is neither a table nor a GeoPackage.
+        An output exists, or is neither a table nor a GeoPackage.
     InputError
         A file cannot be used.
     GeometryError
-        The point of view lies below the ground.
+        The point of view lies below the ground, or the skyline does not determine the camera that is to be turned.
     """
-    check_output(request.output, [request.view.source], overwrite=request.overwrite)
-    with recording("view skyline", request, [request.view.source, request.view.matrix]) as record:
-        ground = open_view_ground(request.view.source, request.view.crs)
-        camera = view_camera(camera_request(request.view), ground, request.view.force)
-        surface = seen_surface(ground, request.view.farthest, request.view.bound)
-        width, height = camera.target.bundle.size
-
-        def hit(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
-            return np.asarray(surface.at(camera.target, np.stack([x, y], axis=-1)).owner >= 0)
-
-        x, low, high = _bracket(hit, width, height)
-        for _ in range(_HALVINGS):
-            middle = (low + high) / 2
-            met = hit(x, middle)
-            low, high = np.where(met, middle, low), np.where(met, high, middle)
-        seen = surface.at(camera.target, np.stack([x, low], axis=-1))
-        away = seen.XYZ - camera.target.center
-        azimuth = np.degrees(np.arctan2(away[:, 0], away[:, 1])) % 360.0
-        numbers = (x, low, *seen.XYZ.T, camera.target.distance(seen.uvh), azimuth)
-        names = ("sky", "terrain", *ground.objects)
-        found = Skyline(
-            np.column_stack(numbers), tuple(names[owner + 1] for owner in seen.owner), width, request.output
-        )
+    view, photo = request.view, request.photo
+    inputs = [view.source, view.matrix, *([] if photo is None else [photo.photo, photo.control])]
+    outputs = [request.output, *([] if photo is None else [photo.picture, photo.refined])]
+    for each in outputs:
+        if each is not None:
+            check_output(each, [name for name in inputs if name is not None], overwrite=request.overwrite)
+    with recording("view skyline", request, inputs) as record:
+        ground = open_view_ground(view.source, view.crs)
+        camera = view_camera(camera_request(view), ground, view.force)
+        surface = seen_surface(ground, view.farthest, view.bound)
+        if photo is None:
+            found = _skyline(request, ground, camera.target, skyline_of(camera.target, surface))
+        else:
+            matches = against_photo(photo, camera, lambda target, beyond: skyline_of(target, surface, beyond))
+            found = _beside(request, ground, camera, matches)
         _write(found, ground.crs)
-        record([request.output], {"camera": camera, "points": len(found.points), "columns": width})
+        record(outputs, {"camera": camera, **found.json_fields()})
     return found
 
 
-def _bracket(hit: Any, width: int, height: int) -> tuple[NDArray[np.float64], ...]:
-    """Columns with ground below sky, the highest row found with ground, and one without it above."""
-    rows = np.append(np.arange(-0.5, height - 0.5, _COARSE), height - 0.5)
-    x = np.arange(width, dtype=float)
-    below, top = np.full(width, np.nan), np.full(width, -0.5)
-    for before, row in zip(rows[:1].tolist() + rows[:-1].tolist(), rows.tolist()):
-        todo = np.flatnonzero(np.isnan(below))
-        if not len(todo):
-            break
-        met = todo[hit(x[todo], np.full(len(todo), row))]
-        below[met], top[met] = row, before
-    there = np.isfinite(below) & (below > -0.5)
-    return x[there], below[there], top[there]
+def _skyline(request: SkylineRequest, ground: ViewGround, target: ViewTarget, seen: Seen) -> Skyline:
+    """Numbers of the points of a skyline."""
+    away = seen.XYZ - target.center
+    azimuth = np.degrees(np.arctan2(away[:, 0], away[:, 1])) % 360.0
+    numbers = (seen.uvh[:, 0], seen.uvh[:, 1], *seen.XYZ.T, target.distance(seen.uvh), azimuth)
+    names = ("sky", "terrain", *ground.objects)
+    surfaces = tuple(names[owner + 1] for owner in seen.owner)
+    return Skyline(np.column_stack(numbers), surfaces, target.bundle.size[0], request.output)
+
+
+def _beside(
+    request: SkylineRequest, ground: ViewGround, camera: ViewCamera, matches: tuple[PhotoMatch, PhotoMatch | None]
+) -> Skyline:
+    """A skyline with what a photograph says of it; the files of both are written."""
+    assert request.photo is not None
+    before, after = matches
+    last = before if after is None else after
+    refined = None if after is None else refined_camera(camera, after, ground, request.photo.refined)
+    if request.photo.refined is not None and refined is not None:
+        write_refined(request.photo.refined, refined)
+    if request.photo.picture is not None:
+        draw_match(request.photo.picture, request.photo.photo, last)
+    found = _skyline(request, ground, last.target, last.line)
+    return replace(found, before=before, match=last, refined=refined)
 
 
 def _write(found: Skyline, crs: str) -> None:
     if found.output.suffix.lower() == ".csv":
         rows = [[*(f"{v:.4f}" for v in row), name] for row, name in zip(found.points.tolist(), found.surfaces)]
-        write_table(found.output, (*COLUMNS, "surface"), rows)
+        if found.match is not None:
+            for row, y, apart in zip(rows, found.points[:, 1], found.match.residuals.tolist()):
+                row += [f"{y + apart:.4f}", f"{apart:.4f}"] if apart == apart else ["", ""]
+        write_table(found.output, (*COLUMNS, "surface", *([] if found.match is None else OF_PHOTO)), rows)
         return
     columns = {name: found.points[:, k] for k, name in enumerate(COLUMNS) if name not in ("E", "N", "H")}
     shapes = [shapely.Point(row) for row in found.points[:, 2:5].tolist()]
+    if found.match is not None:
+        apart = found.match.residuals
+        columns |= dict(zip(OF_PHOTO, (found.points[:, 1] + apart, apart)))
     columns["surface"] = np.array(found.surfaces, object)
     write_features(found.output, "Point Z", shapes, columns, crs, "skyline")
