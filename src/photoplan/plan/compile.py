@@ -134,7 +134,7 @@ def compile_anchors(
     while len(boxes.rects):
         lattice = projection.project_homogeneous(boxes.lattice)
         errors = np.zeros((len(boxes.rects), 4))
-        if breaks is not None:
+        if isinstance(breaks, Breaks):
             strict = _strict(projection, ground, boxes)
             np.maximum.at(errors, boxes.rect, bend_errors(breaks, lattice[:, CORNERS], strict))
         keep, behind = np.zeros((2, len(errors)), bool)
