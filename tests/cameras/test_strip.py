@@ -13,7 +13,7 @@ from tools.line_strip import Strip, pattern
 
 from photoplan.cameras.base import project
 from photoplan.errors import InputError
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line.file import line_files, read_line
 from photoplan.io.project.file import load_project
 from photoplan.project.scene import input_files
 
@@ -118,7 +118,7 @@ def test_detectors_are_chosen_by_name(tmp_path: Path) -> None:
         (np.zeros((5, 7), complex), "complex128; real numbers are needed"),
         (np.zeros(5, [("a", "f8")]), "real numbers are needed"),
         (b"\x93NUMPY\x01\x00\x06\x00{'a(9\n", "flight.npy: cannot be read"),
-        (np.zeros((5, 7))[:, :6], "needed are two rows or more"),
+        (np.zeros((5, 7))[:, :6], "needed are 7 numbers in each row"),
     ],
 )
 def test_fault_31_damaged_arrays_are_named(tmp_path: Path, record: np.ndarray | bytes, told: str) -> None:
@@ -130,3 +130,52 @@ def test_fault_31_damaged_arrays_are_named(tmp_path: Path, record: np.ndarray | 
         np.save(tmp_path / "flight.npy", record)
     with pytest.raises(InputError, match=told):
         read_line(path, "nadir")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npy"])
+def test_a_table_of_elements_is_what_its_polynomial_is(tmp_path: Path, suffix: str) -> None:
+    """Positions of every element, measured to 0.01 columns, instead of the polynomial from which they come."""
+    strip = Strip(lines=60)
+    path = strip.strip_file(tmp_path)
+    column = np.arange(strip.columns, dtype=float)
+    y = ((strip.columns - 1) / 2 - column) * strip.pitch
+    table = np.stack([np.zeros_like(y), y - 2e-5 * y**3], axis=1)
+    table += np.random.default_rng(1).normal(0.0, 0.002 * strip.pitch, table.shape)
+    write_table(tmp_path / f"nadir{suffix}", table)
+    exact = read_line(path, "nadir").camera(strip.crs, "ellipsoidal")
+    name, rest = path.read_text().split("[detectors.forward]")
+    head = name.split("y_mm = ")[0]
+    path.write_text(f'{head}table = "nadir{suffix}"\n[detectors.forward]{rest}')
+    stated = read_line(path, "nadir")
+    told = stated.describe()["directions"]
+    assert "columns beside a smooth curve" in told
+    assert stated.beside is not None and 0.003 < stated.beside < 0.02
+    xy = np.stack(np.meshgrid(np.linspace(0, 399, 40), [10.0, 30.0]), axis=-1)
+    away = stated.camera(strip.crs, "ellipsoidal").rays(xy, 300.0)[0] - exact.rays(xy, 300.0)[0]
+    print(f"\n{suffix}: {np.abs(away).max() / strip.pixel:.4f} px beside the exact line")
+    assert np.abs(away).max() < 0.005 * strip.pixel
+    assert tmp_path / f"nadir{suffix}" in line_files(path)
+
+    for change, message in (
+        (lambda t: t[:-1], "399 rows; needed are x and y of 400 elements"),
+        (lambda t: np.where(np.arange(400)[:, None] == 17, np.nan, t), "row 18 holds a number that is not finite"),
+        (lambda t: t + 0.3 * strip.pitch * (np.arange(400)[:, None] == 17), "element 18 lies 0.4"),
+        (lambda t: t + 3.0 * strip.pitch * (np.arange(400)[:, None] >= 200), "Two chips in one line are two images"),
+    ):
+        write_table(tmp_path / f"nadir{suffix}", change(table))
+        with pytest.raises(InputError, match=message):
+            read_line(path, "nadir")
+
+
+def write_table(path: Path, table: np.ndarray) -> None:
+    if path.suffix == ".npy":
+        np.save(path, table)
+    else:
+        np.savetxt(path, table, "%.8f", ",", header="x,y", comments="")
+
+
+def test_detectors_are_a_table_or_polynomials(tmp_path: Path) -> None:
+    path = Strip(lines=60).strip_file(tmp_path)
+    path.write_text(path.read_text().replace("[detectors.forward]\n", '[detectors.forward]\ntable = "a.csv"\n'))
+    with pytest.raises(InputError, match="state one of both"):
+        read_line(path, "forward")

@@ -49,6 +49,9 @@ class LineTrack:
     by cubic convolution. An image shows nothing of how a camera shook between two lines; geometry that went its own
     way there would be another one than that of the resampled grey values. For clocks without pauses."""
 
+    gaps: tuple[tuple[float, float], ...] = ()
+    """Moments between which nothing is known after all: the record has a gap; seconds."""
+
     def __post_init__(self) -> None:
         ends = self.moments[:-1] + self.rates[:-1] * np.diff(self.knots)
         late = ends > self.moments[1:] + _SLACK * self.rates[:-1]
@@ -80,7 +83,10 @@ class LineTrack:
         """Whether position and attitude are known at rows (n,)."""
         slack = _SLACK * self.rates.max()
         t = self.time(line)
-        return np.asarray((t >= self.known[0] - slack) & (t <= self.known[1] + slack))
+        inside = (t >= self.known[0] - slack) & (t <= self.known[1] + slack)
+        for begin, end in self.gaps:
+            inside &= (t <= begin + slack) | (t >= end - slack)
+        return np.asarray(inside)
 
     def __call__(self, line: _Floats) -> tuple[_Floats, _Floats]:
         """Positions (n, 3) and rotations (n, 3, 3) of rows (n,), whole numbers at the middle of a line's exposure.

@@ -69,7 +69,9 @@ class LineTremor:
         if not len(seen):
             return None
         rows = self._rows(float(seen[:, 1].min()) - _AROUND, float(seen[:, 1].max()) + _AROUND)
-        first, last = max(rows[0], -1), min(rows[1], self.rough.size[1])
+        # Lines whose orientation is not known are not looked at; between the lines their neighbours count, too.
+        begin, end = self.rough.track.oriented
+        first, last = max(rows[0], int(np.floor(begin))), min(rows[1], int(np.ceil(end)))
         if last <= first:
             return None
         straight = replace(self.rough, track=_straight_track(self.rough.track, first, last))
@@ -165,6 +167,7 @@ class StraightPart:
         # First as the straight flight is turned at the same moment: all but what it flies on until it sees the point.
         S, d = self.rough.sight.rays(np.column_stack([wanted, y]))
         real, near = 2 * wanted - sight.across(S + d, y)[1], y
+        known = self.rough.track.is_oriented(y) | (y < 0.0) | (y > self.rough.size[1] - 1.0)
         sea = np.linalg.norm(S, axis=1) - ground.height(S)
         out = []
         for height in heights:
@@ -178,7 +181,7 @@ class StraightPart:
                 real = real + miss
                 if not (np.abs(miss) > _NEAR).any():
                     break
-            out.append(shift.reshape(size))
+            out.append(np.where(known[:, None], shift, np.nan).reshape(size))
         return np.stack(out)
 
     def _lift(self, height: float) -> float:

@@ -71,27 +71,29 @@ def tremor_table(part: TremorPart, width: int, heights: tuple[float, float], tol
         nodes = _along(strict, places, columns)
         middles = _along(strict, places, (columns[1:] + columns[:-1]) / 2)[..., :2]
         bent = (nodes[:, 1:, :2] + nodes[:, :-1, :2]) / 2 - middles
-        if np.hypot(bent[..., 0], bent[..., 1]).max() <= tolerance / 4:
+        if not np.nanmax(np.hypot(bent[..., 0], bent[..., 1]), initial=0.0) > tolerance / 4:
             break
     stretch = _stretch(nodes, half)
     k = np.unique(np.r_[np.argsort(stretch)[-_MEASURED:], np.linspace(0, len(stretch) - 1, _MEASURED)].astype(np.int64))
-    missed = float((_missed(part, columns, rows, nodes, (middle, half), k + 1) * stretch[k]).max())
+    missed = float(np.nanmax(_missed(part, columns, rows, nodes, (middle, half), k + 1) * stretch[k], initial=0.0))
     kept = np.zeros((len(rows), len(columns) + 1, 4), np.float32)
     kept[:, :-1] = nodes
     come = np.arange(len(rows))[:, None] - nodes[..., 1] + half * np.abs(nodes[..., 3])
-    kept[:, -1, 0] = np.maximum.accumulate(come.max(axis=1)) + 1e-3
-    rounding = float(np.spacing(np.abs(kept[:, :-1, :2]).max())) + half * float(np.spacing(np.abs(kept[..., 2:]).max()))
-    around = half * np.abs(nodes[..., 2:]).max(axis=(0, 1))
+    # Rows without orientation see nothing.
+    kept[:, -1, 0] = np.fmax.accumulate(np.nan_to_num(come.max(axis=1), nan=-np.inf)) + 1e-3
+    furthest = np.nanmax(np.abs(nodes), axis=(0, 1), initial=0.0)
+    around = half * furthest[2:]
+    last_digits = [float(np.spacing(np.float32(each.max()))) for each in (furthest[:2], furthest[2:])]
     return TremorTable(
         part=part,
         first=(float(first), float(rows[0])),
         spacing=spacing,
         height=middle,
         nodes=kept,
-        residual=_BESIDE * missed + rounding,
+        residual=_BESIDE * missed + last_digits[0] + half * last_digits[1],
         stretch=float(stretch.max()),
-        low=nodes[..., :2].min(axis=(0, 1)) - around - 1.0,
-        high=nodes[..., :2].max(axis=(0, 1)) + around + 1.0,
+        low=np.nanmin(nodes[..., :2], axis=(0, 1), initial=0.0) - around - 1.0,
+        high=np.nanmax(nodes[..., :2], axis=(0, 1), initial=0.0) + around + 1.0,
     )
 
 
@@ -117,7 +119,7 @@ def _stretch(nodes: _Floats, half: float) -> _Floats:
         along = np.abs(slope[..., 0]) + half * np.abs(slope[..., 2])
         pace = 1.0 - slope[..., 1] - half * np.abs(slope[..., 3])
         longer = np.where(pace > _SLOW, np.hypot(1.0, along) / np.where(pace > _SLOW, pace, 1.0), 1.0)
-        worst = np.maximum(worst, longer.max(axis=1))
+        worst = np.fmax(worst, longer.max(axis=1))
     return np.asarray(np.hypot(1.0, worst))
 
 

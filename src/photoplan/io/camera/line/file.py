@@ -66,7 +66,7 @@ def line_files(path: Path) -> list[Path]:
     if path.suffix.lower() != ".toml":
         return [path]
     try:
-        return [path, strip.flight_file(path)]
+        return [path, *strip.files_beside(path)]
     except InputError:
         return [path]
 

@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from photoplan.cameras.line import LineCamera
 from photoplan.cameras.line_look import LineLook
 from photoplan.cameras.line_track import LineTrack
@@ -26,6 +28,8 @@ class StatedLine:
     look: LineLook
     radii: tuple[float, float]
     """Equatorial and polar radius of the body, metres."""
+    beside: float | None = None
+    """How far elements of a table of detectors lie beside the curve that stands for them, columns; None: no table."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -38,14 +42,18 @@ class StatedLine:
 
     def describe(self) -> dict[str, str]:
         """In words, by name."""
-        first, last = math.ceil(self.track.oriented[0]), math.floor(self.track.oriented[1])
-        rate = float(self.track.rates[0])
+        first, last = math.ceil(self.track.oriented[0] - 1e-3), math.floor(self.track.oriented[1] + 1e-3)
         oriented = f"{first} to {last}"
+        t0, rate = float(self.track.time(np.zeros(1))[0]), float(self.track.rates[0])
+        ends = [[round((t - t0) / rate, 1) for t in gap] for gap in self.track.gaps]
+        gaps = ", ".join(f"{a:g} to {b:g}" for a, b in ends if b > 0 and a < self.size[1])
+        table = "" if self.beside is None else f"; elements lie up to {self.beside:.2g} columns beside a smooth curve"
         whole = self.track.oriented == (-0.5, self.size[1] - 0.5)
         return {
             "line camera": self.form,
             "image": f"{self.size[0]} columns, {self.size[1]} lines of {1000 * rate:.6g} ms",
             "oriented lines": "all" if whole else f"{oriented} only; the others have no position or attitude",
-            "directions": f"{1e6 * self.look.pitch:.4g} µrad from column to column in the middle",
+            "directions": f"{1e6 * self.look.pitch:.4g} µrad from column to column in the middle{table}",
+            **({} if not gaps else {"gaps": f"of the record: lines {gaps} have no orientation"}),
             "body": f"radii {self.radii[0] / 1000:.3f} and {self.radii[1] / 1000:.3f} km",
         }

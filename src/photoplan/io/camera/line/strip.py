@@ -12,28 +12,29 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 from pydantic import Field
 
-from photoplan.cameras.line_look import LineLook
 from photoplan.cameras.line_track import LineTrack
-from photoplan.errors import InputError
+from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.body import EARTH_RADII, BodyGround
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.motion import between, continuous, cubic, odd_step, quaternions
 from photoplan.geometry.rotation import ANGLE_UNITS, rotation_from_angles, rotation_opk
+from photoplan.io.camera.line.detectors import StripDetectors, look_of
 from photoplan.io.camera.line.model import MAX_BYTES, StatedLine
+from photoplan.io.camera.line.number_table import read_numbers
 from photoplan.io.camera.model import Entry, Name, Number, Pixels, Positive, Triple
-from photoplan.io.plain_files import read_entries, read_head, read_text
+from photoplan.io.plain_files import read_entries, read_head
 
 _Floats = NDArray[np.float64]
 FORM = "aerial strip (photoplan)"
 MARK = "photoplan strip 1"
+#: A record that is silent for this many times its usual step has a gap.
+_GAP = 10.0
 _COLUMNS = "time,x,y,z,omega,phi,kappa"
 #: From the camera axes of frame images to those of a line camera, which looks along +z.
 _TURNED = np.diag([1.0, -1.0, -1.0])
-_Polynomial = Annotated[tuple[Number, ...], Field(min_length=1, max_length=16)]
 
 
 class StripClock(Entry):
@@ -63,17 +64,6 @@ class StripFlight(Entry):
     """ω, φ, κ from the axes of the camera to those of the record, degrees."""
 
 
-class StripDetectors(Entry):
-    """``[detectors.NAME]``: one line of detectors."""
-
-    columns: Pixels
-    focal_mm: Positive
-    x_mm: _Polynomial = (0.0,)
-    """Where the detectors are in the direction of flight: coefficients of the powers of the column, mm."""
-    y_mm: _Polynomial
-    """The same across it, to the left."""
-
-
 class StripFile(Entry):
     """A whole file."""
 
@@ -94,15 +84,17 @@ def names(path: Path) -> list[str]:
     return list(read_entries(path, StripFile, MAX_BYTES).detectors)
 
 
-def flight_file(path: Path) -> Path:
-    """The record of the flight that a strip names.
+def files_beside(path: Path) -> list[Path]:
+    """The record of the flight that a strip names, and tables of its detectors.
 
     Raises
     ------
     InputError
         The file of the strip cannot be used.
     """
-    return path.parent / read_entries(path, StripFile, MAX_BYTES).flight.file
+    strip = read_entries(path, StripFile, MAX_BYTES)
+    tables = dict.fromkeys(each.table for each in strip.detectors.values() if each.table is not None)
+    return [path.parent / name for name in (strip.flight.file, *tables)]
 
 
 def read(path: Path, name: str | None) -> StatedLine:
@@ -123,7 +115,10 @@ def read(path: Path, name: str | None) -> StatedLine:
     if detectors is None:
         raise InputError(f"{path}: no line of detectors {name!r}; there are {known}")
     try:
-        return StatedLine(path, FORM, _track(strip, path), _look(detectors), EARTH_RADII)
+        look, beside = look_of(detectors, path.parent, MAX_BYTES)
+        return StatedLine(path, FORM, _track(strip, path), look, EARTH_RADII, beside)
+    except HeightSystemError:
+        raise
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith(str(path.parent)) else f"{path}: {text}") from None
@@ -154,42 +149,27 @@ def _track(strip: StripFile, path: Path) -> LineTrack:
         positions=lambda when: cubic(t, S, speed, when),
         attitudes=lambda when: between(t, q, when),
         known=known,
+        gaps=_gaps(t),
         per_line=True,
     )
 
 
 def _record(path: Path) -> _Floats:
     """The table of the flight, shape (n, 7)."""
-    try:
-        if path.suffix.lower() == ".npy":
-            table = _from_npy(path)
-        else:
-            header, _, body = read_text(path, MAX_BYTES).partition("\n")
-            if header.replace(" ", "").lower() != _COLUMNS:
-                raise InputError(f"{path}: the first line is {header[:80]!r}; it has to be {_COLUMNS}")
-            table = np.loadtxt(body.splitlines(), delimiter=",", ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from None
-    if table.ndim != 2 or table.shape[1] != 7 or len(table) < 2 or not np.isfinite(table).all():
-        raise InputError(f"{path}: a table of shape {table.shape}; needed are two rows or more of seven finite numbers")
+    table = read_numbers(path, _COLUMNS, MAX_BYTES)
+    if len(table) < 2:
+        raise InputError(f"{path}: one row; two or more are needed")
     if not (np.diff(table[:, 0]) > 0).all():
         row = int(np.argmin(np.diff(table[:, 0]))) + 1
         raise InputError(f"{path}: the time of row {row + 1} ({table[row, 0]:g}) is not after that of the row before")
-    return np.ascontiguousarray(table)
+    return table
 
 
-def _from_npy(path: Path) -> _Floats:
-    try:
-        table = np.load(path, allow_pickle=False, mmap_mode="r")
-        kind = table.dtype
-    except (OSError, ValueError):
-        raise
-    except Exception as error:
-        # Its header is a line of Python: a damaged one ends in whatever the parser raises.
-        raise ValueError(f"no array in NPY form: {error}") from None
-    if kind.kind not in "fiu":
-        raise ValueError(f"it holds {kind}; real numbers are needed")
-    return np.asarray(table, float)
+def _gaps(t: _Floats) -> tuple[tuple[float, float], ...]:
+    """Where a record is silent for much longer than from row to row otherwise."""
+    step = np.diff(t)
+    long = np.flatnonzero(step > _GAP * np.median(step))
+    return tuple((float(t[k]), float(t[k + 1])) for k in long)
 
 
 def _judge(table: _Floats, flight: StripFlight, path: Path) -> None:
@@ -206,11 +186,3 @@ def _judge(table: _Floats, flight: StripFlight, path: Path) -> None:
     odd = odd_step(table[:, 0], table[:, 1:4])
     if odd is not None:
         raise InputError(f"{path}: {odd}; correct the record, or leave rows out")
-
-
-def _look(detectors: StripDetectors) -> LineLook:
-    def tangents(column: _Floats) -> _Floats:
-        x, y = (polynomial.polyval(column, each) for each in (detectors.x_mm, detectors.y_mm))
-        return np.asarray(np.stack([x, -y], axis=-1) / detectors.focal_mm)
-
-    return LineLook.of(tangents, detectors.columns)
