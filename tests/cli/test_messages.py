@@ -142,3 +142,16 @@ def test_images_with_commas_or_repeated(tmp_path: Path) -> None:
     assert len(chosen) > 15
     for name, option in chosen.items():
         assert option.multiple and option.callback(None, option, ["a,b", "c"]) == ("a", "b", "c"), name
+
+
+def test_fault_08_bytes_that_are_no_text_in_words_of_gdal_are_not_shown() -> None:
+    """Of damaged tags rasterio cannot decode what GDAL says, and shows tracebacks that nobody asked for."""
+    program = (
+        "import sys; from photoplan.cli.main import start; start()\n"
+        "class Late:\n    def __init__(self, error): self.error = error\n"
+        "    def __del__(self): raise self.error\n"
+        "del_me = [Late(UnicodeDecodeError('utf-8', b'x', 0, 1, 'hidden')), Late(ValueError('shown'))]; del del_me\n"
+        "raise UnicodeDecodeError('utf-8', b'x', 0, 1, 'hidden')\n"
+    )
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert "ValueError: shown" in said.stderr and "hidden" not in said.stderr, said.stderr

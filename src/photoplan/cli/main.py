@@ -88,6 +88,14 @@ def start() -> None:
     warnings.filterwarnings("ignore", "(overflow|underflow|divide by zero|invalid value) encountered", RuntimeWarning)
     warnings.filterwarnings("ignore", "(Mean of empty|All-NaN|Degrees of freedom)", RuntimeWarning)
     warnings.formatwarning = _warning
+    # Of a damaged file rasterio cannot decode what GDAL says: two tracebacks each time. Ours do not come this way.
+    usual, unraisable = sys.excepthook, sys.unraisablehook
+    sys.excepthook = lambda kind, error, where: None if _undecoded(error) else usual(kind, error, where)
+    sys.unraisablehook = lambda what: None if _undecoded(what.exc_value) else unraisable(what)
+
+
+def _undecoded(error: BaseException | None) -> bool:
+    return isinstance(error, UnicodeDecodeError)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
