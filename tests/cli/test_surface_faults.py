@@ -90,6 +90,13 @@ def test_heights_that_texture_does_not_tell_have_a_large_sigma(tmp_path: Path) -
     assert np.sqrt(np.mean((off / sigma)[bare] ** 2)) < 2 and np.sqrt(np.mean((off / sigma)[textured] ** 2)) < 1.5
 
 
+def test_a_start_that_is_farther_away_than_stated(project: Path) -> None:
+    """Nothing is made up at the end of the reach: there is no height, and what helps is told."""
+    said = surface(project, "--start", 80, "--reach", 5, "--json")
+    assert "larger one if the start is that wrong" in notes(said)
+    assert json.loads(said.out)["valid_share"] < 0.8
+
+
 def test_images_without_overlap_are_told(project: Path) -> None:
     said = surface(project, "--bounds", X0 + 4000, Y0, X0 + 4010, Y0 + 10)
     assert said.code == 3 and "no two images see anything there; together they see" in said.err

@@ -64,6 +64,8 @@ class Block:
     """Standard deviation of the grey values of each view, in the system of the surface."""
     scale: float = 1.0
     """See `parallax`."""
+    limits: tuple[_Doubles | float, _Doubles | float] = (-np.inf, np.inf)
+    """Heights between which the surface stays, metres, of all or shape (rows, columns)."""
     views: list[View] = field(default_factory=list)
     """Whose sights they are."""
     values: _Floats = field(default_factory=lambda: np.empty((0, 0), np.float32))
@@ -113,7 +115,12 @@ class Block:
         """Heights by the equations of the last iteration and the curvatures' weights as they are now."""
         before, right = self._pull
         (change,) = self._solved(right - self.roughness.gradient(before))
-        self.heights = before + np.clip(change, -_FARTHEST / self.scale, _FARTHEST / self.scale)
+        self.heights = np.clip(before + np.clip(change, -_FARTHEST / self.scale, _FARTHEST / self.scale), *self.limits)
+
+    @property
+    def astray(self) -> NDArray[np.bool_]:
+        """Posts that have come to the end of their limits: what is there is no height, shape (rows, columns)."""
+        return np.asarray((self.heights <= self.limits[0]) | (self.heights >= self.limits[1]))
 
     def misfit(self, heights: _Doubles) -> float:
         """Variance of the grey values about a surface of these heights over their own; infinite if few pixels tell."""

@@ -33,6 +33,8 @@ _FEW = 16
 _ROOM, _FAR = 16.0, 0.15
 #: Distance of the heights that are tried on the coarsest level, pixels of parallax, and how many up and down at most.
 _TRIAL, _MOST_TRIALS = 0.5, 24
+#: The multiple of its reach that the surface keeps to.
+_BEYOND = 1.5
 #: Part of the misfit of the start below which another height is taken: without texture none fits better than others.
 _BETTER = 0.8
 #: Standard deviation of grey values until it is estimated, part of their contrast.
@@ -72,6 +74,8 @@ class Found:
     residuals: _Floats | None
     """Standardised residuals of every view where the grey values are, shape (views, m · rows, m · columns), NaN without
     a pixel; None: not wanted."""
+    astray: int
+    """Posts without a height since it went as far from the start as it may."""
     sums: _Doubles
     """Of every view: Σ of squared residuals in its own grey values, and redundancy; shape (n, 2)."""
     moves: tuple[float, ...]
@@ -129,6 +133,7 @@ def reconstruct(
         block = _opened(views, level + scheme.base, facets, heights, block) or block
         if block is None or block.facets is not facets:
             continue
+        block.limits = _limits(start, facets, scheme.reach)
         if level == scheme.coarsest:
             block.heights = _lifted(block, scheme.reach)
         block.adjust(_FIRST[level < scheme.coarsest], True)
@@ -211,6 +216,16 @@ def _start_heights(start: Callable[[_Doubles], _Doubles], facets: Facets) -> _Do
     return np.where(known, found, found[known].mean()) if known.any() else None
 
 
+def _limits(
+    start: Callable[[_Doubles], _Doubles], facets: Facets, reach: float
+) -> tuple[_Doubles | float, _Doubles | float]:
+    """What the surface keeps to around a start that is wrong by `reach` at most; no limits if nobody says so."""
+    if not reach > 0:
+        return -np.inf, np.inf
+    begun, room = np.asarray(start(facets.posts), float), _BEYOND * reach
+    return np.nan_to_num(begun - room, nan=-np.inf), np.nan_to_num(begun + room, nan=np.inf)
+
+
 def _finer(block: Block, facets: Facets, start: Callable[[_Doubles], _Doubles]) -> _Doubles:
     """Heights of the level before at the posts of finer facets, bilinear, with what the start has between its posts;
     beyond the border those of the border.
@@ -229,7 +244,8 @@ def _found(
     variance = block.variances()
     ratio = block.facets.ratio
     inner = slice(MARGIN, MARGIN + window.height), slice(MARGIN, MARGIN + window.width)
-    count = block.counted[inner]
+    astray = block.astray[inner] & (block.counted[inner] > 1)
+    count = np.where(astray, np.uint8(1), block.counted[inner])
     place = [next(n for n, view in enumerate(views) if view is own) for own in block.views]
     sums = np.zeros((len(views), 2))
     sums[place] = block.sums
@@ -255,6 +271,7 @@ def _found(
         grey=_where(finer(count > 0), block.grey_values(at.reshape(-1, 2)).reshape(at.shape[:2])),
         grey_sigmas=_where(finer(count > 0), grey_sigmas(block, at, finer(np.nan_to_num(variance[inner])))),
         residuals=pictures,
+        astray=int(astray.sum()),
         sums=sums,
         moves=moves,
     )

@@ -8,8 +8,8 @@ from photoplan.products.surface.plan import SurfacePlan
 
 #: An image whose sigma0 is so many times the median of the others is told of; or all, if sigma0 is this part of the
 #: contrast of the surface. Parts of the heights that fit badly, last corrections, and standard deviations, pixels of
-#: parallax, from which it is told.
-_ALONE, _NOISY, _MISFITS, _MOVING, _VAGUE = 1.6, 0.35, 0.02, 0.2, 1.0
+#: parallax, from which it is told; so many of them without a height.
+_ALONE, _NOISY, _MISFITS, _MOVING, _VAGUE, _ASTRAY = 1.6, 0.35, 0.02, 0.2, 1.0, 0.001
 
 
 def findings(
@@ -19,6 +19,7 @@ def findings(
     sigma_px: float | None,
     misfit_share: float,
     correction: float,
+    astray: float,
 ) -> tuple[str, ...]:
     """Lines about a surface that should not be trusted as it is; none if nothing speaks against it.
 
@@ -29,8 +30,9 @@ def findings(
         Standard deviation of a grey value by image.
     contrast : float
         Standard deviation of the surface's grey values.
-    sigma_px, misfit_share, correction
-        Of the heights: see `SurfaceResult`; the last correction of the finest level.
+    sigma_px, misfit_share, correction, astray
+        Of the heights: see `SurfaceResult`; the last correction of the finest level; the part of the posts that has
+        none since it went too far from the start.
     """
     lines = []
     known = {name: value for name, value in sigma0.items() if value is not None}
@@ -55,6 +57,11 @@ def findings(
         lines.append(
             f"{misfit_share:.1%} of the heights fit badly: see {plan.settings.name}_fit.tif. They lie at edges and "
             "moving things, or in regions that went wrong; `--reach` and a better `--start` help these"
+        )
+    if astray > _ASTRAY:
+        lines.append(
+            f"{astray:.1%} of the posts have no height since it would lie farther from the start than 1.5 times "
+            "`--reach`: give a larger one if the start is that wrong; if not, the images contradict the start there"
         )
     if correction > _MOVING:
         lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; `--resolution` helps")

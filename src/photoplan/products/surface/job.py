@@ -64,7 +64,7 @@ class SurfaceJob:
         count = np.zeros((1, *shape), np.uint8)
         grey, grey_sigmas = (np.full((1, *finest), np.nan, np.float32) for _ in range(2))
         residuals = np.full((len(views) if self.residuals else 0, *finest), np.nan, np.float32)
-        sums, moves, parts = np.zeros((len(views), 2)), np.zeros(self.scheme.coarsest + 1), 0
+        sums, moves, parts, astray = np.zeros((len(views), 2)), np.zeros(self.scheme.coarsest + 1), 0, 0
         for part in window.tiles(self.part):
             found = reconstruct(views, self.grid, part, self.scheme, start, self.residuals)
             if found is None:
@@ -76,7 +76,7 @@ class SurfaceJob:
             grey[(0, *there)], grey_sigmas[(0, *there)] = found.grey, found.grey_sigmas
             if found.residuals is not None:
                 residuals[(slice(None), *there)] = found.residuals
-            sums, moves, parts = sums + found.sums, moves + found.moves, parts + 1
+            sums, moves, parts, astray = sums + found.sums, moves + found.moves, parts + 1, astray + found.astray
         record = {
             "squares": sums[:, 0].tolist(),
             "redundancy": sums[:, 1].tolist(),
@@ -84,6 +84,7 @@ class SurfaceJob:
             "parts": parts,
             "sigmas": float(np.nansum(sigmas)),
             "heights": int(np.isfinite(sigmas).sum()),
+            "astray": astray,
             "misfits": int((fit > MISFIT).sum()),
             "greys": [float(np.isfinite(grey).sum()), *(float(np.nansum(grey.astype(float) ** n)) for n in (1, 2))],
         }

@@ -222,6 +222,7 @@ def _result(
     sigma_px = None if sigma is None else sigma / plan.height_error
     misfits = totals["misfits"] / totals["heights"] if totals["heights"] else 0.0
     corrections = tuple(move / parts for move in totals["moves"])
+    astray = totals["astray"] / max(totals["astray"] + totals["heights"], 1)
     seen, total, squares = totals["greys"]
     contrast = float(np.sqrt(max(squares / seen - (total / seen) ** 2, 0.0))) if seen else 0.0
     return SurfaceResult(
@@ -236,7 +237,7 @@ def _result(
         sigma_px=sigma_px,
         misfit_share=misfits,
         corrections=corrections,
-        notes=findings(plan, sigma0, contrast, sigma_px, misfits, corrections[0]),
+        notes=findings(plan, sigma0, contrast, sigma_px, misfits, corrections[0], astray),
         tiles=len(files["heights"].windows),
         resumed=tally.resumed,
     )
