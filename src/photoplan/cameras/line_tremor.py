@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import make_lsq_spline
 
 from photoplan.cameras.line_sight import LineSight, to_sphere
 from photoplan.cameras.line_track import LineTrack
@@ -223,6 +222,8 @@ def _smooth_track(track: LineTrack, knots: int) -> LineTrack:
     """Splines through the poses of all lines; its times are rows."""
     first, poses = track.poses
     begin, end = track.whole_rows
+    from scipy.interpolate import make_lsq_spline  # noqa: PLC0415 - frame images start without it
+
     rows, poses = np.arange(begin, end + 1.0), poses[begin - first : end + 1 - first]
     origin = poses.mean(axis=0)
     inner = np.linspace(rows[0], rows[-1], max(1, len(rows) // knots) + 1)

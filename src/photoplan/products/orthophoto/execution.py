@@ -37,7 +37,6 @@ from photoplan.products.orthophoto.finished import (
 )
 from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, known_errors, painting
-from photoplan.products.orthophoto.sheets import sheet_index, write_index
 from photoplan.products.run import Run, clock, refuse_inputs
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files
@@ -83,7 +82,11 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     picture = folder / "overview.png" if run.quicklook else None
     rasters = [path for p in plan.products for path in all_files(folder, p, plan.settings)]
     refuse_inputs(input_files(plan.project), [*rasters, *([] if picture is None else [picture])])
-    index = sheet_index(plan, folder)
+    in_sheets = plan.settings.choice is not None and plan.settings.choice.sheets is not None
+    if in_sheets:
+        # Shapely and vector files: a quarter of the start, and only here.
+        from photoplan.products.orthophoto.sheets import sheet_index, write_index  # noqa: PLC0415
+    index = sheet_index(plan, folder) if in_sheets else []
     refuse_inputs(input_files(plan.project), index[:1])
     for path in index:
         refuse_foreign_virtual(path)
