@@ -88,3 +88,26 @@ def test_the_orthophoto_of_a_turbulent_strip_is_where_the_truth_is(
     # Along the border too: no saw teeth.
     rim = ndimage.binary_erosion(valid, iterations=1) & ~ndimage.binary_erosion(valid, iterations=4) & ~steep
     assert np.sqrt((error[rim] ** 2).mean() / 2) < 0.1
+
+
+@pytest.mark.slow
+def test_lines_of_one_camera_are_bands_on_the_same_ground(shared: Path, tmp_path: Path) -> None:
+    """A line 1.5° ahead of the other sees the ground a second later, when all has moved: bands of one raster."""
+    vienna = Vienna(shared / "data" / "vienna_ortho_dtm")
+    strip = ShakenStrip(columns=400, lines=600)
+    project = project_file(tmp_path, strip, vienna, {"nadir": 0.0, "forward": 2.6})
+    toml = tmp_path / "strip.toml"
+    toml.write_text(toml.read_text().replace("x_mm = [46.6]", "x_mm = [2.6]"))
+    said = inside("ortho", project, "--resolution", 0.3, "--no-quicklook", "--stack", "colours")
+    assert said.code == 0, said.err
+    with rasterio.open(tmp_path / "products" / "colours.vrt") as file:
+        assert file.descriptions == ("nadir 1", "nadir 2", "nadir 3", "forward 1", "forward 2", "forward 3")
+        values = file.read(masked=True).astype(float)
+    both = ndimage.binary_erosion(~np.ma.getmaskarray(values).any(axis=0), iterations=2)
+    apart = np.hypot(values[0] - values[3], values[1] - values[4])[both] / 0.3
+    print(
+        f"\nbands: {np.sqrt((apart**2).mean() / 2):.4f} px rms, worst {apart.max():.3f} px; {both.mean():.0%} in both"
+    )
+    assert both.mean() > 0.25
+    assert np.sqrt((apart**2).mean() / 2) < 0.1
+    assert np.percentile(np.asarray(apart), 99.9) < 0.1

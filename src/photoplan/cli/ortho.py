@@ -16,6 +16,7 @@ from photoplan.cli.options import PATH, executing, product_options
 @click.option("--true/--ground", "true", default=None, help="Show objects where they stand, or the ground [ground].")
 @click.option("--method", help="indirect, or direct: pixels of the image are carried to the ground [indirect].")
 @click.option("--fill", type=int, metavar="PX", help="Fill gaps of the direct method from pixels this near [0].")
+@click.option("--stack", metavar="NAME", help="Show all orthophotos as bands of one raster, NAME.vrt.")
 @executing
 def command(project: Path, **options: Any) -> None:
     """Make an orthophoto of each image: NAME_ortho.tif (a cloud-optimised GeoTIFF) and its run record.

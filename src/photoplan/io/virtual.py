@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -13,6 +13,8 @@ from photoplan.errors import UsageError
 from photoplan.io.naming import write_atomically
 
 _MARK = "<!-- written by photoplan -->"
+#: Pixels that lie over each other do so to this part of their side.
+_ALIGNED = 1e-3
 _TYPES = {"uint8": "Byte", "int8": "Int8", "uint16": "UInt16", "int16": "Int16", "uint32": "UInt32", "int32": "Int32",
           "float32": "Float32", "float64": "Float64"}  # fmt: skip
 
@@ -66,6 +68,48 @@ def write_virtual(path: Path, rasters: Sequence[Path]) -> None:
     ]
     if masked:
         bands.append(f'<MaskBand><VRTRasterBand dataType="Byte">\n{sources("mask,1")}\n</VRTRasterBand></MaskBand>')
+    head = (
+        f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{_MARK}\n<SRS>{escape(crs.to_wkt())}</SRS>\n'
+        f"<GeoTransform>{left!r}, {resolution!r}, 0, {top!r}, 0, {-resolution!r}</GeoTransform>\n"
+    )
+    write_atomically(path, (head + "\n".join(bands) + "\n</VRTDataset>\n").encode())
+
+
+def write_stacked(path: Path, rasters: Mapping[str, Path]) -> None:
+    """Write a VRT that shows rasters of one resolution, which lie in its folder, as bands of one, over all of them.
+
+    Each band has the name of its raster, with the number of the band where that has several.
+
+    Raises
+    ------
+    UsageError
+        Pixels of the rasters do not lie over each other.
+    """
+    left, top, right, bottom = float("inf"), float("-inf"), float("-inf"), float("inf")
+    opened = {}
+    for name, raster in rasters.items():
+        with rasterio.open(raster) as file:
+            b, resolution, crs = file.bounds, file.res[0], file.crs
+            opened[name] = raster.name, b, (file.width, file.height), file.dtypes, file.nodata
+        left, top, right, bottom = min(left, b.left), max(top, b.top), max(right, b.right), min(bottom, b.bottom)
+    bands: list[str] = []
+    for name, (file_name, b, (width, height), dtypes, nodata) in opened.items():
+        x, y = (b.left - left) / resolution, (top - b.top) / resolution
+        if max(abs(x - round(x)), abs(y - round(y))) > _ALIGNED:
+            raise UsageError(f"{file_name}: its pixels do not lie over those of the other orthophotos")
+        at = f'xSize="{width}" ySize="{height}"'
+        none = "" if nodata is None else f"<NoDataValue>{nodata!r}</NoDataValue>"
+        for k, dtype in enumerate(dtypes, 1):
+            title = name if len(dtypes) == 1 else f"{name} {k}"
+            bands.append(
+                f'<VRTRasterBand dataType="{_TYPES[dtype]}" band="{len(bands) + 1}"><Description>{escape(title)}'
+                f'</Description>{none}<ComplexSource><SourceFilename relativeToVRT="1">{escape(file_name)}'
+                f'</SourceFilename><SourceBand>{k}</SourceBand><SrcRect xOff="0" yOff="0" {at}/><DstRect '
+                f'xOff="{round(x)}" yOff="{round(y)}" {at}/>'
+                + ("<UseMaskBand>true</UseMaskBand>" if nodata is None else f"<NODATA>{nodata!r}</NODATA>")
+                + "</ComplexSource></VRTRasterBand>"
+            )
+    size = round((right - left) / resolution), round((top - bottom) / resolution)
     head = (
         f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{_MARK}\n<SRS>{escape(crs.to_wkt())}</SRS>\n'
         f"<GeoTransform>{left!r}, {resolution!r}, 0, {top!r}, 0, {-resolution!r}</GeoTransform>\n"

@@ -94,6 +94,9 @@ class OrthoSettings:
     """Gaps that the direct method leaves are filled from pixels no further away than this; 0: they stay empty."""
     sources: bool = False
     """Whether a second raster says which image painted each pixel, and a GeoPackage where its regions are."""
+    stack: str = ""
+    """Name of a virtual raster that shows all orthophotos as bands of one, on the same ground: lines of one camera, of
+    other colours; empty: there is none."""
 
     def __post_init__(self) -> None:
         if self.resolution is not None:
@@ -125,6 +128,9 @@ class OrthoSettings:
                 "`method` direct makes orthophotos of single images, paints no hidden ground and knows no `accuracy`: "
                 "leave `hidden` and `accuracy` out, or take the indirect method"
             )
+
+        if self.stack and self.choice is not None:
+            raise UsageError(f"`stack` {self.stack!r} shows orthophotos as bands; a mosaic is one picture already")
 
     @property
     def asks_hidden(self) -> bool:
