@@ -22,8 +22,9 @@ from photoplan.products.view.camera import CameraRequest
 from photoplan.products.view.content import ContentRequest
 from photoplan.products.view.job import LookRequest
 from photoplan.products.view.lines import LinesRequest
-from photoplan.products.view.make import ViewRequest, ViewResult, draw, make_view, plan_view
+from photoplan.products.view.make import ViewRequest, draw, make_view, plan_view
 from photoplan.products.view.overlay import Letters, Overlay, dashed, placed
+from photoplan.products.view.result import ViewResult
 
 STAND = CameraRequest(position=(X0 - 80, Y0 - 60), height=40.0, look_at=(X0 + 20, Y0 + 10), size=(240, 160))
 LOOK = LookRequest((ContentRequest("shade"),), samples=1)
@@ -61,7 +62,8 @@ def write(path: Path, layer: str, kind: str, shapes: list, columns: dict, crs: s
 
 def drawn(small: Block, *texts: str) -> Overlay:
     lines = tuple(map(LinesRequest.parse, texts))
-    overlay = draw(plan_view(ViewRequest(small.terrain, STAND, None, LOOK, lines=lines, lettering=block_letters)))
+    plan = plan_view(ViewRequest(small.terrain, STAND, None, LOOK, lines=lines, lettering=block_letters))
+    overlay = draw(plan, plan.camera)
     assert overlay is not None
     return overlay
 

@@ -9,6 +9,7 @@ from photoplan.cli.lazy import LazyGroup
 #: Verb and its one-line help; the command is `photoplan.cli.view_<verb>:command`.
 VERBS = {
     "picture": "A picture of terrain, rasters or photos (this word may be left out).",
+    "sequence": "Pictures along a path, and a film of them.",
     "matrix": "The ground of every pixel as a raster.",
     "pick": "Pixels to ground, ground to pixels.",
     "area": "What of the map is seen, as a raster or a polygon.",

@@ -144,6 +144,8 @@ def told(plan: Any) -> list[str]:
         earth = f"{request.curvature or 'bend'}: R = {plan.camera.earth_radius / 1000:.0f} km, k = {k:g}"
     if request.exaggeration != 1:
         earth += f"; heights × {request.exaggeration:g} about {request.reference:.2f} m"
+    if plan.stereo is not None:
+        earth += f"; {plan.stereo.how}, base {plan.stereo.base:g} m"
     lines = [
         f"standpoint {x:.2f} {y:.2f} {z:.2f}, {plan.camera.above_ground:.2f} m above ground",
         f"{what}; field of view {across:.4g}{upright}°; {width} × {height} pixels; {earth}",

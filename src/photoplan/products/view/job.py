@@ -21,6 +21,7 @@ from photoplan.products.view.content import Colours, ContentRequest, Layer, Scen
 from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.overlay import Overlay
 from photoplan.products.view.photo import Photo, PhotoRequest
+from photoplan.products.view.stereo import anaglyph
 from photoplan.surfaces.rays import Hits
 from photoplan.surfaces.seen import Seen, SeenSurface, ground_size
 from photoplan.targets.view import Bundle, ViewTarget
@@ -164,9 +165,15 @@ class ViewJob:
     """Whether tiles are those of the coordinate matrix, or of the picture."""
     overlay: Overlay | None = None
     """What is drawn over the picture."""
+    right: ViewJob | None = None
+    """The right picture of a stereo pair, of which this is the left one."""
+    beside: bool = False
+    """Whether the right picture lies beside this one, or both make an anaglyph."""
 
     def __call__(self, tile: Tile) -> Made:
         """Colours or ground of a tile, and counts of its pixels."""
+        if self.right is not None:
+            return self._pair(tile, self.right)
         view = self.address.open()
         if self.matrix:
             seen = view.surface.look(view.target, tile.window)
@@ -181,6 +188,19 @@ class ViewJob:
             for shift in dict.fromkeys((0, view.shift)):
                 self.overlay.paint(picture, tile.window, shift)
         return Made(((picture, None),), tally.totals)
+
+    def _pair(self, tile: Tile, right: ViewJob) -> Made:
+        """A tile of both pictures of a pair; rays of both are counted."""
+        shift = self.address.open().target.window.width if self.beside else 0
+        window = tile.window
+        moved = Tile(tile.index, Window(window.col - shift, window.row, window.width, window.height))
+        one, other = replace(self, right=None)(tile), right(moved)
+        tally = Tally()
+        tally.add(one.record)
+        tally.add(other.record)
+        assert one.layers[0] is not None and other.layers[0] is not None
+        pictures = one.layers[0][0], other.layers[0][0]
+        return Made(((np.maximum(*pictures) if self.beside else anaglyph(*pictures), None),), tally.totals)
 
     def _paint(self, view: OpenView, tile: Tile, picture: NDArray[np.uint8], tally: Tally) -> None:
         """Colours of a part of the view."""

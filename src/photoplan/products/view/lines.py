@@ -184,7 +184,7 @@ def _features(request: LinesRequest, ground: ViewGround) -> Drawing:
     table, options = read_drawn_features(request.path, request.layer), dict(request.options)
     if len(table.XYZ) > _MOST:
         raise InputError(f"{table.path}: {len(table.XYZ)} vertices; up to {_MOST} are drawn. Choose a part of it")
-    XYZ = _carried(table, options, ground)
+    XYZ = in_crs_of_ground(table, options, ground)
     values = _Values(table, options)
     point_vertex = table.is_point[table.part]
     is_line = np.flatnonzero(~table.is_point)
@@ -205,7 +205,7 @@ def _features(request: LinesRequest, ground: ViewGround) -> Drawing:
     )
 
 
-def _carried(table: DrawnFeatures, options: dict[str, str], ground: ViewGround) -> NDArray[np.float64]:
+def in_crs_of_ground(table: DrawnFeatures, options: dict[str, str], ground: ViewGround) -> NDArray[np.float64]:
     """Vertices in the CRS of the ground; heights as they are, or left out where all lies on the ground."""
     XYZ = table.XYZ.copy()
     drape = options.get("drape", "no")

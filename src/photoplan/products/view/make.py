@@ -14,7 +14,7 @@ import numpy as np
 
 from photoplan import __version__
 from photoplan.engine.cluster import Question
-from photoplan.engine.executors import open_workers
+from photoplan.engine.executors import Workers, open_workers
 from photoplan.engine.run import Runner, Tally, Work
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.grid import Placement
@@ -25,7 +25,7 @@ from photoplan.io.naming import together, write_atomically
 from photoplan.io.product import DESCRIPTION, ProductFile, check_output
 from photoplan.io.run_record import input_entry, run_key, versions, write_run_record
 from photoplan.io.storage import PICTURES
-from photoplan.plain import json_text, pick, plain
+from photoplan.plain import json_text, plain
 from photoplan.plan.tiles import Tiles
 from photoplan.products.run import Run, clock, refuse_inputs
 from photoplan.products.view.camera import CameraRequest, ViewCamera, view_camera
@@ -34,8 +34,10 @@ from photoplan.products.view.first_look import FirstLook, first_look
 from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.job import LookRequest, ViewAddress, ViewJob, seen_surface
 from photoplan.products.view.lines import LinesRequest, open_drawing
-from photoplan.products.view.overlay import Lettering, Overlay, OverlayFacts, overlay
+from photoplan.products.view.overlay import Lettering, Overlay, overlay
 from photoplan.products.view.photo import Photo
+from photoplan.products.view.result import ViewResult
+from photoplan.products.view.stereo import Stereo, eyes
 from photoplan.surfaces.seen_lines import Sight
 from photoplan.terrain.shading import Lighting
 
@@ -73,8 +75,12 @@ class ViewRequest:
     """What draws texts; None: points have no labels."""
     svg: Path | None = None
     """A file for what is drawn, over the picture."""
+    stereo: Stereo | None = None
+    """A pair of pictures instead of one."""
 
     def __post_init__(self) -> None:
+        if self.stereo is not None and (self.matrix or self.svg or self.look.photo or self.kind == "matrix"):
+            raise UsageError("a stereo pair has two cameras; give no matrix, `photo` or `svg`")
         if self.svg is not None and not self.lines:
             raise UsageError(f"{self.svg}: nothing is drawn; give `lines`, too")
         if self.svg is not None and self.svg.suffix.lower() != ".svg":
@@ -97,7 +103,13 @@ class ViewPlan:
     def placement(self) -> Placement:
         """Of what is written: wider than the picture where a photo lies beside it."""
         photo, (width, height) = self.address.look.photo, self.camera.target.bundle.size
-        return Placement((2 * width if photo is not None and photo.how == "beside" else width, height))
+        beside = (photo is not None and photo.how == "beside") or (self.stereo is not None and self.stereo.beside)
+        return Placement((2 * width if beside else width, height))
+
+    @property
+    def stereo(self) -> Stereo | None:
+        """How a pair is made, its base in metres; None: there is one picture."""
+        return None if self.request.stereo is None else self.request.stereo.stated(self.first.nearest)
 
     @property
     def field_of_view(self) -> tuple[float, float]:
@@ -120,37 +132,9 @@ class ViewPlan:
             "field_of_view_deg": list(self.field_of_view),
             "farthest_m": self.request.farthest,
             "error_bound_m": self.request.bound,
+            **({} if self.stereo is None else {"stereo": self.stereo.how, "base_m": self.stereo.base}),
             "expected": self.first,
         }
-
-
-@dataclass(frozen=True)
-class ViewResult:
-    """What came out."""
-
-    path: Path
-    size: tuple[int, int]
-    sky: int
-    """Pixels that show no ground (of a picture with several rays to a pixel: rays)."""
-    rays: int
-    lost: int
-    """Those of them that point downwards: they pass the border of the terrain, or a hole of it."""
-    nearest: float | None
-    farthest: float | None
-    """Distances of ground, metres."""
-    resumed: int
-    """Tiles of an earlier run."""
-    seconds: float
-    svg: Path | None = None
-    drawn: OverlayFacts | None = None
-    """What became of lines and labels."""
-
-    def json_fields(self) -> dict[str, Any]:
-        """Counts of rays."""
-        counts = pick(self, "rays", sky_rays="sky", downward_sky_rays="lost")
-        return {**pick(self, "path", "size", nearest_m="nearest", farthest_m="farthest"), **counts,
-                **pick(self, "seconds", resumed_tiles="resumed"),
-                **({} if self.drawn is None else pick(self, "svg", "drawn"))}  # fmt: skip
 
 
 def plan_view(request: ViewRequest) -> ViewPlan:
@@ -197,6 +181,9 @@ def plan_view(request: ViewRequest) -> ViewPlan:
     if request.lines:
         drawn = [(each.layer, each.interval, each.options) for each in request.lines]
         told += [drawn, request.text_size, request.lettering is not None]
+    if request.stereo is not None:
+        pair = request.stereo.stated(first.nearest)
+        told += [pair, eyes(camera, pair.metres)]
     return ViewPlan(request, camera, first, address, run_key(f"view {request.kind}", told, inputs))
 
 
@@ -279,9 +266,23 @@ def make_view(plan: ViewPlan, run: Run) -> ViewResult:
     ResourceError
         Disk or memory ran out.
     """
-    path, request = plan.request.output, plan.request
-    assert path is not None
     run.check()
+    question = Question(versions, tuple(each for each, _ in plan.address.digests), str(_output(plan).parent.resolve()))
+    with open_workers(run.executor, run.workers, question, run.events) as workers, together():
+        work = view_work(plan, run, workers)
+        run.events.begin(work.name, work.count)
+        (result,) = Runner[ViewResult](workers, run.in_flight(workers.threads), run.events).run([work])
+    return result
+
+
+def _output(plan: ViewPlan) -> Path:
+    assert plan.request.output is not None
+    return plan.request.output
+
+
+def view_work(plan: ViewPlan, run: Run, workers: Workers) -> Work[ViewResult]:
+    """A picture or matrix as one of the products of a run; its output is checked, and its folder made."""
+    path, request = _output(plan), plan.request
     outputs = [path] if request.svg is None else [path, request.svg]
     refuse_inputs([Path(each) for each, _ in plan.address.digests], outputs)
     for each in outputs:
@@ -305,32 +306,39 @@ def make_view(plan: ViewPlan, run: Run) -> ViewResult:
         if is_matrix
         else None,
     )
-    tiles, drawn = Tiles.every(placement.window, TILE), draw(plan)
-    run.events.begin(path.name, len(tiles))
-    question = Question(versions, tuple(each for each, _ in plan.address.digests), str(path.parent.resolve()))
-    with open_workers(run.executor, run.workers, question, run.events) as workers, together():
-        work = Work(
-            name=path.stem,
-            job=ViewJob(plan.address, is_matrix, drawn),
-            tiles=tiles,
-            count=len(tiles),
-            sinks=(file,),
-            complete=partial(_complete, plan, drawn, file, run, clock(workers)),
-            scratch=path.with_name(f".{path.name}.parcels"),
-        )
-        (result,) = Runner[ViewResult](workers, run.in_flight(workers.threads), run.events).run([work])
-    return result
+    tiles, job = Tiles.every(placement.window, TILE), _job(plan)
+    return Work(
+        name=path.stem,
+        job=job,
+        tiles=tiles,
+        count=len(tiles),
+        sinks=(file,),
+        complete=partial(_complete, plan, job.overlay, file, run, clock(workers)),
+        scratch=path.with_name(f".{path.name}.parcels"),
+    )
 
 
-def draw(plan: ViewPlan) -> Overlay | None:
-    """What is drawn over the picture; None: nothing."""
+def _job(plan: ViewPlan) -> ViewJob:
+    """What workers are told; of a pair for both pictures."""
+    if plan.stereo is None:
+        return ViewJob(plan.address, plan.request.kind == "matrix", draw(plan, plan.camera))
+    ground = open_view_ground(plan.request.source, plan.request.crs)
+    left, right = (
+        ViewJob(replace(plan.address, camera=eye), overlay=draw(plan, view_camera(eye, ground, force=True)))
+        for eye in eyes(plan.camera, plan.stereo.metres)
+    )
+    return replace(left, right=right, beside=plan.stereo.beside)
+
+
+def draw(plan: ViewPlan, camera: ViewCamera) -> Overlay | None:
+    """What is drawn over the picture of a camera; None: nothing."""
     request = plan.request
     if not request.lines:
         return None
     ground = open_view_ground(request.source, request.crs)
     reach = min(request.farthest, 1.5 * (plan.first.farthest or 0.0) + 1000.0)
-    drawing = open_drawing(request.lines, ground, reach, plan.camera.target.center)
-    sight = Sight(plan.camera.target, seen_surface(ground, request.farthest, request.bound))
+    drawing = open_drawing(request.lines, ground, reach, camera.target.center)
+    sight = Sight(camera.target, seen_surface(ground, request.farthest, request.bound))
     return overlay(drawing, sight, request.lettering, request.text_size)
 
 
@@ -344,7 +352,8 @@ def _complete(
 ) -> ViewResult:
     tally.check(file.path)
     facts = plan.json_fields()
-    told = {name: facts[name] for name in ("standpoint", "camera", "earth_radius", "bend_per_metre", "error_bound_m")}
+    names = ("standpoint", "camera", "earth_radius", "bend_per_metre", "error_bound_m", "stereo", "base_m")
+    told = {name: facts[name] for name in names if name in facts}
     tags = {
         "PHOTOPLAN_VERSION": __version__,
         "PHOTOPLAN_KEY": plan.key,

@@ -1,0 +1,177 @@
+"""Views along a path: numbered pictures in a folder, and a film of them."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from photoplan.engine.cluster import Question
+from photoplan.engine.executors import Workers, open_workers
+from photoplan.engine.run import Kept, Runner, Work
+from photoplan.errors import PhotoplanError, UsageError
+from photoplan.io.naming import together
+from photoplan.io.product import check_output
+from photoplan.io.run_record import recorded_result, run_key, versions
+from photoplan.products.run import Run
+from photoplan.products.view.camera import CameraRequest
+from photoplan.products.view.ground import open_view_ground
+from photoplan.products.view.make import ViewPlan, ViewRequest, plan_view, view_work
+from photoplan.products.view.path import cameras, stations
+
+
+@dataclass(frozen=True)
+class SequenceRequest:
+    """What is asked."""
+
+    view: ViewRequest
+    """All pictures have this look; it has no camera of its own and no output."""
+    template: CameraRequest
+    """The camera but for its standpoint."""
+    path: Path
+    output: Path
+    """A folder for `frame_00001.png` and so on."""
+    along: bool = False
+    """Whether it looks along the path, whatever azimuth it has."""
+    layer: str | None = None
+    step: float | None = None
+    """Between stations of a line, metres."""
+    video: Path | None = None
+    """A film ``.mp4`` of the pictures, made by ffmpeg."""
+    rate: float = 25.0
+    """Pictures of the film per second."""
+
+    def __post_init__(self) -> None:
+        if self.video is not None and self.video.suffix.lower() != ".mp4":
+            raise UsageError(f"{self.video}: a film is written as .mp4")
+        if not 0.1 <= self.rate <= 240:
+            raise UsageError(f"`rate` {self.rate}; 0.1 to 240 pictures per second are allowed")
+        if self.view.stereo is not None and self.view.stereo.base is None:
+            raise UsageError("pairs of a sequence have one `base`; state it")
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """What came out."""
+
+    frames: tuple[Path, ...]
+    kept: int
+    """Pictures of an earlier run."""
+    video: Path | None
+
+    def json_fields(self) -> dict[str, Any]:
+        """Files and counts."""
+        folder = self.frames[0].parent
+        return {"folder": folder, "frames": len(self.frames), "kept": self.kept, "video": self.video}
+
+
+def plan_sequence(request: SequenceRequest) -> list[ViewPlan]:
+    """Put all cameras on the ground; nothing is written.
+
+    Raises
+    ------
+    UsageError
+        The path does not fit the request, or a film is asked for where there is no ffmpeg.
+    InputError
+        A file cannot be used.
+    GeometryError
+        A standpoint lies below the ground or sees none of it; its picture is named.
+    """
+    if request.video is not None and shutil.which("ffmpeg") is None:
+        raise UsageError(
+            f"{request.video}: a film needs ffmpeg, which is not found on the PATH; install it, or leave `video` out "
+            "(the pictures are numbered, so that any program can join them)"
+        )
+    places = stations(
+        request.path, request.layer, request.step, open_view_ground(request.view.source, request.view.crs)
+    )
+    plans = []
+    for k, camera in enumerate(cameras(request.template, places, request.along), 1):
+        name = request.output / f"frame_{k:05d}.png"
+        try:
+            plans.append(plan_view(replace(request.view, camera=camera, output=name)))
+        except PhotoplanError as error:
+            raise type(error)(f"picture {k} of {len(places)}: {error}") from None
+    # One range of heights for all, or colours would change from one picture to the next.
+    lows, highs = zip(*(plan.address.heights for plan in plans))
+    heights = (min(lows), max(highs))
+    return [
+        replace(
+            plan,
+            address=replace(plan.address, heights=heights),
+            key=run_key("view sequence", [plan.key, heights], []),
+        )
+        for plan in plans
+    ]
+
+
+def make_sequence(request: SequenceRequest, plans: list[ViewPlan], run: Run) -> Sequence:
+    """Make all pictures in one run, and the film; those of an earlier run that would be equal are kept.
+
+    Raises
+    ------
+    UsageError
+        A picture of another view stands in the way; see `make_view` for the rest.
+    """
+    run.check()
+    kept = [_is_made(plan) for plan in plans]
+    inputs = [name for name, _ in plans[0].address.digests]
+    for plan, there in zip(plans, kept):
+        if not there and plan.request.output is not None:
+            check_output(plan.request.output, inputs, overwrite=run.overwrite)
+    if request.video is not None:
+        check_output(request.video, inputs, overwrite=run.overwrite)
+    tiles = [-(-plan.placement.size[0] // 512) * -(-plan.placement.size[1] // 512) for plan in plans]
+
+    def works(workers: Workers) -> Iterator[Work[Path] | Kept[Path]]:
+        for plan, there, count in zip(plans, kept, tiles):
+            assert plan.request.output is not None
+            if there:
+                yield Kept(plan.request.output, count)
+            else:
+                work = view_work(plan, run, workers)
+                told: Any = replace(work, complete=_path_of(work))
+                yield told
+
+    question = Question(versions, tuple(inputs), str(request.output.resolve().parent))
+    run.events.begin(request.output.name, sum(tiles))
+    with open_workers(run.executor, run.workers, question, run.events) as workers, together():
+        frames = Runner[Path](workers, run.in_flight(workers.threads), run.events).run(works(workers))
+    if request.video is not None:
+        write_film(request.video, request.output, request.rate)
+    return Sequence(tuple(frames), sum(kept), request.video)
+
+
+def _is_made(plan: ViewPlan) -> bool:
+    path = plan.request.output
+    return path is not None and path.is_file() and bool(recorded_result(path, plan.key, lambda product, settings: True))
+
+
+def _path_of(work: Work[Any]) -> Any:
+    """Completes a picture, and tells its path only."""
+    return lambda tally: work.complete(tally).path
+
+
+def write_film(path: Path, folder: Path, rate: float) -> None:
+    """Join the pictures of a folder by ffmpeg (H.264; sides are made even).
+
+    Raises
+    ------
+    PhotoplanError
+        ffmpeg could not; its last words are told.
+    """
+    part = path.with_name(f".{path.stem}.part.mp4")
+    pictures = str(folder / "frame_%05d.png")
+    words = ["ffmpeg", "-y", "-loglevel", "error", "-framerate", f"{rate:g}", "-i", pictures, "-pix_fmt", "yuv420p"]
+    words += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", str(part)]
+    try:
+        said = subprocess.run(words, capture_output=True, text=True, check=False)
+        if said.returncode != 0 or not part.is_file():
+            last = " ".join(said.stderr.split())[-300:]
+            raise PhotoplanError(f"{path}: ffmpeg could not join the pictures in {folder}, which are complete ({last})")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
