@@ -20,7 +20,7 @@ from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions
 from photoplan.products.simulate.form import Forming, SimulateReport, check_fit, stated_model
 from photoplan.products.simulate.scene import ProjectScene, TruthRaster, image_truth, true_orthophoto, usual_grain
-from photoplan.project.cameras import central_without_pixels
+from photoplan.project.cameras import camera_without_pixels
 
 _ORTHO = "true_orthophoto.tif"
 
@@ -162,7 +162,7 @@ def _works(
             overwrite=request.overwrite,
         )
         if request.truth:
-            camera = central_without_pixels(project, name)
+            camera = camera_without_pixels(project, name)
             truth = path.with_name(f"{path.stem}_truth.tif")
             yield image_truth(seen, camera, truth, raster("truth of a rendered image", settings))
     if request.resolution is not None:
@@ -177,9 +177,10 @@ def _facts(project: Project, name: str | None) -> dict[str, Any]:
     said = project.model_dump_json(include={"crs", "terrain", "objects", "orientation"}, exclude_none=True)
     found: dict[str, Any] = json.loads(said)
     if name is not None:
-        image = project.image(name)
+        image = project.any_image(name)
         found["image"] = json.loads(image.model_dump_json(exclude_none=True, exclude={"file"}))
-        found["camera"] = json.loads(project.cameras[image.camera].model_dump_json(exclude_none=True))
+        if image.described_by is not None:
+            found["camera"] = json.loads(project.cameras[image.described_by].model_dump_json(exclude_none=True))
     return found
 
 

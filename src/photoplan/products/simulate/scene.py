@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import CentralCamera
+from photoplan.cameras.base import Camera
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid, Placement, Window
@@ -23,7 +23,7 @@ from photoplan.kernels.sample_grid import sample_points
 from photoplan.plan.footprint import FAR
 from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
 from photoplan.products.orthophoto.look import two_figures
-from photoplan.project.cameras import central_without_pixels
+from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import Ground, ground_of
 from photoplan.quality.formation.rendered import FromAbove, RenderedScene, SolidTexture, Texture
 from photoplan.surfaces.objects import painted_surface
@@ -140,11 +140,11 @@ class ProjectScene:
         GeometryError
             There is nothing within 30 km.
         """
-        camera = central_without_pixels(self.project, name)
-        x, y, z = camera.center.tolist()
+        camera = camera_without_pixels(self.project, name)
+        x, y, z = camera.vantage.point.tolist()
         low, high = self._heights((x - FAR, y - FAR, x + FAR, y + FAR), f"image {name!r}")
         orientation = self.project.orientation
-        if orientation.earth_curvature != "none" or orientation.refraction:
+        if orientation.earth_curvature != "none" or orientation.refraction or not camera.vantage.central:
             # Curved rays are known from heights alone; what lies higher than the camera they cannot meet.
             high = max(low, min(high, z - 1.0))
         return RenderedScene(
@@ -215,12 +215,12 @@ class TruthRaster:
         write_grid(self.path, self.placement, self.dtype, self.bands, "auto", self.tile, self.options)
 
 
-def image_truth(scene: RenderedScene, camera: CentralCamera, path: Path, options: GridOptions) -> TruthRaster:
+def image_truth(scene: RenderedScene, camera: Camera, path: Path, options: GridOptions) -> TruthRaster:
     """X, Y, Z and object of what the middles of an image's pixels show; NaN: nothing.
 
     Values of X and Y are stored from an origin, the bands' offset, which GDAL's readers add.
     """
-    origin = np.round(camera.center / _ORIGIN) * _ORIGIN * (1.0, 1.0, 0.0)
+    origin = np.round(camera.vantage.point / _ORIGIN) * _ORIGIN * (1.0, 1.0, 0.0)
     form = ImageForm(
         descriptions=("X", "Y", "Z", "object"), units=("metre", "metre", "metre", ""), offsets=(*origin.tolist(), 0.0)
     )
