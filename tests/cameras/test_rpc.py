@@ -165,3 +165,11 @@ def test_gdals_warper_looks_for_pixels_at_the_same_places() -> None:
     XY = (x, y) + pixel * (places - (0.5, 0.5)) * (1, -1)
     mine = project(seen, np.column_stack([XY, np.full(len(XY), 250.0)]))
     assert np.abs(found.reshape(2, -1).T - mine).max() < 1e-8
+
+
+@pytest.mark.parametrize(("row", "term"), [(0, 9), (0, 16), (2, 10), (2, 3), (3, 0)])
+def test_fault_30_a_coefficient_that_leads_far_away_is_refused(row: int, term: int) -> None:
+    coefficients = functions().coefficients.copy()
+    coefficients[row, term] = 1000.0 if row % 2 == 0 else 1e-6
+    with pytest.raises(InputError, match=f"the {'sample' if row < 2 else 'line'} at the border .* fresh copy"):
+        replace(functions(), coefficients=coefficients)

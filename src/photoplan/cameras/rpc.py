@@ -23,6 +23,8 @@ from photoplan.geometry.geodetic import GeodeticGround
 BOUND = 1.5
 #: A denominator below this part of its value in the middle is near a pole: no position.
 _POLE = 1e-3
+#: Normalised image coordinates beyond this are no part of an image, and at so many of 27 places no accident.
+_FAR, _MOST_FAR = 100.0, 6
 #: Powers of longitude, latitude and height of the 20 terms, in the order of RPC00B.
 _POWERS = np.array(
     [
@@ -78,6 +80,22 @@ class RationalFunctions:
             raise InputError("a denominator vanishes in the middle of the image; the first of its coefficients is 0")
         if (coefficients[::2, 1:3] == 0).all(axis=1).any():
             raise InputError("a numerator does not change with longitude and latitude; coefficients are missing")
+        self._refuse_far()
+
+    def _refuse_far(self) -> None:
+        """Refuse what leads from the box of ground coordinates to places many images away: a coefficient is wrong."""
+        nodes = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
+        p = terms(nodes) @ self.coefficients.T
+        with np.errstate(all="ignore"):
+            value, bottom = p[:, ::2] / p[:, 1::2], p[:, 1::2] / self.coefficients[1::2, 0]
+        far = ~(np.abs(value) < _FAR) & (bottom > _POLE)
+        # A pole may lie beside one of the 27 places, outside the image.
+        if (far.sum(axis=0) >= _MOST_FAR).any():
+            what = ("sample", "line")[int(np.argmax(far.sum(axis=0)))]
+            raise InputError(
+                f"the {what} at the border of its ground lies more than {_FAR:g} images away; one of its coefficients "
+                "is wrong: get a fresh copy"
+            )
 
     @property
     def heights(self) -> tuple[float, float]:
