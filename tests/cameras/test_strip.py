@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 from scipy import ndimage
-from tools.command import inside
+from tools.command import inside, unfinished_numbers
 from tools.line_strip import Strip, pattern
 
 from photoplan.cameras.base import project
@@ -93,6 +93,10 @@ def test_two_lines_of_one_flight_show_the_same_ground(tmp_path: Path) -> None:
         ("strip.toml", lambda t: t.replace("EPSG:32633", "EPSG:4326"), "is geographic"),
         ("strip.toml", lambda t: t.replace("first = ", "first = 9"), "no line of the image is oriented"),
         ("strip.toml", lambda t: t.replace("focal_mm = 100.0", "focal_mm = -100.0"), "focal_mm"),
+        ("strip.toml", lambda t: t.replace("focal_mm = 100.0", "focal_mm = 1e300"), "detectors are .* rad apart"),
+        ("strip.toml", lambda t: t.replace("line = ", "line = 1e-300 # "), "lines of 1e-300 s"),
+        ("strip.toml", lambda t: t.replace("lever_arm = [0.0", "lever_arm = [5e3"), "lever_arm"),
+        ("strip.toml", lambda t: t.replace("first = ", "first = 1e300 # "), "clock.first"),
         ("strip.toml", lambda t: t.replace('"flight.csv"', '"other.csv"'), "other.csv"),
     ],
 )
@@ -179,3 +183,16 @@ def test_detectors_are_a_table_or_polynomials(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("[detectors.forward]\n", '[detectors.forward]\ntable = "a.csv"\n'))
     with pytest.raises(InputError, match="state one of both"):
         read_line(path, "forward")
+
+
+def test_fault_30_check_of_what_sees_nothing_prints_no_nan(tmp_path: Path) -> None:
+    toml = Strip(lines=60, columns=40).write(tmp_path, 200.0)
+    toml.write_text(toml.read_text().replace("height = 200.0", "height = 9000.0"))
+    said = inside("check", toml)
+    assert (
+        said.code == 3 and "FAULT: sees nothing of the terrain\n" in said.out and "no sensible resolution" in said.out
+    )
+    assert not unfinished_numbers(said.out + said.err), said
+    toml.write_text(toml.read_text().replace("height = 9000.0", "height = 9e9"))
+    said = inside("check", toml)
+    assert said.code == 3 and "terrain.height: Z = 9e+09 m" in said.err

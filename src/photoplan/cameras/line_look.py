@@ -18,6 +18,8 @@ _DEGREE = 16
 _TOLERANCE = 1e-9
 #: Coefficients below this are left out, in columns.
 _NOTHING = 1e-11
+#: Angle between detectors below which there is no such camera.
+_FINEST = 1e-12
 #: Columns beyond either end of the line over which the curve goes on, by its width; further out it is straight.
 _ROOM = 0.05
 
@@ -49,6 +51,11 @@ class LineLook:
             raise InputError("detectors of the line have no direction; are the numbers of its lens right?")
         coefficients = chebyshev.chebfit(nodes, values, _DEGREE)
         look = cls(columns, np.asarray(coefficients, float))
+        if not look.pitch > _FINEST:
+            raise InputError(
+                f"the line's detectors are {look.pitch:.3g} rad apart, which no telescope tells; is its focal length "
+                "in millimetres?"
+            )
         # Most lenses are of low degree; what is next to nothing is not computed a million times.
         tiny = np.abs(coefficients).max(axis=1) < _NOTHING * look.pitch
         look = cls(columns, look.coefficients[: max(2, len(tiny) - int(np.argmin(tiny[::-1])))])

@@ -14,6 +14,8 @@ from photoplan.geometry.motion import Course, continuous, cubic_convolution, rot
 _Floats = NDArray[np.float64]
 #: Lines by which tables may end before the image, since large times are rounded.
 _SLACK = 1e-3
+#: No line of a camera is exposed for less or more, seconds.
+_SHORTEST, _LONGEST = 1e-8, 1e5
 #: Lines over which the mean rate at the ends is taken.
 _AVERAGED = 128
 #: Rows beyond either end of the image that have poses of their own: a part of its height, and lines.
@@ -57,6 +59,9 @@ class LineTrack:
         late = ends > self.moments[1:] + _SLACK * self.rates[:-1]
         if not ((self.rates > 0).all() and (np.diff(self.knots) > 0).all()) or late.any():
             raise InputError("the times of the image's lines do not grow from line to line")
+        odd = self.rates[(self.rates < _SHORTEST) | (self.rates > _LONGEST)]
+        if len(odd):
+            raise InputError(f"lines of {odd[0]:g} s; from {_SHORTEST:g} to {_LONGEST:g} s are taken")
         first, last = self.oriented
         if not (last > first):
             began, ended = self.time(np.array([0.0, self.lines - 1.0]))

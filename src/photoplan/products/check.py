@@ -85,13 +85,15 @@ class ProjectCheck:
         ]
         for i in self.images:
             size = f"{i.footprint[0]:.0f} × {i.footprint[1]:.0f} m"
-            lines.append(
-                f"{i.image:<{width}}  {i.tilt_deg:4.1f}°  {i.gsd:#7.3g} m  {size:>15}       {i.on_terrain:5.0%}   "
+            figures = (
+                f"{i.tilt_deg:4.1f}°  {i.gsd:#7.3g} m  {size:>15}       {i.on_terrain:5.0%}   "
                 f"{i.relief_px:7.2f} px   {i.admissible_height_error:#8.3g} m   {i.curvature_px:6.2f} px"
             )
+            lines.append(f"{i.image:<{width}}  {figures.replace('nan', '  –')}")
             lines += [f"{'':<{width}}  note: {note}" for note in i.notes]
             lines += [f"{'':<{width}}  FAULT: {i.fault}"] if i.fault else []
-        closing = [f"sensible resolution {self.sensible_resolution:g} m"]
+        known = np.isfinite(self.sensible_resolution)
+        closing = [f"sensible resolution {self.sensible_resolution:g} m" if known else "no sensible resolution"]
         if not self.implausible and self.alternative is None:
             closing.append("all plausible")
         return "\n".join([*lines, " · ".join(closing), *self.advice])
@@ -151,7 +153,7 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
     seen = footprint(camera, ground.bare, ground.bounds)
     nan = float("nan")
     if seen.bounds is None:
-        fault = fault or f"sees nothing of the terrain (tilt {tilt:.1f}°)"
+        fault = fault or "sees nothing of the terrain" + (f" (tilt {tilt:.1f}°)" if np.isfinite(tilt) else "")
         return ImageCheck(
             image=name,
             tilt_deg=tilt,

@@ -31,6 +31,14 @@ class StatedTerrain(Entry):
     sigma: NotNegative | InputName | None = None
     """Standard deviation of the heights, metres, where the file states none; or a raster of them."""
 
+    @field_validator("height")
+    @classmethod
+    def _is_height(cls, value: float | None) -> float | None:
+        odd = None if value is None else odd_place((0.0, 0.0, value), camera=True)
+        if odd is not None:
+            raise ValueError(odd)
+        return value
+
     @field_validator("file", "sigma")
     @classmethod
     def _file(cls, text: str | float | None) -> str | float | None:

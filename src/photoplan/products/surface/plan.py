@@ -206,7 +206,7 @@ def check_start(project: Project, settings: SurfaceSettings) -> None:
     number = _number(settings.start)
     if number is not None and not math.isfinite(number):
         raise UsageError(f"start {settings.start}; give `terrain`, a height in metres, or a file of heights")
-    odd = None if number is None else odd_place((0.0, 0.0, number), camera=False)
+    odd = None if number is None else odd_place((0.0, 0.0, number), camera=True)
     if odd is not None:
         raise UsageError(f"start: {odd}")
     if number is None:

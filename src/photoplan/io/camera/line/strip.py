@@ -24,7 +24,7 @@ from photoplan.geometry.rotation import ANGLE_UNITS, rotation_from_angles, rotat
 from photoplan.io.camera.line.detectors import StripDetectors, look_of
 from photoplan.io.camera.line.model import MAX_BYTES, StatedLine
 from photoplan.io.camera.line.number_table import read_numbers
-from photoplan.io.camera.model import Entry, Name, Number, Pixels, Positive, Triple
+from photoplan.io.camera.model import Entry, Name, Number, Pixels, Positive
 from photoplan.io.plain_files import read_entries, read_head
 
 _Floats = NDArray[np.float64]
@@ -37,10 +37,16 @@ _COLUMNS = "time,x,y,z,omega,phi,kappa"
 _TURNED = np.diag([1.0, -1.0, -1.0])
 
 
+#: What is further from nought is no time, no place in an aircraft, no angle.
+_Seconds = Annotated[Number, Field(ge=-1e12, le=1e12)]
+_Arm = Annotated[Number, Field(ge=-1000.0, le=1000.0)]
+_Turn = Annotated[Number, Field(ge=-360.0, le=360.0)]
+
+
 class StripClock(Entry):
     """``[clock]``: when lines were taken."""
 
-    first: Number
+    first: _Seconds
     """Middle of the exposure of the first line, in the time of the flight's record; seconds."""
     line: Positive
     """From line to line, seconds."""
@@ -56,11 +62,11 @@ class StripFlight(Entry):
     angle_unit: Literal["deg", "gon", "rad"] = "deg"
     rotation: Literal["opk", "pok", "kpo", "kop", "okp", "pko"] = "opk"
     """Order of the rotations, the primary one first; the columns stay as they are."""
-    time_offset: Number = 0.0
+    time_offset: _Seconds = 0.0
     """Added to the times of the record, seconds."""
-    lever_arm: Triple = (0.0, 0.0, 0.0)
+    lever_arm: tuple[_Arm, _Arm, _Arm] = (0.0, 0.0, 0.0)
     """From the recorded point to the projection centre, in the axes of the record, metres."""
-    boresight: Triple = (0.0, 0.0, 0.0)
+    boresight: tuple[_Turn, _Turn, _Turn] = (0.0, 0.0, 0.0)
     """ω, φ, κ from the axes of the camera to those of the record, degrees."""
 
 
