@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -238,6 +239,12 @@ class TestFault25Interrupts:
         go.touch()
         running.communicate(timeout=60)
         assert running.returncode == 0
+
+    def test_fault_25_it_ends_although_nobody_reads_what_it_says(self) -> None:
+        """Whoever had started it is gone, and with that the other end of its errors."""
+        away = "import os; r, w = os.pipe(); os.close(r); os.dup2(w, 2); "
+        code = away + "from photoplan.cli.interrupt import _end; _end()"
+        assert subprocess.run([sys.executable, "-c", code]).returncode == 130
 
 
 class TestFault13And29Outputs:

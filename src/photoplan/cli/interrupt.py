@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from types import FrameType
 
 CODE = 130
@@ -53,7 +54,8 @@ def _watch(reader: int) -> None:
 
 def _end() -> None:
     stop_children()
-    os.write(2, b"photoplan: stopped; the same command continues with the tiles that are finished\n")
+    with suppress(OSError):  # whoever read what is said may have gone before
+        os.write(2, b"photoplan: stopped; the same command continues with the tiles that are finished\n")
     os._exit(CODE)
 
 
