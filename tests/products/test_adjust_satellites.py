@@ -161,6 +161,10 @@ def test_splines_of_a_strip_are_written_and_read(tmp_path: Path) -> None:
     assert difference(path, cameras) < 0.15
     times, values = report.figures.corrections[0].over_time or (np.empty(0), np.empty(0))
     assert len(times) == len(values) > 4
+    # Angles as they are drawn: a flight to the east, rolled and pitched by waves of 0.23 degrees.
+    seconds, angles = report.figures.corrections[0].angles or (np.empty(0), np.empty((0, 3)))
+    assert len(seconds) == len(angles) > 100 and (np.diff(seconds) > 0).all()
+    assert 0.1 < np.degrees(np.abs(angles[:, :2])).max() < 0.4 and np.degrees(np.abs(angles[:, 2])).max() < 0.4
     assert load_project(path).any_image("forward").geometry_files(lambda name: tmp_path / name)[-1].exists()
 
 

@@ -114,6 +114,7 @@ def facts(name: str = "p") -> AdjustFigures:
                 seconds=np.arange(9.0),
                 residuals=np.zeros((9, 2)),
                 over_time=(np.arange(5.0), np.full((5, 6), 1e-4)),
+                angles=(np.arange(5.0), np.full((5, 3), 1e-2)),
             ),
         ),
         ground=ground,
@@ -176,7 +177,7 @@ def test_it_holds_everything_and_reaches_for_nothing() -> None:
     document = adjust_page(facts())
     page = Page(document)
     assert all(address and address.startswith("data:image/png;base64,") for address in page.addresses)
-    assert page.tags.count("img") == 7
+    assert page.tags.count("img") == 8
     words = " ".join(page.words)
     for said in ("1.020", "RMSE_H", "ASPRS", "Edition 2 (2023)", "4 check points; the standard asks for at least 30"):
         assert said in words, said
@@ -200,7 +201,7 @@ def test_fault_11_hostile_names_are_shown_and_not_obeyed() -> None:
     document = adjust_page(facts(HOSTILE))
     page = Page(document)
     assert "script" not in page.tags
-    assert page.tags.count("img") == 7
+    assert page.tags.count("img") == 8
     assert "\u202e" not in document
     assert any("<script>" in words for words in page.words)
     assert re.search(r"default-src 'none'", document)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,7 +128,13 @@ class CorrectableLine:
 
     def camera(self, values: Mapping[str, _Floats]) -> Camera:
         """See `Correctable`."""
-        return replace(self.plain, track=self.correction(values).track(self.plain.track))
+        track = self.correction(values).track(self.plain.track)
+        # Calm flights are as smooth between the lines as the record; poses of all lines would be made at every step.
+        return replace(self.plain, track=track if self._shaken else replace(track, per_line=False))
+
+    @cached_property
+    def _shaken(self) -> bool:
+        return self.plain.breaks is not None
 
     def by_corrections(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> Mapping[str, ByCorrections]:
         """See `Correctable`; whatever moves the camera moves the ground the other way."""

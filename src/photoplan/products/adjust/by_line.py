@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.cameras.line_correctable import CorrectableLine, TrackPriors
-from photoplan.cameras.line_correction import LineCorrection
+from photoplan.cameras.line_correction import TURNED, LineCorrection, map_axes
+from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.camera.line.correction import line_correction_text, read_line_correction
 from photoplan.io.project.line import LineImage
 from photoplan.io.project.model import Project, StripAdjustment
@@ -18,6 +20,9 @@ from photoplan.products.adjust.geometry import FoundCorrection, FoundParameter, 
 from photoplan.project.by_line import line_camera
 from photoplan.project.ground import Ground
 
+_Floats = NDArray[np.float64]
+#: Lines at which angles are drawn, at most.
+_DRAWN = 3000
 _UNITS = np.repeat([180.0 / np.pi, 1.0, 1.0], [3, 3, 1])
 _CALLED = [*(f"{what} {axis}" for what in ("boresight", "lever arm") for axis in "xyz"), "time offset"]
 
@@ -65,7 +70,17 @@ def _found(image: CorrectableLine, sets: Mapping[str, AdjustedCorrections]) -> F
         sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
         over_time = correction.spline.times, correction.spline.coefficients
     text = line_correction_text(correction, covariance, sigma)
-    return FoundCorrection({}, parameters, text, over_time, image.plain.track.time)
+    return FoundCorrection({}, parameters, text, over_time, image.plain.track.time, _angles(image, correction))
+
+
+def _angles(image: CorrectableLine, correction: LineCorrection) -> tuple[_Floats, _Floats]:
+    """Times and ω, φ, κ of the camera at lines spread over the image, against east, north and up in its middle."""
+    track = correction.track(image.plain.track)
+    first, last = track.oriented
+    rows = np.unique(np.linspace(np.ceil(first), np.floor(last), _DRAWN).round())
+    rows = rows[track.is_oriented(rows)]
+    R = track(rows)[1] @ TURNED
+    return track.time(rows), np.stack([angles_from_rotation(each) for each in map_axes(track).T @ R])
 
 
 def _output(name: str) -> str:

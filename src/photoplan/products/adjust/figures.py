@@ -57,6 +57,8 @@ class CorrectionFigures:
     """Of these, (k, 2), pixels."""
     over_time: tuple[_Floats, _Floats] | None
     """Times and corrections that change with them: metres, radians."""
+    angles: tuple[_Floats, _Floats] | None = None
+    """Times, and ω, φ, κ of the adjusted trajectory, radians."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,6 +40,8 @@ class FoundCorrection:
     """Times (k,) in seconds and corrections (k, 6) that change with them: metres, radians."""
     seconds: Callable[[_Floats], _Floats] | None = None
     """Times of rows (n,), where residuals are worth a look over time."""
+    angles: tuple[_Floats, _Floats] | None = None
+    """Times (k,) in seconds, and ω, φ, κ of the adjusted trajectory (k, 3), radians."""
 
 
 @dataclass(frozen=True)

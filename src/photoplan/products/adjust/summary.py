@@ -227,6 +227,7 @@ def _corrections(result: MapResult, used: NDArray[np.bool_]) -> tuple[Correction
                 seconds=np.empty(0) if found.seconds is None else found.seconds(points.xy[mine, 1]),
                 residuals=r if timed else np.empty((0, 2)),
                 over_time=found.over_time,
+                angles=found.angles,
             )
         )
     return tuple(out)

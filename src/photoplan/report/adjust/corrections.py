@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.products.adjust.figures import CorrectionFigures
 from photoplan.report.adjust.tables import Row, cell, number, paragraph, plain
@@ -38,7 +39,27 @@ def correction_parts(corrections: tuple[CorrectionFigures, ...]) -> list[str]:
                     "A wave that is left in the residuals asks for knots that are closer together.",
                 )
             )
+        if image.angles is not None:
+            parts.append(
+                figure(
+                    _angles_of(image.angles),
+                    f"{image.name}: angles of the flight",
+                    "Angles of the camera at the moments of its lines, as adjusted (Schlüter 2001, fig. 4b). Lines "
+                    "that are shaken have angles of their own.",
+                )
+            )
     return parts
+
+
+@styled
+def _angles_of(angles: tuple[NDArray[np.float64], NDArray[np.float64]]) -> bytes:
+    fig = figure_of(7.2, 4.6)
+    panels = fig.subplots(3, 1, sharex=True)
+    for axes, name, colour, values in zip(panels, ("ω °", "φ °", "κ °"), (BLUE, GREEN, RED), angles[1].T):
+        axes.plot(angles[0], np.degrees(np.unwrap(values)), color=colour, linewidth=0.8)
+        axes.set_ylabel(name)
+    panels[-1].set_xlabel("seconds of the flight")
+    return png(fig)
 
 
 @styled
