@@ -99,7 +99,7 @@ def test_standard_deviations_hold_whatever_the_ground_is_like(kind: str) -> None
         return out
 
     signs = rng.choice((-1.0, 1.0), size=(3, *inside.shape))
-    smoother = Smoother(solve, noise, inside, np.ones(inside.shape), signs)
+    smoother = Smoother(solve, noise, inside, signs)
     for _ in range(8):
         (heights,) = solve([seen / sigma**2])
         rough = rough.estimated(heights, smoother)

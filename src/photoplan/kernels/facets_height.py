@@ -53,8 +53,8 @@ def signs_at(col, row, out):
 
 @kernel
 def add_heights(
-    first, places, grey, weights, values, ratio, means, trust, sigma, limit, system, right, noise, residuals,
-    factors, sums, telling,
+    first, places, grey, weights, values, ratio, means, sigma, limit, system, right, noise, residuals,
+    factors, sums,
 ):  # fmt: skip
     """Add the equations of an image to the normal equations of the heights; residuals and robust factors.
 
@@ -68,8 +68,6 @@ def add_heights(
         Coefficients of the grey facets, and how many lie along a side of a height facet.
     means : ndarray, shape (rows − 1, columns − 1, 2)
         Mean change of place with height of the pixels of all images in a facet.
-    trust : ndarray, shape (rows − 1, columns − 1)
-        Part of the sensitivities in a facet that is texture, not noise: a factor of the weights.
     sigma, limit : float
         Standard deviation of the grey values, and the multiple of it from which weights fall (Huber 1964).
     system : ndarray, shape (7, rows, columns); right, noise : ndarray, shape (rows, columns)
@@ -78,8 +76,6 @@ def add_heights(
         Grey value of the surface less that of the pixel (NaN: no pixel), and the robust factor of its weight.
     sums : ndarray, shape (3,)
         Added: Σ f, Σ f (v/σ)², pixels.
-    telling : ndarray, shape (rows − 1, columns − 1, 2)
-        Added, by facet: Σ p a², and Σ p |k − k̄|², with k the change of place in grey facets per metre.
     """
     x, y, dx, dy, found = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(3)
     phi = np.empty(4)
@@ -99,11 +95,7 @@ def add_heights(
             sums[1] += factor * size * size
             sums[2] += 1.0
             i, j = min(int(u), means.shape[1] - 1), min(int(v), means.shape[0] - 1)
-            ku, kv = ratio * (places[r, c, 2] - means[j, i, 0]), ratio * (places[r, c, 3] - means[j, i, 1])
-            a = found[1] * ku + found[2] * kv
-            telling[j, i, 0] += p * a * a
-            telling[j, i, 1] += p * (ku * ku + kv * kv)
-            p *= trust[j, i]
+            a = ratio * (found[1] * (places[r, c, 2] - means[j, i, 0]) + found[2] * (places[r, c, 3] - means[j, i, 1]))
             f, g = u - i, v - j
             phi[0], phi[1], phi[2], phi[3] = (1 - f) * (1 - g), f * (1 - g), (1 - f) * g, f * g
             pa = p * a

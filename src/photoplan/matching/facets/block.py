@@ -43,9 +43,6 @@ _SIDE, _MARGIN = 24, 8
 _BORDER = 6
 #: Times by which curvatures weigh more to see what they take away.
 _STIFFER = 1.2
-#: Variance of the slopes of grey values over that of grey values, both of noise, per grey facet (of cubic facets 3.4,
-#: and more, since estimates vary); facets around which texture is judged; the least part of a sensitivity that counts.
-_SLOPES, _AROUND, _LEAST_TRUST = 4.0, 7, 1e-6
 #: Least standard deviation of grey values, parts of the contrast: images without noise have residuals of rounding.
 _QUIET = 1e-4
 
@@ -82,8 +79,6 @@ class Block:
     """Of each view: Σ of robust factors times squared residuals in its own grey values; redundancy."""
     ways: _Doubles = field(default_factory=lambda: np.empty((0, 0, 2)))
     """Mean change of the pixels' places with height in each facet, posts per metre, (rows − 1, columns − 1, 2)."""
-    trust: _Doubles = field(default_factory=lambda: np.empty((0, 0)))
-    """Part of the sensitivities to height in each facet that is texture, not noise, (rows − 1, columns − 1)."""
     _factors: list[_Floats] = field(default_factory=list)
     _pull: tuple[_Doubles, _Doubles] = (np.empty((0, 0)), np.empty((0, 0)))
     """Heights where the last equations were set up, and their right-hand side, of the pixels alone."""
@@ -155,7 +150,7 @@ class Block:
         inside = np.zeros(self.facets.shape, bool)
         inner = (slice(_BORDER, -_BORDER),) * 2
         inside[inner] = (self.counted > 1)[inner]
-        return Smoother(lambda rights: self._solved(*rights), self.noise, inside, self._trust_at_posts(), self._signs)
+        return Smoother(lambda rights: self._solved(*rights), self.noise, inside, self._signs)
 
     @cached_property
     def _signs(self) -> _Doubles:
@@ -164,10 +159,6 @@ class Block:
         out = np.empty((3, *self.facets.shape))
         signs_at(left, top, out)
         return out
-
-    def _trust_at_posts(self) -> _Doubles:
-        padded = np.pad(self.trust, 1, mode="edge")
-        return (padded[1:, 1:] + padded[:-1, 1:] + padded[1:, :-1] + padded[:-1, :-1]) / 4
 
     def _equations(self, stiffer: float = 1.0) -> _Doubles:
         """Normal equations of pixels and curvatures."""
@@ -258,32 +249,17 @@ class Block:
         self.noise = np.zeros((rows, columns))
         counted = np.zeros((rows, columns), np.uint8)
         found, residuals = np.zeros((len(self.sights), 3)), np.empty(0)
-        if not self.trust.size:
-            self.trust = np.ones((rows - 1, columns - 1))
-        telling = np.zeros((rows - 1, columns - 1, 2))
         for n, (sight, g, w) in enumerate(zip(self.sights, grey, weights)):
             residuals = np.empty(g.shape, np.float32)
             before = self.system[0].copy()
             add_heights(
-                sight.first, sight.places, g, w, self.values, self.facets.ratio, self.ways, self.trust,
-                self.sigmas[n], _LIMIT, self.system, right, self.noise, residuals, self._factors[n], found[n], telling,
+                sight.first, sight.places, g, w, self.values, self.facets.ratio, self.ways,
+                self.sigmas[n], _LIMIT, self.system, right, self.noise, residuals, self._factors[n], found[n],
             )  # fmt: skip
             counted += self.system[0] > before
         self.counted = counted
-        self.trust = self._texture(telling, sums[..., 0])
         self._weigh(found, int((density > 0).sum()))
         return right
-
-    def _texture(self, telling: _Doubles, weights: _Doubles) -> _Doubles:
-        """The part of the squared sensitivities that is not what noise alone makes of the slopes of the grey values.
-
-        Grey values that are known with the variance 1/density have slopes with `_SLOPES` times that; without this,
-        ground without any texture would claim to know heights.
-        """
-        density = means_around(weights, _AROUND) / self.facets.ratio**2
-        noise = _SLOPES * means_around(telling[..., 1], _AROUND) / np.maximum(density, 1e-30)
-        whole = np.maximum(means_around(telling[..., 0], _AROUND), 1e-30)
-        return np.clip(1 - noise / whole, _LEAST_TRUST, 1.0)
 
     def _weigh(self, found: _Doubles, unknowns: int) -> None:
         """Standard deviations of the views' grey values, by variance components (Förstner 1979)."""

@@ -40,8 +40,6 @@ class Smoother:
     """A right-hand side of errors of the pixels, shape (rows, columns)."""
     inside: NDArray[np.bool_]
     """Posts that tell: seen by some images, and away from the border."""
-    texture: _Doubles
-    """Part of what pixels say of a post that is texture, not noise, 0 to 1, shape (rows, columns)."""
     signs: _Doubles
     """Of the curvatures that are drawn, 1 or −1, shape (3, rows, columns)."""
 
@@ -91,8 +89,7 @@ class Roughness:
         # In parts of what is usual at a place, all places count alike.
         change = mean((weighed - noise) / usual, _SHARED) / np.maximum(mean(drawn / usual, _SHARED), 1e-30)
         # Of smooth terrain it falls with the 2.5th power of the variance: whole steps would not settle.
-        # Where there is no texture nothing is learnt: that nothing moves does not say that ground is smooth.
-        squares = self.squares * np.clip(change, 1 / _MOST, _MOST) ** (0.5 * mean(smoother.texture, _SHARED))
+        squares = self.squares * np.sqrt(np.clip(change, 1 / _MOST, _MOST))
         single = curvatures(heights) ** 2 / squares
         return Roughness(squares, np.where(self.factors > 0, (_FREEDOM + 1) / (_FREEDOM + single), 0.0))
 
