@@ -45,30 +45,30 @@ def findings(
         listed = ", ".join(f"{name} {known[name]:.3g} ({others[name]:.3g})" for name in alone[:6])
         lines.append(
             f"sigma0 of {listed} is far above that of the other images (in brackets): its orientation is wrong, or it "
-            "shows something else. `photoplan tie` and `photoplan adjust` orient anew; `--images` leaves it out"
+            "shows something else. `photoplan tie` and `photoplan adjust` orient anew; `images` leaves it out"
         )
     elif contrast > 0 and usual > _NOISY * contrast:
         lines.append(
             f"sigma0 is {usual / contrast:.0%} of the contrast of the ground: images do not show the same, or no "
             "texture. Orientations are wrong (`photoplan tie`, `photoplan adjust`), or the start was too far away "
-            "(`--start`, `--reach`)"
+            "(`start`, `reach`)"
         )
     if misfit_share > _MISFITS:
         lines.append(
             f"{misfit_share:.1%} of the heights fit badly: see {plan.settings.name}_fit.tif. They lie at edges and "
-            "moving things, or in regions that went wrong; `--reach` and a better `--start` help these"
+            "moving things, or in regions that went wrong; `reach` and a better `start` help these"
         )
     if astray > _ASTRAY:
         lines.append(
             f"{astray:.1%} of the posts have no height since it would lie farther from the start than 1.5 times "
-            "`--reach`: give a larger one if the start is that wrong; if not, the images contradict the start there"
+            "`reach`: give a larger one if the start is that wrong; if not, the images contradict the start there"
         )
     if correction > _MOVING:
-        lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; `--resolution` helps")
+        lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; `resolution` helps")
     if sigma_px is not None and sigma_px > _VAGUE:
         lines.append(
             f"the mean standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "
             "images do not determine follows its surroundings; mask it by the standard deviations, or choose a coarser "
-            "`--resolution`"
+            "`resolution`"
         )
     return tuple(lines)

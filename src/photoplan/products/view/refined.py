@@ -103,7 +103,7 @@ def _of_image(camera: ViewCamera, ground: ViewGround, turn: _Floats) -> _Floats:
 
 
 def _camera_text(request: CameraRequest, after: _Floats) -> str:
-    """A file for `--camera`."""
+    """A file that is taken in place of an image as the camera of a view."""
     names = ("azimuth", "pitch", "roll", "field_of_view")
     values: dict[str, Any] = dict(zip(names, (round(float(v), 7) for v in after)))
     found = replace(request, **values)
