@@ -176,6 +176,7 @@ def test_fault_23_lines_in_a_gap_of_the_record_are_not_made_up(tmp_path: Path, s
     assert (seen < 80).mean() > 0.3 and (seen > 119).mean() > 0.2
 
 
+@pytest.mark.slow
 def test_fault_24_sixteen_bits_and_floats_of_a_strip_keep_their_type(tmp_path: Path) -> None:
     strip = ShakenStrip(columns=60, lines=100, vibration=(1.0, 0.3, 0.0), events=(0.0, 0.0, 0.0))
     for dtype, value in (("uint16", 40_000), ("float32", -1234.5)):

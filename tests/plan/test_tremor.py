@@ -39,11 +39,11 @@ def planned(camera: LineCamera, tolerance: float) -> tuple[Anchors, np.ndarray, 
     return anchors, ground, relief
 
 
-@pytest.mark.parametrize("tolerance", [0.02, 0.2])
+@pytest.mark.parametrize("tolerance", [0.02, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_the_reported_residual_holds_everywhere(camera: LineCamera, tolerance: float) -> None:
     """Wherever a point is seen once and passes the line at a fifth of its pace or faster; a cell or two suffice."""
     anchors, ground, relief = planned(camera, tolerance)
-    part = (slice(1, None, 3), slice(0, None, 4))
+    part = (slice(1, None, 5), slice(0, None, 6))
     truth = project(camera, ground[part])
     w = anchors.source_window
     found = positions(anchors.arrays, relief).astype(float)[part] + np.array([w.col, w.row])
@@ -52,7 +52,7 @@ def test_the_reported_residual_holds_everywhere(camera: LineCamera, tolerance: f
     inside = ((truth >= -0.5) & (truth <= np.array(camera.size) - 0.5)).all(axis=-1)
     pace = np.abs(np.linalg.det(camera.derivatives(ground[part])[..., :2])) * 0.09
     counted = once & inside & (pace < 5.0)
-    assert counted.mean() > 0.5 and (inside & ~once).sum() > 20
+    assert counted.mean() > 0.5 and (inside & ~once).sum() > 8
     assert np.isfinite(found[inside]).mean() > 0.998
     miss = np.hypot(*np.moveaxis(found - truth, -1, 0))
     true = f"{miss[counted].max():.3f} px true, median {np.median(miss[counted]):.4f}"

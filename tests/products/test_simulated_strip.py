@@ -28,7 +28,7 @@ def test_each_pixel_shows_what_its_line_sees(tmp_path: Path) -> None:
     image = 'name = "a"\nfile = "a.tif"\nline = "strip.toml"\ndetectors = "nadir"\nsize = [90, 160]\n'
     ground = '[terrain]\nfile = "dtm.tif"\nheight_system = "ellipsoidal"\n'
     path.write_text(f'format = 1\ncrs = "{strip.crs}"\n{ground}[[images]]\n{image}')
-    said = inside("simulate", "--scene", path, "--truth", "--grain", 6.0)
+    said = inside("simulate", "--scene", path, "--truth", "--grain", 6.0, "--oversampling", 1)
     assert said.code == 0, said.err
     with rasterio.open(tmp_path / "rendered" / "a_truth.tif") as file:
         truth = file.read().astype(float) + np.array(file.offsets)[:, None, None]
