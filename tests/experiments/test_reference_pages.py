@@ -71,10 +71,10 @@ def test_options_of_a_verb(verb):
     told, elsewhere = long_options(section_of(verb)), {"run": {"--plan"}}.get(verb, set())
     # Of a mosaic only those are listed that an orthophoto does not have, of an object those that a mosaic has not.
     same = {
-        "mosaic": options_of("ortho") - {"--true", "--ground", "--method", "--fill"},
+        "mosaic": options_of("ortho") - {"--true", "--ground", "--method", "--fill", "--stack"},
         "object": options_of("mosaic") - {"--name", "--seams", "--feather", "--blend", "--sheets"},
     }.get(verb, set())
-    others = {"--true", "--name", "--seams", "--feather", "--blend", "--sheets"} if same else set()
+    others = {"--true", "--stack", "--name", "--seams", "--feather", "--blend", "--sheets"} if same else set()
     assert (told - elsewhere - (others - options_of(verb))) | same == options_of(verb)
 
 
