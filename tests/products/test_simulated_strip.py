@@ -15,7 +15,7 @@ from photoplan.io.camera.line.file import read_line
 
 def test_each_pixel_shows_what_its_line_sees(tmp_path: Path) -> None:
     """Terrain with a slope and a step: truth of every pixel to 0.01 px; its colours are those of the place."""
-    strip = ShakenStrip(columns=90, lines=160, vibration=(2.0, 0.8, 0.3), events=(10.0, 12.0, 4.0), event_lines=20.0)
+    strip = ShakenStrip(columns=48, lines=90, vibration=(2.0, 0.8, 0.3), events=(10.0, 12.0, 4.0), event_lines=20.0)
     strip.strip_file(tmp_path)
     y, x = np.mgrid[:400, :400]
     terrain = (300.0 + 0.1 * x + np.where(y > 200, 15.0, 0.0)).astype(np.float32)
@@ -25,7 +25,7 @@ def test_each_pixel_shows_what_its_line_sees(tmp_path: Path) -> None:
     ) as file:
         file.write(terrain, 1)
     path = tmp_path / "project.toml"
-    image = 'name = "a"\nfile = "a.tif"\nline = "strip.toml"\ndetectors = "nadir"\nsize = [90, 160]\n'
+    image = 'name = "a"\nfile = "a.tif"\nline = "strip.toml"\ndetectors = "nadir"\nsize = [48, 90]\n'
     ground = '[terrain]\nfile = "dtm.tif"\nheight_system = "ellipsoidal"\n'
     path.write_text(f'format = 1\ncrs = "{strip.crs}"\n{ground}[[images]]\n{image}')
     said = inside("simulate", "--scene", path, "--truth", "--grain", 6.0, "--oversampling", 1)
@@ -33,23 +33,24 @@ def test_each_pixel_shows_what_its_line_sees(tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "rendered" / "a_truth.tif") as file:
         truth = file.read().astype(float) + np.array(file.offsets)[:, None, None]
     camera = read_line(tmp_path / "strip.toml", "nadir").camera(strip.crs, "ellipsoidal")
-    v, u = np.mgrid[:160, :90].astype(float)
+    v, u = np.mgrid[:90, :48].astype(float)
     XYZ = np.moveaxis(truth[:3], 0, -1)
     assert np.isfinite(XYZ).mean() > 0.99
     # By rays that were drawn without this code, at the heights that were met.
-    S, R = strip.pose((np.arange(160) - 80) * strip.line_time)
-    P = camera.ground(XYZ.reshape(-1, 3)).reshape(160, 90, 3)
+    S, R = strip.pose((np.arange(90) - 45) * strip.line_time)
+    P = camera.ground(XYZ.reshape(-1, 3)).reshape(90, 48, 3)
     d = np.einsum("nij,nci->ncj", R, P - S[:, None])
     y_mm = d[..., 1] / d[..., 2] * strip.focal
-    column = (np.arange(90) + 0.5 - 45) * strip.pitch
+    column = (np.arange(48) + 0.5 - 24) * strip.pitch
     away = np.hypot(y_mm - column * (1 - 2e-5 * column**2), d[..., 0] / d[..., 2] * strip.focal) / strip.pitch
     print(f"\nworst {np.nanmax(away):.4f} px")
     assert np.nanmax(away) < 0.01
-    once = np.bincount(camera.moments(XYZ.reshape(-1, 3)).point, minlength=14_400).reshape(160, 90) == 1
-    again = np.abs(projected(camera, XYZ) - np.stack([u, v], axis=-1)).max(axis=-1)
-    assert np.nanmedian(again[once]) < 0.01 and once.mean() > 0.3
+    some = (slice(2, None, 4), slice(1, None, 4))
+    count = np.bincount(camera.moments(XYZ[some]).point, minlength=XYZ[some][..., 0].size)
+    again = np.abs(projected(camera, XYZ[some]) - np.stack([u, v], axis=-1)[some]).max(axis=-1).ravel()
+    assert np.nanmedian(again[count == 1]) < 0.01 and (count == 1).mean() > 0.3
     with rasterio.open(tmp_path / "rendered" / "a.tif") as file:
-        assert file.shape == (160, 90) and file.read().std() > 5
+        assert file.shape == (90, 48) and file.read().std() > 5
 
 
 def test_what_has_no_size_is_told(tmp_path: Path) -> None:
