@@ -1,8 +1,8 @@
 """Views by profiles, as Herzner (1988) and Ecker (1991) make them: how many profiles and cuts they take.
 
 A vertical plane through the point of view is a line in the picture through the vertical vanishing point. A profile of
-the terrain in it gives the ground of all pixels along that line, at its cuts with rows or columns of the picture: each cut
-sets the pixel next to it, at most half a pixel beside its ray.
+the terrain in it gives the ground of all pixels along that line, at its cuts with rows or columns of the picture: each
+cut sets the pixel next to it, at most half a pixel beside its ray.
 """
 
 from __future__ import annotations
