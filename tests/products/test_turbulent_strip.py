@@ -50,7 +50,8 @@ def test_check_and_the_record_tell_how_turbulent_a_flight_is(tmp_path: Path) -> 
     assert found is not None, words
     assert 5 < float(found[1]) < 25 and 5 < float(found[2]) < 40 and 10 < float(found[3]) < 90
     assert "the first moment counts" in words
-    product = inside("ortho", path, "--resolution", 0.3, "--no-quicklook").out.split()[0]
+    product = inside("ortho", path, "--resolution", 0.3, "--no-quicklook", "--stack", "all").out.split()[0]
+    assert (Path(product).parent / "all.vrt").exists()
     record = json.loads(Path(product).with_suffix(".run.json").read_text())
     assert record["images"][0]["tremor"] in words
     with rasterio.open(product) as file:

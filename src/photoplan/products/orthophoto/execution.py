@@ -37,6 +37,7 @@ from photoplan.products.orthophoto.finished import (
 )
 from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, known_errors, painting
+from photoplan.products.orthophoto.stack import stack_index, write_stack
 from photoplan.products.run import Run, clock, refuse_inputs
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files
@@ -86,7 +87,7 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     if in_sheets:
         # Shapely and vector files: a quarter of the start, and only here.
         from photoplan.products.orthophoto.sheets import sheet_index, write_index  # noqa: PLC0415
-    index = sheet_index(plan, folder) if in_sheets else []
+    index = sheet_index(plan, folder) if in_sheets else stack_index(plan, folder)
     refuse_inputs(input_files(plan.project), index[:1])
     for path in index:
         refuse_foreign_virtual(path)
@@ -104,7 +105,7 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     if picture is not None:
         write_overview([r.path for r in results if not r.failed], picture)
     for path in index:
-        write_index(plan, path, [r for r in results if not r.failed])
+        (write_index if in_sheets else write_stack)(plan, path, [r for r in results if not r.failed])
     failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]
     if failed:
         raise TilesFailed(

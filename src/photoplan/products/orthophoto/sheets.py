@@ -18,7 +18,7 @@ from photoplan.io.names import safe_stem
 from photoplan.io.naming import write_atomically
 from photoplan.io.polygons import read_features
 from photoplan.io.regions import Regions
-from photoplan.io.virtual import write_stacked, write_virtual
+from photoplan.io.virtual import write_virtual
 from photoplan.products.orthophoto.finished import ProductResult
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
 
@@ -105,20 +105,14 @@ def sheets_of(grid: MapGrid, size: float) -> list[Sheet]:
 
 
 def sheet_index(plan: OrthoPlan, folder: Path) -> list[Path]:
-    """The file that shows all sheets as one, or orthophotos as bands; none where neither is asked for."""
+    """The file that shows all sheets as one; none where there are no sheets."""
     choice = plan.settings.choice
-    if plan.settings.stack:
-        return [folder / f"{safe_stem(plan.settings.stack)}.vrt"]
     return [] if choice is None or choice.sheets is None else [folder / f"{safe_stem(choice.name)}.vrt"]
 
 
 def write_index(plan: OrthoPlan, path: Path, results: Sequence[ProductResult]) -> None:
-    """A STAC item beside each sheet that is there, and a VRT of them all; or of orthophotos as bands."""
+    """A STAC item beside each sheet that is there, and a VRT of them all."""
     products = {product.plan.name: product for product in plan.products}
-    if plan.settings.stack:
-        if results:
-            write_stacked(path, {products[result.path.stem].images[0]: result.path for result in results})
-        return
     for result in results:
         item = _item(products[result.path.stem], result)
         write_atomically(result.path.with_suffix(".stac.json"), item.encode())
