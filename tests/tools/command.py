@@ -22,7 +22,7 @@ import pytest
 
 from photoplan.cli.main import photoplan, run
 
-COMMAND = (sys.executable, "-m", "photoplan.cli.main")
+COMMAND = (sys.executable, "-m", "photoplan")
 OPTIONS = ("--resolution", "1", "--tile", "128")
 """Of `photoplan ortho` for the small block: twenty tiles."""
 SABOTEUR = Path(__file__).parent / "saboteur"
