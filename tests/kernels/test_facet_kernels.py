@@ -103,7 +103,7 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
     noise = np.zeros((3, 4))
     residuals, factors, sums = np.empty((14, 16), np.float32), np.ones((14, 16), np.float32), np.zeros(3)
     facets_height.add_heights(
-        places, seen, weights, values, 2, means, 8.0, 2.0, system, right, noise, residuals, factors, sums
+        (0, 0), places, seen, weights, values, 2, means, 8.0, 2.0, system, right, noise, residuals, factors, sums
     )
     misfit = (A @ values.reshape(-1)).reshape(14, 16) - seen
     used = weights > 0
