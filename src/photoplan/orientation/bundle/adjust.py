@@ -64,6 +64,8 @@ _ROUNDS, _COMPONENTS = 8, 6
 #: Whole steps that may make things worse for once: a block that turns as a whole cannot avoid it, since the step is
 #: straight and its way is not. What they led to counts only if it is better in the end.
 _PATIENCE = 4
+#: Steps within which it has to be better.
+_AWAY = 8
 #: Damping (part of the diagonal) after a step that made things worse, and when to give up.
 _FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
 
@@ -255,18 +257,23 @@ class _Loop:
             base = base * softened(model, state)
         damping, cost = 0.0, np.inf
         patience, best, least, gains = _PATIENCE, state, np.inf, [np.inf] * _FLAT_STEPS
+        due, away = False, 0
         for turn in range(self._most):
             e = whitened(model, residuals_of(model, state))
             weight = base * robust_weights(model, e * np.sqrt(base), turn) if robust else base
             weight = np.where(np.isfinite(e), weight, 0.0)
             before = _cost(e, weight)
+            away += 1
             if before <= least:
-                best, least = state, before
-            elif patience == 0 and not robust:
+                best, least, away = state, before, 0
+            elif (patience == 0 or away > _AWAY) and patience >= 0 and not robust:
                 state, patience, damping = best, -1, _FIRST_DAMPING
                 continue
             rows, _ = linearise(model, state, np.sqrt(weight))
-            if self._watch and turn % _LOOK == _LOOK - 1:
+            due |= self._watch and turn % _LOOK == _LOOK - 1
+            # Not in the middle of steps that made things worse: rays are parallel there that are not.
+            if due and state is best:
+                due = False
                 self._loose = loose_points(model, state, rows)
                 if self._loose:
                     return state

@@ -14,16 +14,26 @@ _Floats = NDArray[np.float64]
 
 #: Standard deviation of a point along its rays, as part of its distance, above which the rays count as parallel.
 PARALLEL = 0.25
+#: Part of its longest ray below which another ray of a point is too short: the point has come into that projection
+#: centre, where it is on the image's ray whatever was measured.
+INSIDE = 1e-3
 #: By how much a step may stretch the distance of a point at most.
 _STRETCH = 100.0
 
 
 def loose_points(model: Model, state: State, rows: Rows) -> frozenset[str]:
-    """Points whose rays are parallel within their accuracy, by name; control that holds a point counts as well."""
+    """Points whose distance their rays do not tell, by name; control that holds a point counts as well.
+
+    Rays are parallel within their accuracy; or they have brought the point into a projection centre.
+    """
     inverse = reduce_normals(rows, len(model.point_names)).V_inverse
     away = np.linalg.norm(state.XYZ - _middles(model, state), axis=1)
     rays = np.bincount(model.point, minlength=len(away))
     far = (np.linalg.eigvalsh(inverse)[:, 2] > (PARALLEL * away) ** 2) & (rays >= 2)
+    length = np.linalg.norm(state.XYZ[model.point] - model.origins(state.images.centers), axis=1)
+    longest = np.zeros(len(away))
+    np.maximum.at(longest, model.point, length)
+    far[model.point[length < INSIDE * longest[model.point]]] = True
     return frozenset(model.point_names[k] for k in np.flatnonzero(far))
 
 
