@@ -52,6 +52,7 @@ def notes(said: Said) -> str:
     return " ".join(json.loads(said.out)["notes"])
 
 
+@pytest.mark.slow
 def test_an_orientation_that_is_wrong_by_five_pixels_is_named(project: Path) -> None:
     """Across the flight, where no height makes up for it; along it the image contradicts the two others."""
     change(project.parent / "rendered" / "i3.tif", lambda pixels: np.roll(pixels, 5, axis=1))

@@ -55,6 +55,7 @@ def test_without_any_orientation_all_images_hang_together_and_points_fit(free) -
     assert within(residuals, 3.0) >= 0.95  # measured: 0.999
 
 
+@pytest.mark.slow
 def test_approximate_orientation_guides(project: Path) -> None:
     report, points, residuals = ties(project)
     assert report.chosen.startswith("pairs with common ground") and report.unconnected == ()
