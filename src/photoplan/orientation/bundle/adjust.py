@@ -64,7 +64,7 @@ _ROUNDS, _COMPONENTS = 8, 6
 #: Whole steps that may make things worse for once: a block that turns as a whole cannot avoid it, since the step is
 #: straight and its way is not. What they led to counts only if it is better in the end.
 _PATIENCE = 4
-#: Steps within which it has to be better.
+#: Steps within which it has to be better, else the best state is taken up again, with damped steps alone.
 _AWAY = 8
 #: Damping (part of the diagonal) after a step that made things worse, and when to give up.
 _FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
@@ -302,10 +302,11 @@ class _Loop:
             variance = after / max(1.0, float((weight > 0).sum()) - model.columns.count - 3 * len(model.point_names))
             gains = [*gains[1:], abs(before - after) / max(variance, 1e-300)]
             # A damped step is short for that reason alone, unless rounding is all that is left.
-            if not robust and ((damping == 0.0 and (largest < _CONVERGED or settled)) or largest < _ROUNDING):
-                return state
-            if max(gains) < _FLAT and not robust:
-                return state
+            ended = (damping == 0.0 and (largest < _CONVERGED or settled)) or largest < _ROUNDING or max(gains) < _FLAT
+            if ended and not robust:
+                if after <= least * (1.0 + 1e-9) + 1e-12 or patience < 0:
+                    return state
+                away = _AWAY
             if robust and turn >= _LEAST and largest < _ROUGHLY:
                 return state
             cost = after
