@@ -9,6 +9,7 @@ import numpy as np
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.crs import CrsStep, crs_step, require_projected_metres, same_crs
+from photoplan.io.terrain.known_ranges import KnownRanges
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.reader import TerrainReader
 from photoplan.surfaces.height_errors import HeightErrors, ModelHeightErrors
@@ -125,7 +126,7 @@ def _open_raster(path: Path, crs: str | None, option: str) -> OpenTerrain:
         raise InputError(f"{path}: the grid is rotated or not north-up; bring it north-up with gdalwarp first")
     columns, rows = info.size
     bounds = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
-    surface = RasterSurface(reader, (x0, y0), (xx, -yy), part=reader.block)
+    surface = RasterSurface(reader, (x0, y0), (xx, -yy), part=reader.block, store=KnownRanges.of(reader))
     return OpenTerrain(
         path=info.path,
         surface=surface,

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.extent import height_ranges
 from photoplan.kernels.sample_grid import sample_lattice, sample_points
 from photoplan.surfaces.carried import box_points, carried_positions
+from photoplan.surfaces.grid_ranges import GridRanges, HeightGrid, RangeStore
 from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.rays import Cache, Hits, Part, carried_hits
 from photoplan.targets.base import Target
@@ -47,6 +46,8 @@ class RasterSurface:
     """Takes X, Y of the product's CRS (..., 2) to the grid's CRS; None if they are the same."""
     part: tuple[int, int] = (256, 256)
     """Columns and rows that are best read at once: the blocks of a file."""
+    store: RangeStore | None = field(default=None, repr=False, compare=False)
+    """Keeps ranges of heights for later runs."""
     _ranges: GridRanges = field(init=False, repr=False, compare=False)
     _kept: dict[int, Cache] = field(init=False, repr=False, compare=False, default_factory=dict)
     """Parts that rays were followed over last, by their side."""
@@ -54,7 +55,7 @@ class RasterSurface:
     def __post_init__(self) -> None:
         if not (self.mesh[0] > 0 and self.mesh[1] > 0):
             raise InputError(f"terrain grid with mesh {self.mesh}; mesh widths must be positive (a north-up grid)")
-        object.__setattr__(self, "_ranges", GridRanges(self.grid, self.part))
+        object.__setattr__(self, "_ranges", GridRanges(self.grid, self.part, self.store))
 
     def continued(self) -> RasterSurface:
         """The same terrain, going on with its slope instead of level for a mesh beyond its outer posts."""
@@ -283,114 +284,3 @@ class RasterParts:
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Heights at points of the grid's CRS."""
         return self.surface._heights(self.surface._posts(np.asarray(XY, float)))
-
-
-#: Cells whose ranges are kept (8 bytes each): single posts in small grids, squares of 2, 4, 8 … posts in larger ones.
-MOST_CELLS = 2_000_000
-
-
-class HeightGrid(Protocol):
-    """Posts of a terrain grid, read by windows; safe to call from several threads."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Columns and rows."""
-        ...
-
-    def read(self, window: Window) -> NDArray[np.float32]:
-        """Heights of a window inside the grid, shape (height, width), metres; NaN where there is none."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class GridRanges:
-    """Ranges of the cells of a grid: read once, part by part, when a window first touches them.
-
-    Bounds are those of the posts themselves. Overviews of a file are no bounds: an average hides a summit, and a
-    nearest neighbour leaves it out. Two threads that want one part at once both read it and write the same numbers.
-    """
-
-    grid: HeightGrid
-    part: tuple[int, int]
-    """Columns and rows that are read at once: the file's blocks."""
-    _side: int = field(init=False, repr=False)
-    _low: NDArray[np.float32] = field(init=False, repr=False)
-    _high: NDArray[np.float32] = field(init=False, repr=False)
-    _known: NDArray[np.bool_] = field(init=False, repr=False)
-    _tables: dict[int, NDArray[np.float64]] = field(init=False, repr=False, default_factory=dict)
-
-    def __post_init__(self) -> None:
-        columns, rows = self.grid.size
-        side = 1
-        while -(-columns // side) * -(-rows // side) > MOST_CELLS:
-            side *= 2
-        # Parts are made of whole cells.
-        width, height = (max(1, -(-extent // side)) * side for extent in self.part)
-        cells = (-(-rows // side), -(-columns // side))
-        for name, value in (
-            ("_side", side),
-            ("part", (width, height)),
-            ("_low", np.full(cells, np.nan, np.float32)),
-            ("_high", np.full(cells, np.nan, np.float32)),
-            ("_known", np.zeros((-(-rows // height), -(-columns // width)), bool)),
-        ):
-            object.__setattr__(self, name, value)
-
-    def of(self, windows: NDArray[np.int64], learn: bool = True) -> NDArray[np.float64]:
-        """Bounds of the posts in windows: first column, first row, end column, end row (n, 4), shape (n, 2).
-
-        A window is widened to whole cells. NaN, NaN for empty windows and where there is no height; with `learn` False
-        nothing is read, and windows that touch unknown parts have infinite bounds.
-        """
-        out = np.full((len(windows), 2), np.nan)
-        ask = np.flatnonzero((windows[:, 2] > windows[:, 0]) & (windows[:, 3] > windows[:, 1]))
-        if not len(ask):
-            return out
-        if learn:
-            self._learn(windows[ask])
-        else:
-            unknown = np.pad(~self._known, ((1, 0), (1, 0))).astype(np.int64).cumsum(axis=0).cumsum(axis=1)
-            (c0, r0), (c1, r1) = (windows[ask, :2] // self.part).T, (-(-windows[ask, 2:] // self.part)).T
-            count = unknown[r1, c1] - unknown[r0, c1] - unknown[r1, c0] + unknown[r0, c0]
-            out[ask[count > 0]], ask = (-np.inf, np.inf), ask[count == 0]
-        asked = windows[ask]
-        cells = np.concatenate([asked[:, :2] // self._side, -(-asked[:, 2:] // self._side)], axis=1).astype(np.int32)
-        found = np.stack([height_ranges(self._low, cells)[:, 0], height_ranges(self._high, cells)[:, 1]], axis=1)
-        out[ask] = np.where(np.isinf(found), np.nan, found)
-        return out
-
-    def table(self, side: int, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """What was found out of squares of so many posts, rows × columns of them: −inf, inf: nothing yet."""
-        if side not in self._tables:
-            self._tables[side] = np.full((*shape, 2), np.inf) * (-1.0, 1.0)
-        return self._tables[side]
-
-    def _learn(self, windows: NDArray[np.int64]) -> None:
-        """Read all parts that some windows touch and that are not known yet."""
-        first = windows[:, :2] // self.part
-        last = (windows[:, 2:] - 1) // self.part
-        # How many windows touch each part, from the corners of the rectangles.
-        count = np.zeros((self._known.shape[0] + 1, self._known.shape[1] + 1), np.int64)
-        for rows, columns, sign in (
-            (first[:, 1], first[:, 0], 1),
-            (first[:, 1], last[:, 0] + 1, -1),
-            (last[:, 1] + 1, first[:, 0], -1),
-            (last[:, 1] + 1, last[:, 0] + 1, 1),
-        ):
-            np.add.at(count, (rows, columns), sign)
-        touched = count.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
-        for row, column in zip(*np.nonzero(touched & ~self._known)):
-            self._read(int(column), int(row))
-            self._known[row, column] = True
-
-    def _read(self, column: int, row: int) -> None:
-        width, height = self.part
-        area = Window(column * width, row * height, width, height) & Window(0, 0, *self.grid.size)
-        side = self._side
-        cells = Window(area.col // side, area.row // side, -(-area.width // side), -(-area.height // side))
-        row0, col0 = np.mgrid[0 : cells.height, 0 : cells.width].reshape(2, -1) * side
-        right, bottom = np.minimum(col0 + side, area.width), np.minimum(row0 + side, area.height)
-        found = height_ranges(self.grid.read(area), np.stack([col0, row0, right, bottom], axis=1).astype(np.int32))
-        found[np.isinf(found)] = np.nan
-        here = np.s_[cells.row : cells.row + cells.height, cells.col : cells.col + cells.width]
-        self._low[here], self._high[here] = found.T.reshape(2, cells.height, cells.width)

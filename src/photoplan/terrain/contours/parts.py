@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.surfaces.raster import HeightGrid
+from photoplan.surfaces.grid_ranges import HeightGrid
 from photoplan.surfaces.units import LineElement, MeshFaces, Unit, UnitSource
 
 Bounds = tuple[float, float, float, float]
