@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 import rasterio
-from tools.command import peak_of
+from tools.command import Here, peak_of
 from tools.huge_tiff import write_huge_tiff
 from tools.small_block import X0, Y0, Z0, Block, make_project
 
@@ -19,15 +19,17 @@ SIDE = 40_000
 
 @pytest.fixture
 def huge(small: Block) -> Block:
-    """One image of 40,000 × 40,000 × 3 bytes: 4.8 GB in memory, a pixel of 7.5 mm on the ground."""
+    """Two images of 40,000 × 40,000 × 3 bytes: 4.8 GB each in memory, a pixel of 7.5 mm on the ground."""
     for path in small.images:
         path.unlink()
     noise = np.random.default_rng(1).integers(60, 200, (256, 256, 3), dtype=np.uint8)
     write_huge_tiff(small.images[0], noise, (SIDE, SIDE))
+    write_huge_tiff(small.images[1], noise, (SIDE, SIDE))
     small.camera.write_text(
         f"c:\n  type: pinhole\n  im_size: [{SIDE}, {SIDE}]\n  focal_len: 1\n  sensor_size: [1, 1]\n"
     )
-    small.orientation.write_text(f"name,x,y,z,omega,phi,kappa\none,{X0 + 60},{Y0},{Z0},1,-2,30\n")
+    lines = [f"one,{X0 + 60},{Y0},{Z0},1,-2,30", f"two,{X0 + 160},{Y0},{Z0},0,1,-40"]
+    small.orientation.write_text("\n".join(["name,x,y,z,omega,phi,kappa", *lines, ""]))
     make_project(small)
     return small
 
@@ -46,6 +48,26 @@ def test_fault_06_an_image_far_larger_than_memory(huge: Block, verb: str) -> Non
     # Noise from 60 to 199 has the mean 129.5; means of some 1100 pixels spread by 40/33.
     assert abs(made.mean() - 129.5) < 1
     assert made.std() < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["seams", "balance"])
+def test_fault_06_whole_images_far_larger_than_memory(huge: Block, verb: str) -> None:
+    """Both are read to their last pixel; of bars, since a mean of noise is the same everywhere."""
+    bars = np.broadcast_to(np.where(np.arange(256) < 128, 60, 160).astype(np.uint8)[:, None, None], (256, 256, 3))
+    for path in huge.images[:2]:
+        write_huge_tiff(path, bars, (SIDE, SIDE))
+    words = [verb, huge.project, "--resolution", "1", "--no-picture", "--memory", "600MB", "--workers", 2]
+    said, peak = peak_of(*words)
+    assert said.code == 0, said
+    assert peak < LIMIT
+
+
+@pytest.mark.parametrize("verb", ["seams", "balance"])
+def test_fault_06_what_does_not_suffice_is_refused(small: Block, verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    said = Here(capsys)(verb, small.project, "--memory", "100MB")
+    assert said.code == 2 and "at least" in said.err and "MiB are needed" in said.err
+    assert not (small.folder / "products").exists() and not (small.folder / "balance").exists()
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from photoplan.errors import UsageError
+from photoplan.errors import RunLocked, UsageError
 from photoplan.io import naming
-from photoplan.io.naming import is_unfinished, standing, together, write_atomically
+from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.naming import is_unfinished, locked, standing, together, write_atomically
 
 
 def names(folder: Path) -> list[str]:
@@ -25,6 +26,24 @@ def test_nothing_has_its_name_before_the_end(tmp_path: Path) -> None:
         assert not (tmp_path / "a").exists() and standing(tmp_path / "a").read_bytes() == b"1"
     assert names(tmp_path) == ["a", "b"] and not is_unfinished(tmp_path / "a")
     assert {"a", "b"} <= set(done[0])
+
+
+def test_a_lock_is_held_until_files_have_their_names(tmp_path: Path) -> None:
+    seen = []
+    with together():
+        with locked(lock_of(tmp_path / "a")):
+            write_atomically(tmp_path / "a", b"1")
+        naming.when_named(lambda: seen.append((tmp_path / "a").exists()))
+        with pytest.raises(RunLocked), FileLock(lock_of(tmp_path / "a")):
+            pass
+    with FileLock(lock_of(tmp_path / "a")):
+        assert seen == [True]
+    with pytest.raises(ZeroDivisionError), together(), locked(lock_of(tmp_path / "a")):
+        1 / 0  # noqa: B018
+    with locked(lock_of(tmp_path / "a")), pytest.raises(RunLocked), FileLock(lock_of(tmp_path / "a")):
+        pass
+    with FileLock(lock_of(tmp_path / "a")):
+        pass
 
 
 def test_an_error_leaves_what_was_there(tmp_path: Path) -> None:

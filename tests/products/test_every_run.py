@@ -78,6 +78,11 @@ def mosaic(inputs: Path, out: Path) -> list[object]:
     return ["mosaic", project, *bounds, *blend, "--sources", "--no-quicklook", "--output", out]
 
 
+def seams(inputs: Path, out: Path) -> list[object]:
+    words = ["--resolution", 4, "--no-picture", "-o", out / "product.gpkg"]
+    return ["seams", inputs / "block" / "project.toml", *words]
+
+
 def single(inputs: Path, out: Path) -> list[object]:
     """A house alone, in four tiles."""
     words = ["--objects", "house", "--resolution", 0.25, "--force", "--tile", 128, "--no-quicklook", "--output", out]
@@ -124,6 +129,7 @@ CASES: dict[str, tuple[Words, str]] = {
     "ortho": (ortho, "one_ortho.tif"),
     "true": (true_ortho, "one_ortho.tif"),
     "mosaic": (mosaic, "mosaic.tif"),
+    "seams": (seams, "product.gpkg"),
     "object": (single, "house_object.tif"),
     "direct": (direct, "one_ortho.tif"),
     "restore": (restore, "scan_restored.tif"),

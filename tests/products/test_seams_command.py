@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,6 @@ import rasterio.features
 import shapely
 from scipy.ndimage import gaussian_filter, map_coordinates
 from tools.command import Here
-from tools.forked import Mishap, forked
 from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
 
 from photoplan.io.lock import FileLock, lock_of
@@ -161,15 +158,3 @@ def test_fault_05_an_image_that_cannot_be_read(
     said = photoplan(*words, "-o", path)
     assert said.code == 4 and "the disk has gone" in said.err and "nothing is written" in said.err
     assert not path.exists() and not list(block.folder.glob(".*"))
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals")
-@pytest.mark.parametrize(("sign", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
-def test_faults_03_25_a_run_that_ended_early_leaves_nothing(block: Block, sign: signal.Signals, code: int) -> None:
-    words = ["seams", block.project, "--resolution", 4, "--no-picture", "--workers", 1]
-    before = sorted(block.folder.rglob("*"))
-    said = forked(words, block.folder.parent / "said", Mishap(end_at=1, sign=sign))
-    assert said.code == code, said.err
-    left = [p for p in sorted(block.folder.rglob("*")) if p not in before and p.suffix != ".lock" and not p.is_dir()]
-    assert left == []
-    assert forked(words, block.folder.parent / "again").code == 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -12,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from photoplan.errors import PhotoplanError, ResourceError
-from photoplan.io.scratch import Scratch
+from photoplan.errors import PhotoplanError
+from photoplan.io.result_log import ResultLog
 from photoplan.radiometry import seams
 from photoplan.radiometry.seams import Parts, _Level
 from photoplan.radiometry.shown import Memory, Shown, layers_of
@@ -163,25 +161,30 @@ def test_parts_of_a_map_cost_no_more_than_the_whole() -> None:
 
 
 def test_arrays_wait_on_the_disk(tmp_path: Path) -> None:
-    """Seams from a file are those from memory; the file has no name, and a full disk is told."""
-    images = two(np.zeros((1, 120, 200), np.float32))
-    with Scratch(tmp_path) as store:
-        layers = [layers_of(each, store) for each in images]
-        found = seams.find_seams(layers, store, np.ones((120, 200), np.float32))[0]
-        assert not list(tmp_path.iterdir())
-        np.testing.assert_array_equal(found, find_seams(images, np.ones((120, 200), np.float32))[0])
-        lost = replace(layers[0][0], at=10**9)
-        with pytest.raises(PhotoplanError, match="cannot be read"):
-            lost.window(store, (0, 0, 10, 10))
+    """Seams from a file are those from memory, also when the file is opened again; a file that was cut is told."""
+    images, weight = two(np.zeros((1, 120, 200), np.float32)), np.ones((120, 200), np.float32)
+    with ResultLog(tmp_path / "log", "key", None) as store:
+        layers = [layers_of(each, store) for each in images[:1]]
+        assert not store.finished
+    with ResultLog(tmp_path / "log", "key", None) as store:
+        layers.append(layers_of(images[1], store))
+        assert len({layer.at for each in layers for layer in each}) == sum(map(len, layers))
+        found = seams.find_seams(layers, store, weight)[0]
+        np.testing.assert_array_equal(found, find_seams(images, weight)[0])
+        with (tmp_path / "log").open("r+b") as file:
+            file.truncate(10_000)
+        with pytest.raises(PhotoplanError, match="has become shorter"):
+            layers[1][0].window(store, (0, 60, 120, 140))
 
 
-def test_fault_04_the_disk_is_full_when_seams_keep_what_images_show(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("os.pwrite", full)
-    with Scratch(tmp_path) as store, pytest.raises(ResourceError, match="No space left"):
-        layers_of(two(np.zeros((1, 120, 200), np.float32))[0], store)
-    assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize("shape", [(1, 1), (320, 320), (321, 1000), (2000, 1500)])
+@pytest.mark.parametrize("parts", [Parts(), Parts(40, 12), Parts(30, 45)])
+def test_parts_that_are_solved_at_once_do_not_touch(shape: tuple[int, int], parts: Parts) -> None:
+    boxes, groups = parts.of(shape), parts.apart(shape)
+    assert sorted(k for group in groups for k in group) == list(range(len(boxes)))
+    for group in groups[:4]:
+        asked = np.zeros(shape, np.uint8)
+        for k in group:
+            row, col, height, width = seams.grown(boxes[k][1], 1, shape)
+            asked[row : row + height, col : col + width] += 1
+        assert asked.max() == 1

@@ -119,9 +119,12 @@ def dry_run_option(what: str) -> Callable[..., Any]:
     return click.option("--dry-run", is_flag=True, help=what)
 
 
-def ending(dry_run: str = "", *, workers: bool = False, overwrite: bool = True) -> Callable[..., Any]:
+def ending(
+    dry_run: str = "", *, workers: bool = False, memory: bool = False, overwrite: bool = True
+) -> Callable[..., Any]:
     """What the options of nearly every verb end with; `dry_run` says what happens instead."""
-    first = [workers_option] * workers + [dry_run_option(dry_run)] * bool(dry_run) + [overwrite_option] * overwrite
+    first = [workers_option] * workers + [memory_option] * memory
+    first += [dry_run_option(dry_run)] * bool(dry_run) + [overwrite_option] * overwrite
     return several(*first, json_option, quiet_option)
 
 

@@ -17,7 +17,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--keep", type=PATH, metavar="FILE", help="Regions with their images that stay as they are.")
 @click.option("-o", "--output", type=PATH, metavar="FILE", help="[products/seams.gpkg by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not draw the regions.")
-@ending("Look at the images and stop.", workers=True)
+@ending("Look at the images and stop.", workers=True, memory=True)
 def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> None:
     """Find seams between the images of PROJECT where they are least seen.
 
@@ -25,16 +25,18 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     column `image`, which `photoplan mosaic --seams` takes and QGIS edits.
     """
     from photoplan.cli.telling import Telling
+    from photoplan.io.naming import together
     from photoplan.products.seams.run import SeamsRequest, make_seams
     from photoplan.report.drawing import has_matplotlib
     from photoplan.report.maps import draw_regions
 
     request = SeamsRequest(**options)
-    with Telling(quiet) as events:
-        found = make_seams(request, events)
     picture = None
-    if found.path is not None and found.shapes and not no_picture and has_matplotlib():
-        picture = draw_regions(found.path.with_suffix(".png"), found.shapes, "Images of the mosaic")
+    with together():
+        with Telling(quiet) as events:
+            found = make_seams(request, events)
+        if found.path is not None and found.shapes and not no_picture and has_matplotlib():
+            picture = draw_regions(found.path.with_suffix(".png"), found.shapes, "Images of the mosaic")
     if as_json:
         show_json(found, picture=picture)
     elif found.path is None or found.differences is None or found.shapes is None:
@@ -44,7 +46,6 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
         show(found.path)
         if picture is not None:
             show(picture)
-        halfway, best = found.differences
         halfway, best = found.differences
         along = "no seams"
         if best is not None and halfway is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +28,8 @@ class _Group:
     unfinished: set[Path] = field(default_factory=set)
     """Those whose names an earlier run gave before it died."""
     then: list[Callable[[], object]] = field(default_factory=list)
+    held: ExitStack = field(default_factory=ExitStack)
+    """Locks of products."""
 
     def take(self, part: Path, path: Path) -> None:
         if path not in self.waiting and is_unfinished(path):
@@ -101,7 +103,23 @@ def together() -> Iterator[None]:
             raise disk_error(next(iter(group.waiting)), error) from error
     finally:
         _GROUP.reset(token)
-        group.leave()
+        with group.held:
+            group.leave()
+
+
+@contextmanager
+def locked(lock: Path) -> Iterator[None]:
+    """Hold a lock, see `FileLock`; inside `together` until the files have their names.
+
+    Raises
+    ------
+    RunLocked, UsageError, ResourceError
+        See `FileLock`.
+    """
+    group = _GROUP.get()
+    with ExitStack() as stack:
+        (stack if group is None else group.held).enter_context(FileLock(lock))
+        yield
 
 
 def give_name(part: Path, path: Path) -> None:

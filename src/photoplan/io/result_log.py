@@ -1,4 +1,4 @@
-"""Results of tasks that are no tiles of a raster, kept on the disk till their product is complete, or longer."""
+"""Results of tasks that are no tiles of a raster, and large arrays, kept on the disk till their product is complete."""
 
 from __future__ import annotations
 
@@ -7,15 +7,24 @@ import io
 import pickle
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import is_dataclass
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from photoplan.errors import InputError
-from photoplan.io.lock import FileLock, lock_of
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, PhotoplanError
+from photoplan.io.disk import disk_error
+from photoplan.io.lock import lock_of
+from photoplan.io.naming import locked
 from photoplan.io.tile_log import TileLog
 
 _ARRAYS = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
+#: Indices from here on are those of arrays.
+_FIRST_ARRAY = 1 << 63
+_BYTES = 4
 
 
 class ResultLog:
@@ -31,7 +40,7 @@ class ResultLog:
     key : str
         What makes a run itself: a log with another key is started afresh.
     lock : Path or None
-        Held while the context lasts; None: whoever opens the log has one.
+        Held while the context lasts, see `photoplan.io.naming.locked`; None: whoever opens the log has one.
 
     Raises
     ------
@@ -43,8 +52,9 @@ class ResultLog:
 
     def __init__(self, path: Path, key: str, lock: Path | None) -> None:
         self._path, self._key = path, key
-        self._lock: AbstractContextManager[Any] = nullcontext() if lock is None else FileLock(lock)
+        self._lock: AbstractContextManager[Any] = nullcontext() if lock is None else locked(lock)
         self._log: TileLog | None = None
+        self._arrays = count(_FIRST_ARRAY)
 
     @classmethod
     def beside(cls, product: Path, key: str, *, locked: bool) -> ResultLog:
@@ -60,6 +70,7 @@ class ResultLog:
         with ExitStack() as stack:
             stack.enter_context(self._lock)
             self._log = TileLog(self._path, self._key)
+            self._arrays = count(max(self._log.finished | {_FIRST_ARRAY - 1}) + 1)
             stack.pop_all()
         return self
 
@@ -77,7 +88,7 @@ class ResultLog:
     @property
     def finished(self) -> frozenset[int]:
         """Indices of the results that are there."""
-        return self._open.finished
+        return frozenset(index for index in self._open.finished if index < _FIRST_ARRAY)
 
     def index(self, name: object) -> int:
         """Where the result of a name is kept: the name's digest, 63 bits."""
@@ -90,6 +101,29 @@ class ResultLog:
     def __getitem__(self, index: int) -> Any:
         """A result, read from the disk: a value of its own each time."""
         return _Data(io.BytesIO(self._open.read(index))).load()
+
+    def keep(self, values: NDArray[np.float32]) -> int:
+        """Keep an array of float32; where it is, also in a later run. Called by workers."""
+        index = next(self._arrays)
+        self._open.append(index, np.ascontiguousarray(values, np.float32).data)
+        return index
+
+    def rows(self, at: int, shape: tuple[int, int, int], first: int, last: int) -> NDArray[np.float32]:
+        """Rows from `first` to before `last` of an array of a shape (rows, columns, n) that is kept.
+
+        Raises
+        ------
+        PhotoplanError
+            The file cannot be read, or is no longer what was written.
+        """
+        row = shape[1] * shape[2] * _BYTES
+        try:
+            found = self._open.part(at, first * row, (last - first) * row)
+        except OSError as error:
+            raise disk_error(self._path, error, "read") from error
+        if len(found) < (last - first) * row:
+            raise PhotoplanError(f"{self._path}: has become shorter since it was written; delete the file, rerun")
+        return np.frombuffer(found, np.float32).reshape(last - first, *shape[1:])
 
     def remove(self) -> None:
         """Forget all results: their product is complete."""

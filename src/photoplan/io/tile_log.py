@@ -166,6 +166,10 @@ class TileLog:
             raise PhotoplanError(f"{self.path}: tile {index} has changed since it was written; delete the file, rerun")
         return content[place.figures :]
 
+    def part(self, index: int, first: int, length: int) -> bytes:
+        """So many bytes of a payload from `first` on, as they are now; fewer if the file has become shorter."""
+        return self._read(self._places[index].position + first, length)
+
     def _read(self, position: int, length: int) -> bytes:
         with self._lock:
             os.lseek(self._descriptor, position, os.SEEK_SET)

@@ -25,6 +25,8 @@ NODES, ENTRIES = 17, 33
 _MOST_ROWS = 50_000
 #: Where a shoulder begins, parts of the range from its ends; what of the pixels may lie beyond it without one.
 _SHOULDER, _BEYOND = 0.12, 0.0005
+#: Pairs of rows that are compared at once.
+_CHUNK = 50_000
 #: An image whose grey values differ by less than this part of the range is all of one colour.
 _EVEN = 0.01
 
@@ -182,7 +184,10 @@ def pairs_of(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.i
     times = np.bincount(cell[a], minlength=len(first))
     found, maps = [], []
     for values in (cells.pixels.astype(float), _values(cells, tones, sizes)):
-        mean = np.square(values[a] - values[b]).mean(axis=2)
+        mean = np.empty((len(a), cells.bands))
+        for at in range(0, len(a), _CHUNK):
+            some = np.s_[at : at + _CHUNK]
+            mean[some] = np.square(values[a[some]] - values[b[some]]).mean(axis=2)
         total = np.zeros((len(pair), cells.bands))
         np.add.at(total, of.reshape(-1), mean)
         found.append(np.sqrt(total / count[:, None]))

@@ -9,13 +9,16 @@ three or more meet, all are asked. From coarse to fine pixels only what lies nea
 
 The map is worked on by parts that lie over each other, each with the images that touch it alone: a part is solved while
 what is around it stays, and again when a neighbour has changed it. The sum only falls, and so all parts agree in the
-end; memory is that of one part, and a number for each pixel of the map.
+end. Parts that do not touch each other are solved at once; memory is that of those, and a number for each pixel of the
+map.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +31,8 @@ _Floats = NDArray[np.float32]
 _Mask = NDArray[np.bool_]
 _Labels = NDArray[np.uint16]
 _Box = tuple[int, int, int, int]
+Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""Results of a function of all items in their order, as `map` or `photoplan.engine.steps.Steps` give them."""
 #: Shorter side of images and of the map on the coarsest pixels; and pixels to either side of a coarser seam that are
 #: asked again.
 _COARSEST, _BAND = 48, 5
@@ -54,6 +59,13 @@ class Parts:
                 found.append((inner, grown(inner, self.reach, shape)))
         return found
 
+    def apart(self, shape: tuple[int, int]) -> list[list[int]]:
+        """Numbers of the parts in groups; within one even what parts reach into does not touch."""
+        rows, cols = (-(-n // self.side) for n in shape)
+        step = 1 + -(-2 * (self.reach + 1) // self.side)
+        starts = product(range(min(step, rows)), range(min(step, cols)))
+        return [[i * cols + j for i in range(row, rows, step) for j in range(col, cols, step)] for row, col in starts]
+
 
 PARTS = Parts()
 
@@ -63,8 +75,8 @@ def find_seams(
     store: Store,
     weight: _Floats,
     fixed: _Labels | None = None,
-    told: Callable[[], None] = lambda: None,
     parts: Parts = PARTS,
+    run: Run = map,
 ) -> tuple[_Labels, float, float]:
     """The image of each pixel.
 
@@ -76,10 +88,10 @@ def find_seams(
         What a seam costs at a place beside others; 1 usually, more where none should run.
     fixed : ndarray of uint16, shape (height, width), optional
         Number of an image plus one where somebody has decided, and the image sees the pixel; 0 elsewhere.
-    told : callable
-        Called after each level.
     parts : Parts
         How the map is cut.
+    run : callable
+        Solves parts, several at once.
 
     Returns
     -------
@@ -105,8 +117,7 @@ def find_seams(
             labels = level.allowed(np.repeat(np.repeat(labels, 2, axis=0), 2, axis=1)[: shape[0], : shape[1]])
             near = ndimage.binary_dilation(_borders(labels), iterations=_BAND)
         labels = level.start() if labels is None else labels
-        level.settle(labels, near)
-        told()
+        level.settle(labels, near, run)
     assert labels is not None
     return labels, level.difference(level.start()), level.difference(labels)
 
@@ -139,7 +150,7 @@ class _Level:
         self, layers: Sequence[Layer | None], store: Store, weight: _Floats, fixed: _Labels, parts: Parts
     ) -> None:
         self.shape, self._weight, self._fixed, self._store = weight.shape, weight, fixed, store
-        self._layers, self._parts = layers, parts.of(weight.shape)
+        self._layers, self._parts, self._apart = layers, parts.of(weight.shape), parts.apart(weight.shape)
         self._boxes = np.array([(0, 0, 0, 0) if each is None else each.box for each in layers], np.int64)
         self.usual = self._usual()
 
@@ -170,30 +181,43 @@ class _Level:
             out[_slices(inner)] = self.part(inner, 0).allowed(labels[_slices(inner)])
         return out
 
-    def settle(self, labels: _Labels, near: _Mask | None) -> None:
+    def settle(self, labels: _Labels, near: _Mask | None, run: Run) -> None:
         """Expand images part by part till none gains, and parts again that a neighbour has changed; labels change."""
         changed: list[list[_Box]] = [[outer] for _, outer in self._parts]
+
+        def solve(item: tuple[int, list[_Box]]) -> tuple[_Box, _Labels] | None:
+            """What becomes of a part in which boxes have changed: where labels are new, and which; None: nowhere."""
+            outer = self._parts[item[0]][1]
+            part, wide = self.part(outer, 1), grown(outer, 1, self.shape)
+            free = np.zeros(wide[2:], np.bool_)
+            free[_slices(outer, wide)] = True if near is None else near[_slices(outer)]
+            before = labels[_slices(wide)]
+            after = part.settled(before, free, [(b[0] - wide[0], b[1] - wide[1], *b[2:]) for b in item[1]])
+            at = np.argwhere(after != before)
+            if not len(at):
+                return None
+            (top, left), (bottom, right) = at.min(axis=0).tolist(), (at.max(axis=0) + 1).tolist()
+            box = wide[0] + top, wide[1] + left, bottom - top, right - left
+            return box, after[top:bottom, left:right].copy()
+
         for _ in range(_SWEEPS):
-            for k, (_, outer) in enumerate(self._parts):
-                waiting, changed[k] = changed[k], []
-                if not waiting or not (near is None or near[_slices(outer)].any()):
-                    continue
-                part, wide = self.part(outer, 1), grown(outer, 1, self.shape)
-                free = np.zeros(wide[2:], np.bool_)
-                free[_slices(outer, wide)] = True if near is None else near[_slices(outer)]
-                before = labels[_slices(wide)]
-                after = part.settled(before, free, [(b[0] - wide[0], b[1] - wide[1], *b[2:]) for b in waiting])
-                at = np.argwhere(after != before)
-                if not len(at):
-                    continue
-                labels[_slices(wide)] = after
-                (top, left), (bottom, right) = at.min(axis=0) + wide[:2], at.max(axis=0) + wide[:2] + 1
-                box = int(top), int(left), int(bottom - top), int(right - left)
-                for other, (_, theirs) in enumerate(self._parts):
-                    if other != k and (common := _common(grown(box, 1, self.shape), theirs)) is not None:
-                        changed[other].append(common)
+            for group in self._apart:
+                items = [(k, changed[k]) for k in group if changed[k] and self._asked(k, near)]
+                for k in group:
+                    changed[k] = []
+                for (k, _), found in zip(items, list(run(solve, items)), strict=True):
+                    if found is None:
+                        continue
+                    box, labels[_slices(found[0])] = found
+                    for other, (_, theirs) in enumerate(self._parts):
+                        if other != k and (common := _common(grown(box, 1, self.shape), theirs)) is not None:
+                            changed[other].append(common)
             if not any(changed):
                 break
+
+    def _asked(self, part: int, near: _Mask | None) -> bool:
+        """Whether a part has pixels that may change."""
+        return near is None or bool(near[_slices(self._parts[part][1])].any())
 
     def total(self, labels: _Labels) -> float:
         """The sum that is made least."""

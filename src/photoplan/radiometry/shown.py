@@ -21,7 +21,7 @@ _COLOUR, _STRENGTH = 0.15, 0.5
 class Store(Protocol):
     """Where arrays wait; used by several threads."""
 
-    def append(self, values: _Floats, /) -> int:
+    def keep(self, values: _Floats, /) -> int:
         """Keep an array of shape (rows, columns, n); where it is."""
         ...
 
@@ -37,7 +37,7 @@ class Memory:
         self._kept: dict[int, _Floats] = {}
         self._numbers = count()
 
-    def append(self, values: _Floats, /) -> int:
+    def keep(self, values: _Floats, /) -> int:
         """Keep an array; its number."""
         number = next(self._numbers)
         self._kept[number] = values
@@ -100,7 +100,7 @@ def layers_of(image: Shown, store: Store) -> tuple[Layer, ...]:
         height, width = image.valid.shape
         place = np.where(image.valid, _from_middle(image.valid), np.nan)
         values = np.concatenate([_detail(image), place[..., None]], axis=-1).astype(np.float32)
-        found.append(Layer(store.append(values), (image.row, image.col, height, width), values.shape[2]))
+        found.append(Layer(store.keep(values), (image.row, image.col, height, width), values.shape[2]))
         if max(height, width) < 3:
             return tuple(found)
         image = image.halved()

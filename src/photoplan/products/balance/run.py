@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.engine.run import tiles_in_flight
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.balance_file import BalanceBand, write_balance_file
 from photoplan.io.disk import make_folder
-from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.lock import lock_of
 from photoplan.io.names import safe_stem
-from photoplan.io.naming import together
+from photoplan.io.naming import locked, together
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
@@ -26,7 +27,7 @@ from photoplan.io.tables import write_table
 from photoplan.plain import pick
 from photoplan.products.balance.reference import Reference, open_reference
 from photoplan.products.balance.sample import Survey, sample, survey
-from photoplan.products.run import refuse_inputs
+from photoplan.products.run import BASE_MEMORY, refuse_inputs
 from photoplan.project.scene import input_files
 from photoplan.radiometry.balance import Balanced, Pairs, balance, even_images, pairs_of
 from photoplan.radiometry.cells import SIDE, Cells
@@ -51,6 +52,8 @@ class BalanceRequest:
     """Side of the pixels that are compared, metres."""
     output: Path | None = None
     workers: int = 1
+    memory: int | None = None
+    """Bytes the run should stay under; None: no bound but the tiles under way."""
     overwrite: bool = False
     dry_run: bool = False
 
@@ -124,7 +127,7 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     Raises
     ------
     UsageError
-        An output exists, or an option cannot be.
+        An output exists, an option cannot be, or `memory` does not suffice.
     InputError
         An input cannot be used, or images differ in bands or type of pixels.
     GeometryError
@@ -135,11 +138,12 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     fixed = _check(request, project, names)
     found = survey(project, names, request.resolution, events)
     notes = [f"left out, sees no terrain: {line}" for line in found.blind]
+    workers = tiles_in_flight(request.workers, request.memory, BASE_MEMORY + found.kept_bytes, found.tile_bytes)
     if request.dry_run:
         return BalanceReport(found, tuple(notes))
     make_folder(request.folder)
-    with FileLock(lock_of(request.table)):
-        report = _made(request, found, fixed, notes, events)
+    with together(), locked(lock_of(request.table)):
+        report = _made(replace(request, workers=workers), found, fixed, notes, events)
         _keep(request, project, report, times())
     return report
 
@@ -167,7 +171,7 @@ def _keep(request: BalanceRequest, project: Project, report: BalanceReport, time
             request.table,
             key=run_key("balance", settings, inputs),
             inputs=inputs,
-            run={"workers": request.workers, **times},
+            run={"workers": request.workers, "memory": request.memory, **times},
             kind="balance",
             product=report,
             settings=settings,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import project as into_image
+from photoplan.engine.execute import MOST_SOURCE_BYTES
 from photoplan.engine.steps import steps
 from photoplan.errors import GeometryError
 from photoplan.events import Events
@@ -27,6 +28,8 @@ from photoplan.surfaces.objects import painted_surface
 ACROSS = 256
 #: Cells along the side of a tile.
 _CELLS = BLOCK
+#: Bytes that a band of an image takes in a cell that it shows till all is written.
+_KEPT = 1200
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +51,18 @@ class Survey:
     def sizes(self) -> NDArray[np.int64]:
         """Width and height of the images, (n, 2)."""
         return np.array([one.scene.reader.size for one in self.looked], np.int64)
+
+    @property
+    def tile_bytes(self) -> int:
+        """What a tile takes at most that is looked at: a window of an image, and all images of the tile."""
+        bands = self.looked[0].scene.reader.bands
+        return 3 * MOST_SOURCE_BYTES + max(8 * bands * tile.pixels * len(tile.sources) for tile in self.tiles)
+
+    @property
+    def kept_bytes(self) -> int:
+        """What the cells of all tiles take that are kept, and their adjustment."""
+        rows = sum(tile.pixels * len(tile.sources) for tile in self.tiles) // SIDE**2
+        return _KEPT * self.looked[0].scene.reader.bands * rows
 
 
 def survey(project: Project, names: Sequence[str], resolution: float | None, events: Events) -> Survey:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +13,26 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from photoplan.engine.steps import steps
+from photoplan.engine.execute import MOST_SOURCE_BYTES
+from photoplan.engine.run import tiles_in_flight
+from photoplan.engine.steps import Steps, steps
 from photoplan.errors import GeometryError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.io.disk import make_folder
-from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.naming import together, when_named
 from photoplan.io.polygons import label_polygons
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.regions import read_regions, write_regions
+from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
-from photoplan.io.scratch import Scratch
 from photoplan.products.balance.sample import Survey, survey
 from photoplan.products.orthophoto.shown import shown
+from photoplan.products.run import BASE_MEMORY
 from photoplan.project.scene import input_files
 from photoplan.radiometry.seams import find_seams, without_overlap
-from photoplan.radiometry.shown import Layer, Shown, layers_of
+from photoplan.radiometry.shown import Layer, Shown, Store, layers_of
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
 
@@ -36,6 +40,8 @@ from photoplan.targets.map import MapTarget
 _RAISED, _AROUND, _COSTS = 1.0, 25, 3.0
 #: Side of the parts in which that is looked at; ground where none is known.
 _PART, _ABYSS = 1024, -1e5
+#: Bytes that a pixel and band of an image takes while it is looked at, and a pixel of the map.
+_PIXEL, _MAP = 60, 24
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,8 @@ class SeamsRequest:
     """Regions that somebody has drawn: they stay, where their image sees the ground."""
     output: Path | None = None
     workers: int = 1
+    memory: int | None = None
+    """Bytes the run should stay under; None: no bound but the images and parts under way."""
     overwrite: bool = False
     dry_run: bool = False
 
@@ -87,10 +95,13 @@ class SeamsReport:
 def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     """Find where the images of a project are best joined, and write the regions.
 
+    What images show and parts that are solved are kept beside the output till it is complete: a run that was killed or
+    interrupted goes on.
+
     Raises
     ------
     UsageError
-        The output exists, or an option cannot be.
+        The output exists, an option cannot be, or `memory` does not suffice.
     InputError
         An input cannot be used, or images differ in bands or type of pixels.
     GeometryError
@@ -102,44 +113,56 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     check_output(request.path, files, overwrite=request.overwrite)
     found = survey(project, names, request.resolution, events)
     notes = tuple(f"left out, sees no terrain: {line}" for line in found.blind)
+    reading = _Reading(found)
+    workers = tiles_in_flight(
+        request.workers, request.memory, BASE_MEMORY + _MAP * found.grid.window.size, reading.bytes
+    )
     if request.dry_run:
         return SeamsReport(found, notes)
+    make_folder(request.path.parent)
+    settings = {"resolution": found.grid.resolution, "images": list(found.names)}
+    inputs = [input_entry(file) for file in files]
+    key = run_key("seams", settings, inputs)
+    with together(), ResultLog.beside(request.path, key, locked=False) as log:
+        with steps(request.path.name, workers, events, log) as each:
+            events.begin("reading", len(found.looked), "images")
+            images = list(each(partial(reading.image, store=log), range(len(found.looked))))
+            notes += _odd(found, images, log)
+            labels, differences = _seams(request, found, images, log, each, events, notes)
+        polygons = label_polygons(labels.astype(np.int32), found.grid)
+        shapes = {row: _multi(shape) for row, shape in sorted(polygons.items())}
+        write_regions(request.path, found.names, shapes, found.grid.crs)
+        named = {found.names[row - 1]: shape for row, shape in shapes.items()}
+        report = SeamsReport(found, notes, request.path, named, differences)
+        run = {"workers": request.workers, "memory": request.memory, **times()}
+        write_run_record(request.path, key=key, inputs=inputs, run=run, kind="seams", product=report, settings=settings)
+        when_named(log.remove)
+    return report
+
+
+def _seams(
+    request: SeamsRequest,
+    found: Survey,
+    images: Sequence[tuple[Layer, ...] | float | None],
+    store: Store,
+    run: Steps,
+    events: Events,
+    notes: Sequence[str],
+) -> tuple[NDArray[np.uint16], tuple[float | None, float | None]]:
+    """The image of each pixel of the map, and the differences of a report."""
+    layers = [each if isinstance(each, tuple) else () for each in images]
+    if not sum(map(bool, layers)) > 1:
+        told = "\n  ".join(["fewer than two images show anything of the terrain; there is nothing to join", *notes])
+        raise GeometryError(told)
     grid = found.grid
     fixed = None if request.keep is None else read_regions(request.keep, found.names, grid).rows(grid.window)
-    make_folder(request.path.parent)
-    with FileLock(lock_of(request.path)), Scratch(request.path.parent) as store:
-        images = _images(found, store, request.workers, events)
-        notes += _odd(found, images, store)
-        layers = [each if isinstance(each, tuple) else () for each in images]
-        if not sum(map(bool, layers)) > 1:
-            told = "\n  ".join(["fewer than two images show anything of the terrain; there is nothing to join", *notes])
-            raise GeometryError(told)
-        events.begin("finding seams", 0, "levels")
-        labels, *means = find_seams(layers, store, _weight(found), fixed, events.done)
-        halfway, best = (None if np.isnan(mean) else mean for mean in means)
-        polygons = label_polygons(labels.astype(np.int32), grid)
-        shapes = {row: _multi(shape) for row, shape in sorted(polygons.items())}
-        write_regions(request.path, found.names, shapes, grid.crs)
-        settings = {"resolution": grid.resolution, "images": list(found.names)}
-        inputs = [input_entry(file) for file in files]
-        key = run_key("seams", settings, inputs)
-        differences = {"halfway": halfway, "found": best}
-        run = {"workers": request.workers, **times()}
-        write_run_record(
-            request.path, product="seams", key=key, inputs=inputs, run=run, settings=settings, differences=differences
-        )
-    named = {found.names[row - 1]: shape for row, shape in shapes.items()}
-    return SeamsReport(found, notes, request.path, named, (halfway, best))
+    events.begin("finding seams", 0, "parts")
+    labels, *means = find_seams(layers, store, _weight(found), fixed, run=run)
+    halfway, best = (None if np.isnan(mean) else mean for mean in means)
+    return labels, (halfway, best)
 
 
-def _images(found: Survey, store: Scratch, workers: int, events: Events) -> list[tuple[Layer, ...] | float | None]:
-    """What each image shows of the map, in a store; the grey value of one that has no other; None: nothing."""
-    events.begin("reading", len(found.looked), "images")
-    with steps("seams", workers, events) as run:
-        return list(run(_Reading(found, store).image, range(len(found.looked))))
-
-
-def _odd(found: Survey, images: Sequence[tuple[Layer, ...] | float | None], store: Scratch) -> tuple[str, ...]:
+def _odd(found: Survey, images: Sequence[tuple[Layer, ...] | float | None], store: Store) -> tuple[str, ...]:
     """A line for each image that has no seam: all of one colour, or without another beside it."""
     notes, shape = [], (found.grid.height, found.grid.width)
     alone = without_overlap([each if isinstance(each, tuple) else () for each in images], store, shape)
@@ -155,21 +178,34 @@ def _odd(found: Survey, images: Sequence[tuple[Layer, ...] | float | None], stor
 class _Reading:
     """From an image to what it shows."""
 
-    def __init__(self, found: Survey, store: Scratch) -> None:
-        self._survey, self._store = found, store
+    def __init__(self, found: Survey) -> None:
+        self._survey = found
         self._windows: dict[int, list[Window]] = {}
         for tile in found.tiles:
             for row in tile.sources:
                 self._windows.setdefault(row, []).append(tile.window)
 
-    def image(self, row: int) -> tuple[Layer, ...] | float | None:
+    @property
+    def bytes(self) -> int:
+        """What one image at a time takes at most, beside what all take."""
+        widths, heights = np.array([self._place(mine)[2:] for mine in self._windows.values()]).T
+        return 3 * MOST_SOURCE_BYTES + _PIXEL * self._survey.looked[0].scene.reader.bands * int(
+            (widths * heights).max()
+        )
+
+    @staticmethod
+    def _place(windows: Sequence[Window]) -> tuple[int, int, int, int]:
+        """Left, top, width and height of the box around windows."""
+        left, top = min(w.col for w in windows), min(w.row for w in windows)
+        return left, top, max(w.stop[0] for w in windows) - left, max(w.stop[1] for w in windows) - top
+
+    def image(self, row: int, store: Store) -> tuple[Layer, ...] | float | None:
         """All that it shows, tile by tile, put together."""
         one, mine = self._survey.looked[row], self._windows.get(row)
         if not mine:
             return None
-        left, top = min(w.col for w in mine), min(w.row for w in mine)
-        right, bottom = max(w.stop[0] for w in mine), max(w.stop[1] for w in mine)
-        values = np.zeros((one.scene.reader.bands, bottom - top, right - left), np.float32)
+        left, top, width, height = self._place(mine)
+        values = np.zeros((one.scene.reader.bands, height, width), np.float32)
         valid = np.zeros(values.shape[1:], np.bool_)
         for window in mine:
             made = shown(one, self._survey.grid, window, self._survey.tiles.side)
@@ -183,7 +219,7 @@ class _Reading:
             return float(grey[0, 0])
         rows, cols = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
         at = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-        return layers_of(Shown(top + int(rows[0]), left + int(cols[0]), values[:, *at], valid[at]), self._store)
+        return layers_of(Shown(top + int(rows[0]), left + int(cols[0]), values[:, *at], valid[at]), store)
 
 
 def _weight(found: Survey) -> NDArray[np.float32]:
