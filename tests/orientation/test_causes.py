@@ -6,8 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tools.plain_block import FOCAL, Make, plain_block
+from scipy.stats import multivariate_normal
+from tools.plain_block import FOCAL, Make, Truth, plain_block
 
+from photoplan.adjustment.components import variance_components
+from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import Block
 from photoplan.orientation.bundle.causes import weighed_causes
@@ -66,3 +69,85 @@ def test_where_all_is_as_stated_or_a_point_is_wrong_nothing_is_blamed() -> None:
     result = adjust_block(block)
     assert result.ground_rejected.any()
     assert weighed_causes(block, result) == ()
+
+
+def alike(truth: Truth, seed: int, size: float, reach: float) -> Block:
+    """Errors of image points that are alike, covariance size² exp(−(d / reach)²), beside those of the block."""
+    rng, seen = np.random.default_rng(1000 + seed), truth.block.observations
+    xy = seen.xy.copy()
+    for image in range(len(seen.images)):
+        mine = seen.image == image
+        distance = np.linalg.norm(seen.xy[mine][:, None] - seen.xy[mine], axis=2)
+        covariance = size**2 * np.exp(-((distance / reach) ** 2)) + 1e-9 * np.eye(mine.sum())
+        xy[mine] += np.linalg.cholesky(covariance) @ rng.normal(size=(mine.sum(), 2))
+    return replace(truth.block, observations=replace(seen, xy=xy))
+
+
+def poor_positions(truth: Truth, seed: int, sigma: float) -> Block:
+    positions = truth.block.positions
+    assert positions is not None
+    off = np.random.default_rng(2000 + seed).normal(0, sigma, positions.XYZ.shape)
+    return replace(truth.block, positions=replace(positions, XYZ=positions.XYZ + off))
+
+
+def low_block(seed: int, points: int, images: int) -> Truth:
+    """From 100 m, pixels of 2.8 cm, positions of 2 cm."""
+    return plain_block(Make(seed, 4, images, 100.0, 5.0, points, sigma=0.2, gnss=0.02, control=10, control_sigma=0.01))
+
+
+def told(block: Block) -> list[tuple[str, float]]:
+    result = adjust_block(block)
+    ratios = [round(group.factor, 1) for group in result.groups if "positions" in group.name]
+    found = [(cause.name, cause.explains) for cause in weighed_causes(block, result)]
+    print(f"{len(block.observations) / len(block.images):.0f} points an image, positions {ratios}, {found}")
+    return found
+
+
+def test_image_errors_that_are_alike_are_told_from_poor_positions() -> None:
+    """Errors alike over 400 of 4000 pixels, 16 points an image: residuals of so few points do not show it."""
+    truth = low_block(2, 90, 5)
+    (name, explains), *others = told(alike(truth, 2, 1.0, 400.0))
+    assert name.startswith("errors of image points that are alike over about 4") and explains > 0.9 and not others
+    (name, explains), *others = told(poor_positions(truth, 2, 0.06))
+    assert name.startswith("errors that are larger than stated: observed positions")
+    assert explains > 0.9 and not others
+
+
+@pytest.mark.slow
+def test_the_same_in_many_blocks_sparse_and_dense() -> None:
+    right = {"alike": [0, 0], "positions": [0, 0]}
+    for points in (60, 90, 130, 200, 500):
+        for seed in range(6 if points < 200 else 3):
+            truth = low_block(seed, points, 7)
+            for what, block in (
+                ("alike", alike(truth, seed, 1.0, 400.0)),
+                ("positions", poor_positions(truth, seed, 0.06)),
+            ):
+                try:
+                    found = told(block)
+                except GeometryError:  # An image with too few points in so sparse a block.
+                    continue
+                words = "alike over" if what == "alike" else "larger than stated: observed positions"
+                right[what][0] += bool(found) and words in found[0][0]
+                right[what][1] += 1
+                # The other one is never named.
+                assert not any(("alike over" in name) != (what == "alike") for name, _ in found)
+    print(right)
+    for good, of in right.values():
+        assert of >= 20 and good >= 0.9 * of
+
+
+def test_likelihood_of_components_against_written_out_densities() -> None:
+    """Two variances of a grouped mean (analysis of variance), where restricted likelihood has a closed form."""
+    rng, groups, each = np.random.default_rng(0), 12, 5
+    y = np.repeat(rng.normal(0, 2.0, groups), each) + rng.normal(0, 0.7, groups * each)
+    Z = np.repeat(np.eye(groups), each, axis=0)
+    K = np.linalg.svd(np.ones((1, len(y))))[2][1:].T
+    found = variance_components(K.T @ y, np.zeros((len(y) - 1,) * 2), [K.T @ K, K.T @ Z @ Z.T @ K], [1.0, 1.0])
+    means = y.reshape(groups, each).mean(axis=1)
+    within = ((y.reshape(groups, each) - means[:, None]) ** 2).sum() / (groups * (each - 1))
+    between = means.var(ddof=1) - within / each
+    assert found.variances == pytest.approx([within, between], rel=1e-3)
+    V = found.variances[0] * np.eye(len(y)) + found.variances[1] * Z @ Z.T
+    density = multivariate_normal(np.zeros(len(y) - 1), K.T @ V @ K).logpdf(K.T @ y)
+    assert found.deviance == pytest.approx(-2 * density - (len(y) - 1) * np.log(2 * np.pi))

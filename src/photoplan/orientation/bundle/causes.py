@@ -10,6 +10,7 @@ import numpy as np
 from photoplan.adjustment.chances import chance_gain
 from photoplan.errors import PhotoplanError
 from photoplan.orientation.bundle.adjust import adjust_block
+from photoplan.orientation.bundle.alike import likeness_of
 from photoplan.orientation.bundle.block import Adjusted, AdjustSettings, Block
 
 #: Plain least squares of all that is not a gross error of an image point: nothing is thrown out, nothing reweighted.
@@ -29,11 +30,13 @@ class Cause:
     name: str
     """As users call it."""
     explains: float
-    """Part of the sum of squared residuals that it takes away, 0 to 1."""
+    """Part of what does not fit that it takes away, 0 to 1."""
     change: float
     """By how much a camera constant changes, as a part of it; 0 for other causes."""
     remedy: str
     """What would regard it."""
+    measure: str = "squared residuals"
+    """What it takes away a part of; accuracies are weighed by the deviance, −2 times the logarithm of likelihood."""
 
 
 def doubtful(result: Adjusted) -> bool:
@@ -47,7 +50,8 @@ def weighed_causes(block: Block, result: Adjusted) -> tuple[Cause, ...]:
     """Causes that explain a good part of what does not fit, the likeliest first; empty where all is as stated.
 
     Each is an adjustment of the block with other unknowns, all control and positions included. It is named where
-    unknowns without meaning would hardly lower the sum of squares as much (F-test).
+    unknowns without meaning would hardly lower the sum of squares as much (F-test). What the best of them leaves is
+    weighed as errors of image points that are alike, and as other accuracies than stated, by their likelihood.
 
     Parameters
     ----------
@@ -69,7 +73,7 @@ def weighed_causes(block: Block, result: Adjusted) -> tuple[Cause, ...]:
     except PhotoplanError:
         return ()
     whole = base.sigma0**2 * base.redundancy
-    found: list[tuple[Cause, int]] = []
+    found: list[tuple[Cause, int, Block, Adjusted]] = []
     for name, remedy, other in _models(start):
         try:
             tried = adjust_block(other, _PLAIN)
@@ -81,11 +85,39 @@ def weighed_causes(block: Block, result: Adjusted) -> tuple[Cause, ...]:
         if chance_gain(whole, rest, more, tried.redundancy) < _CHANCE and (whole - rest) / whole > _EXPLAINS:
             changes = [a.c / block.cameras[a.name].c - 1 for a in tried.cameras if "c" in a.free]
             change = max(changes, key=abs, default=0.0) if "constant" in name else 0.0
-            found.append((Cause(name, (whole - rest) / whole, change, remedy), more))
+            found.append((Cause(name, (whole - rest) / whole, change, remedy), more, other, tried))
     # A simpler cause that explains nearly as much is the likelier one.
-    best = max((cause.explains for cause, _ in found), default=0.0)
+    best = max((cause.explains for cause, *_ in found), default=0.0)
     found.sort(key=lambda item: (item[0].explains < best - _MORE * (1 - best) - 0.02, item[1], -item[0].explains))
-    return tuple(cause for cause, _ in found)
+    other, tried = found[0][2:] if found else (start, base)
+    return (*(cause for cause, *_ in found), *_of_errors(other, tried, result))
+
+
+def _of_errors(block: Block, base: Adjusted, result: Adjusted) -> tuple[Cause, ...]:
+    """Other errors than stated: of image points that are alike, or larger ones of what else was observed.
+
+    Control that does not agree with the rest is wrong by itself, and has no part in this.
+    """
+    XYZ = np.where(result.ground_rejected, np.nan, block.ground.XYZ)
+    likeness = likeness_of(replace(block, ground=replace(block.ground, XYZ=XYZ)), base)
+    if likeness is None:
+        return ()
+    found = []
+    if likeness.alike:
+        name = (
+            f"errors of image points that are alike over about {float(f'{likeness.reach:.2g}'):.0f} px "
+            f"({likeness.share:.0%} of their variance)"
+        )
+        remedy = (
+            "look at the lens, the film and how points were measured; with many more points in each image the "
+            "adjustment regards it"
+        )
+        found.append(Cause(name, likeness.by_likeness, 0.0, remedy, "deviance"))
+    if likeness.worse:
+        groups = ", ".join(f"{name} ({times:.1f} times)" for name, times in likeness.worse)
+        name = f"errors that are larger than stated: {groups}"
+        found.append(Cause(name, likeness.by_accuracy, 0.0, "state their accuracy as it is", "deviance"))
+    return tuple(sorted(found, key=lambda cause: -cause.explains))
 
 
 def _models(block: Block) -> Iterator[tuple[str, str, Block]]:

@@ -108,7 +108,7 @@ def cause_notes(causes: Sequence[Cause], result: MapResult) -> tuple[str, ...]:
     if causes:
         words = ("likeliest cause of what does not fit", "next")
         return tuple(
-            f"{word}: {cause.name}, which explains {cause.explains:.0%} of the squared residuals; {cause.remedy}"
+            f"{word}: {cause.name}, which explains {cause.explains:.0%} of the {cause.measure}; {cause.remedy}"
             for word, cause in zip(words, causes)
         )
     positions = [
