@@ -26,7 +26,7 @@ def _look_up(table: NDArray[np.float32], distance: float) -> np.float32:
 
 
 @inner
-def _wide_weights(
+def axis_weights(
     table: NDArray[np.float32], place: tuple[Any, ...], stretch: float, size: int, weights: NDArray[Any]
 ) -> tuple[int, int, float, float]:
     """Weights of the pixels of one axis under the widened kernel.
@@ -158,8 +158,8 @@ def mean_at(
     wx, wy, patch, means = work
     base, _, totals = patch
     groups, height, width, lanes = source.shape
-    left, right, in_x, all_x = _wide_weights(table, (spot[0], spot[1]), spot[2], width, wx)
-    top, bottom, in_y, all_y = _wide_weights(table, (spot[3], spot[4]), spot[5], height, wy)
+    left, right, in_x, all_x = axis_weights(table, (spot[0], spot[1]), spot[2], width, wx)
+    top, bottom, in_y, all_y = axis_weights(table, (spot[3], spot[4]), spot[5], height, wy)
     if left >= right or top >= bottom:
         return 0.0, all_x * all_y
     ranges = (left, right, top, bottom)

@@ -25,7 +25,8 @@ def store(value: float, limits: tuple[Any, ...], out: NDArray[Any], place: tuple
 
 
 @inner
-def _weight(coefficients: NDArray[Any], column: int, g: float) -> float:
+def weight_of(coefficients: NDArray[Any], column: int, g: float) -> float:
+    """Weight of a tap, by Horner's rule."""
     value = 0.0
     for power in range(coefficients.shape[0] - 1, -1, -1):
         value = value * g + np.float64(coefficients[power, column])
@@ -50,12 +51,12 @@ def _tap_weights(
     total = 0.0
     for j in range(taps):
         y = row + j
-        wy = _weight(coefficients, half + j, gy) if 0 <= y < size[1] else 0.0
+        wy = weight_of(coefficients, half + j, gy) if 0 <= y < size[1] else 0.0
         for i in range(taps):
             x = col + i
             weight = 0.0
             if 0 <= y < size[1] and 0 <= x < size[0] and (valid.size == 0 or valid[y, x] != 0):
-                weight = wy * _weight(coefficients, i, gx)
+                weight = wy * weight_of(coefficients, i, gx)
             weights[j, i] = weight
             total += weight
     return total
@@ -96,7 +97,7 @@ def border_runs(
     result : tuple
         out (bands, rows, cols), out_valid (rows, cols).
     """
-    corner, first, part, kind, fill = block
+    corner, first, part, kind, fill, _ = block
     coefficients, taps, limits = rule
     out, out_valid = result
     size, lanes = (source.shape[2], source.shape[1]), source.shape[3]

@@ -107,7 +107,7 @@ def footprint_runs(
     See `place_runs` for the others.
     """
     relief, tilt = ground
-    corner, _, _, kind, fill = block
+    corner, _, _, kind, fill, _ = block
     work, origin, wider = slope_space(), np.empty(2), np.empty(RUN, np.bool_)
     slopes = work[2]
     rate = (STRETCH_FULL - 1.0) / (STRETCH_FULL - STRETCH_FROM)

@@ -52,7 +52,7 @@ def gather_runs(
         Tags for taps and lanes; see `gather`.
     out : (bands, rows, cols)
     """
-    corner, taps, part, kind, fill = block
+    corner, taps, part, kind, fill, _ = block
     taps_tag, lanes_tag = tags
     lanes = len(lanes_tag)
     groups, height, width, _ = source.shape

@@ -188,16 +188,16 @@ def _chunks(taps: int) -> list[tuple[int, int]]:
 
 
 def _emit(builder: Any, dtype: Any, taps: int, lanes: int, data: tuple[Any, Any, Any], place: tuple[Any, ...]) -> None:
-    """The code of one gather; `data` = source, coefficients, out; `place` = first, stride, gx, gy, at."""
+    """The code of one gather; `data` = source, coefficients, out; `place` = rows, gx, gy, at.
+
+    rows: first element of each row of taps; gx: one for all rows, or one for each.
+    """
     source, coefficients, out = data
-    first, stride, gx, gy, at = place
+    rows, gx, gy, at = place
     width = {1: 1, 2: 2, 4: 4, 6: 8}[taps]
-    weights = _weights(builder, coefficients, DEGREE[taps], width, (gx, gy))
-    is_float = isinstance(dtype, types.Float)
+    each = [_weights(builder, coefficients, DEGREE[taps], width, (x, gy)) for x in gx]
+    is_float, apart, weights = isinstance(dtype, types.Float), len(gx) > 1, each[0]
     middle = max(taps // 2 - 1, 0)
-    rows = [first]
-    for _ in range(taps - 1):
-        rows.append(builder.add(rows[-1], stride))
     if is_float:
         centre = builder.add(rows[middle], ir.IntType(64)(middle * lanes))
         base = _load(builder, source, centre, lanes)
@@ -210,13 +210,18 @@ def _emit(builder: Any, dtype: Any, taps: int, lanes: int, data: tuple[Any, Any,
             if is_float:
                 pixels = builder.fsub(pixels, _shuffle(builder, base, list(range(lanes)) * count))
             weight = _shuffle(builder, weights, [width + r] * (count * lanes))
+            if apart:
+                own = _shuffle(builder, each[r], [start + j for j in range(count) for _ in range(lanes)])
+                weight = builder.fmul(weight, own, flags=_FUSE)
             columns = (
                 builder.fmul(weight, pixels, flags=_FUSE)
                 if columns is None
                 else _fused(builder, weight, pixels, columns)
             )
-        weight = _shuffle(builder, weights, [start + j for j in range(count) for _ in range(lanes)])
-        part = _total(builder, builder.fmul(weight, columns, flags=_FUSE), lanes)
+        if not apart:
+            weight = _shuffle(builder, weights, [start + j for j in range(count) for _ in range(lanes)])
+            columns = builder.fmul(weight, columns, flags=_FUSE)
+        part = _total(builder, columns, lanes)
         total = part if total is None else builder.fadd(total, part, flags=_FUSE)
     if is_float:
         total = builder.fadd(total, base)
@@ -258,7 +263,42 @@ def gather(
         def data(position: Any) -> Any:
             return context.make_array(signature.args[position])(context, builder, value=args[position]).data
 
-        _emit(builder, dtype, taps, lanes, (data(0), data(5), data(8)), (args[1], args[2], args[3], args[4], args[9]))
+        rows = [args[1]]
+        for _ in range(taps - 1):
+            rows.append(builder.add(rows[-1], args[2]))
+        _emit(builder, dtype, taps, lanes, (data(0), data(5), data(8)), (rows, [args[3]], args[4], args[9]))
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@intrinsic
+def gather_apart(
+    typingctx: Any,
+    source: Any,
+    rows: Any,
+    gx: Any,
+    gy: Any,
+    coefficients: Any,
+    taps_tag: Any,
+    lanes_tag: Any,
+    out: Any,
+    at: Any,
+) -> Any:
+    """The vectors of `sampling.gather_apart`."""
+    taps, lanes, dtype = len(taps_tag), len(lanes_tag), source.dtype
+    signature = types.void(
+        source, rows, gx, types.float32, coefficients, taps_tag, lanes_tag, out, types.int64
+    )
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def data(position: Any) -> Any:
+            return context.make_array(signature.args[position])(context, builder, value=args[position]).data
+
+        def each(position: Any) -> Any:
+            return [builder.load(builder.gep(data(position), [ir.IntType(64)(r)])) for r in range(taps)]
+
+        _emit(builder, dtype, taps, lanes, (data(0), data(4), data(7)), (each(1), each(2), args[3], args[8]))
         return context.get_dummy_value()
 
     return signature, codegen

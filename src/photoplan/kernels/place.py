@@ -30,7 +30,8 @@ def empty_block(count: int) -> tuple[Any, ...]:
         taps (count, 2, RUN) int32: column and row of the first tap of each pixel;
         part (count, 2, RUN) float32: g along x and y;
         fill (count,) uint8: NOTHING, ALL, SOME;
-        kind (count, RUN) uint8: kind of each pixel, where `fill` is not ALL.
+        kind (count, RUN) uint8: kind of each pixel, where `fill` is not ALL;
+        ideal (count, RUN) float32: x of each pixel from `corner` on, without a field that belongs to rows; else unused.
     """
     return (
         np.empty((count, 2), np.int64),
@@ -38,6 +39,7 @@ def empty_block(count: int) -> tuple[Any, ...]:
         np.empty((count, 2, RUN), np.float32),
         np.empty((count, RUN), np.uint8),
         np.empty(count, np.uint8),
+        np.empty((count, RUN), np.float32),
     )
 
 
@@ -140,7 +142,8 @@ def place_runs(
         Number of BORDER pixels.
     """
     taps, width, height, solid, border = frame
-    corner, first, part, kind, fill = block
+    corner, first, part, kind, fill, ideal = block
+    by_rows = anchors[5].shape[2] == 5
     before, shift = max(taps // 2 - 1, 0), np.float32(0.5 if taps == 1 else 0.0)
     origin = np.empty(2)
     located_by = (origin, np.empty((4, 3)), cell_space())
@@ -156,6 +159,9 @@ def place_runs(
             np.float32(border[2] - origin[0]),
             np.float32(border[3] - origin[1]),
         )
+        if by_rows:
+            for i in range(n):
+                ideal[k, i] = located_by[2][1][i] + np.float32(before)
         x0, y0 = np.int64(origin[0]) - before, np.int64(origin[1]) - before
         corner[k, 0], corner[k, 1] = x0, y0
         reach = (_limit(-x0), _limit(-y0), _limit(width - taps - x0), _limit(height - taps - y0))

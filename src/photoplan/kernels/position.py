@@ -214,7 +214,8 @@ def locate_run(
         A line of `tile_runs`.
     heights : (n,) float32
     frame : (origin (2,), coef (4, 3), working space for the field)
-        Filled: the whole source pixel to be added to dx, dy; the coefficients of the highest box.
+        Filled: the whole source pixel to be added to dx, dy; the coefficients of the highest box; of a field that
+        belongs to rows, the x without it in the second part of the working space.
     dx, dy : (n,) float32
         Filled. With several boxes piled up, a pixel keeps what the highest box not above it says; heights below the
         lowest box are taken by that one.
@@ -234,7 +235,9 @@ def locate_run(
             higher = np.empty((2, RUN), np.float32)
             _run_positions(coef, run[3] - u_ref, heights, h_ref, higher[0], higher[1])
             _keep_from(heights, np.float32(box_heights[box, 0]), higher[0], higher[1], dx, dy)
-    if field.shape[2] == 4:
+    if field.shape[2] == 5:
+        for i in range(dx.shape[0]):
+            work[1][i] = dx[i]
         add_rows(field_frame, field, origin, heights, dx, dy)
     elif field.size > 0:
         find_cells(field_frame, field, origin, dx, dy, work)

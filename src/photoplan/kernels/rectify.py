@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.kernels.apart import apart_runs
 from photoplan.kernels.area import average_runs
 from photoplan.kernels.border import border_runs
 from photoplan.kernels.footprint import average_along_runs, footprint_runs
@@ -27,7 +28,7 @@ from photoplan.kernels.weights import KERNELS, weight_table
 
 AnchorArrays = tuple[NDArray[Any], ...]
 """rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3), field_frame (5,), field (rows, cols, 2);
-or, of a flight that changes from line to line, (6,) and (rows, cols + 1, 4)."""
+or, of a flight that changes from line to line, (6,) and (rows, cols, 5)."""
 
 Border = tuple[float, float, float, float]
 """Outer edges of the image x_min, y_min, x_max, y_max in pixels of the source window."""
@@ -73,7 +74,7 @@ def rectify_tile(
     ----------
     anchors : tuple of arrays
         rects (m, 4) int32, box_start (m + 1,) int32, box_heights (n, 2) float64, corners (n, 8, 3) float64,
-        field_frame (5,) float64, field (rows, cols, 2) float32, or (6,) and (rows, cols + 1, 4): the fields of
+        field_frame (5,) float64, field (rows, cols, 2) float32, or (6,) and (rows, cols, 5): the fields of
         `photoplan.plan.Anchors`.
     relief : ndarray, shape (rows, cols), float32
         Height of every pixel, metres; NaN where there is no surface.
@@ -178,14 +179,20 @@ def _block(
     coefficients, tags, limits = _rule(name, packed.dtype, lanes)
     taps = KERNELS[name].taps
     relief, tilt = ground
+    by_rows = anchors[5].shape[2] == 5
     doubtful = place_runs(anchors, runs, relief, offset, (taps, width, height, solid, edges), block, result[1])
     averaged = 0
+    scales = np.empty((0, 2, RUN), np.float32)
     if averaging:
         scales = np.empty((len(runs), 4 if tilt.size else 2, RUN), np.float32)
         if tilt.size:
             averaged = footprint_runs(anchors, runs, ground, offset, block, scales)
         else:
             averaged = stretch_runs(anchors, runs, relief, offset, block, scales)
+    if by_rows:
+        rule = (coefficients, taps, weight_table(name), limits)
+        apart_runs((packed, mask, solid), anchors, runs, (relief, offset), block, scales, rule, tags, result)
+        return
     gather_runs(packed, runs, offset, block, coefficients, tags, result[0])
     if doubtful:
         border_runs(packed, mask, runs, offset, block, (coefficients, taps, limits), result)

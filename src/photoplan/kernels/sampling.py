@@ -98,6 +98,43 @@ def gather_loops(
 
 
 @maker
+def gather_apart_loops(
+    source: NDArray[Any],
+    rows: NDArray[np.int64],
+    gx: NDArray[np.float32],
+    gy: float,
+    coefficients: NDArray[Any],
+    taps_tag: tuple[Any, ...],
+    lanes_tag: tuple[Any, ...],
+    out: NDArray[Any],
+    at: int,
+) -> None:
+    """As `gather`, of rows that lie apart: each has a first element and a fraction of its own.
+
+    Parameters
+    ----------
+    rows : (taps,) int64
+        Element of the first tap of each row.
+    gx : (taps,) float32
+        x − floor(x) − 1/2 in each row.
+    """
+    taps, lanes, width = len(taps_tag), len(lanes_tag), coefficients.shape[1] // 2
+    low, high, half = _limits(source)
+    flat, middle, y = source.ravel(), max(taps // 2 - 1, 0), np.float32(gy)
+    for lane in range(lanes):
+        base = np.float32(0.0) if half > 0 else np.float32(flat[rows[middle] + middle * lanes + lane])
+        value = base
+        for r in range(taps):
+            line = np.float32(0.0)
+            for i in range(taps):
+                line += _weight(coefficients, i, gx[r]) * (np.float32(flat[rows[r] + i * lanes + lane]) - base)
+            value += _weight(coefficients, width + r, y) * line
+        if half > 0:
+            value = min(max(np.trunc(value + np.copysign(half, value)), low), high)
+        out[at * lanes + lane] = value
+
+
+@maker
 def add_block_loops(
     source: NDArray[Any],
     place: tuple[Any, ...],
@@ -142,4 +179,5 @@ def block_pixels(lanes_tag: tuple[Any, ...]) -> int:
 
 
 gather = numba_parts.gather if numba_parts.USABLE else gather_loops
+gather_apart = numba_parts.gather_apart if numba_parts.USABLE else gather_apart_loops
 add_block = numba_parts.add_block if numba_parts.USABLE else add_block_loops

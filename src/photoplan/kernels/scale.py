@@ -242,7 +242,7 @@ def stretch_runs(
 
     See `place_runs` for the others.
     """
-    corner, _, _, kind, fill = block
+    corner, _, _, kind, fill, _ = block
     work, no_tilt, wider = slope_space(), np.empty((2, 0), np.float32), np.empty(RUN, np.bool_)
     slopes, origin = work[2], np.empty(2)
     count = 0

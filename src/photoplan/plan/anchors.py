@@ -43,9 +43,9 @@ class Anchors:
     height of its values, metres."""
     field: NDArray[np.float32]
     """(rows, columns, 2): what is added to x and y at the nodes; (0, 0, 2): the projection has no field. Positions
-    beyond the nodes are not in the image. (rows, columns + 1, 4): a field that belongs to rows (a turbulent flight):
-    nodes lie at ideal x and *real* y; the last two are the changes per metre of height; the last column holds the
-    furthest ideal row, in nodes, that any row up to it sees, whatever the x and the height."""
+    beyond the nodes are not in the image. (rows, columns, 5): a field that belongs to rows (a turbulent flight):
+    nodes lie at ideal x and *real* y; then follow the changes per metre of height, and the furthest ideal row, pixels
+    from the first node, that any row up to this one sees between this column and the next, whatever the height."""
     residual: float
     """Worst difference to the strict position, pixels: of the boxes, measured at their centre, face and edge middles,
     plus of the field, measured in and beside its cells' middles, and at declared breaks."""

@@ -38,7 +38,7 @@ class TremorTable:
     height: float
     """Of the values, metres."""
     nodes: NDArray[np.float32]
-    """(rows, columns + 1, 4): real minus ideal position, and its change per metre of height; and how far rows come, see
+    """(rows, columns, 5): real minus ideal position, its change per metre of height, and how far rows come, see
     `Anchors.field`."""
     residual: float
     """Worst difference to the strict position, pixels, but for points that pass through the line very slowly."""
@@ -76,11 +76,11 @@ def tremor_table(part: TremorPart, width: int, heights: tuple[float, float], tol
     stretch = _stretch(nodes, half)
     k = np.unique(np.r_[np.argsort(stretch)[-_MEASURED:], np.linspace(0, len(stretch) - 1, _MEASURED)].astype(np.int64))
     missed = float(np.nanmax(_missed(part, columns, rows, nodes, (middle, half), k + 1) * stretch[k], initial=0.0))
-    kept = np.zeros((len(rows), len(columns) + 1, 4), np.float32)
-    kept[:, :-1] = nodes
     come = np.arange(len(rows))[:, None] - nodes[..., 1] + half * np.abs(nodes[..., 3])
+    come[:, :-1] = np.maximum(come[:, :-1], come[:, 1:])
     # Rows without orientation see nothing.
-    kept[:, -1, 0] = np.fmax.accumulate(np.nan_to_num(come.max(axis=1), nan=-np.inf)) + 1e-3
+    come = np.fmax.accumulate(np.nan_to_num(come, nan=-np.inf), axis=0) + 1e-3
+    kept = np.concatenate([nodes, come[..., None]], axis=-1).astype(np.float32)
     furthest = np.nanmax(np.abs(nodes), axis=(0, 1), initial=0.0)
     around = half * furthest[2:]
     last_digits = [float(np.spacing(np.float32(each.max()))) for each in (furthest[:2], furthest[2:])]
