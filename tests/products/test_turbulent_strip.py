@@ -77,15 +77,19 @@ def test_the_orthophoto_of_a_turbulent_strip_is_where_the_truth_is(
     ground = vienna.heights(np.stack([X, Y], axis=-1))
     steep = ndimage.binary_dilation(np.hypot(*np.gradient(ground, 0.3)) > 0.7, iterations=8)
     grey = values[2] - vienna.grey(np.stack([X, Y], axis=-1))
-    for away in (0, 1, 2):
+    for away in (0, 1, 2, 6):
         part = (ndimage.binary_erosion(valid, iterations=away) if away else valid) & ~steep
         told = f"rms {np.sqrt((error[part] ** 2).mean() / 2):.4f} px, worst {error[part].max():.3f} px"
-        told += f", {np.percentile(error[part], 99.9):.3f} px in all but a thousandth"
+        told += f", {np.percentile(error[part], 99.9):.3f} px in all but a thousandth, {(error[part] > 0.3).sum()} over 0.3"
         print(f"\n{name}, {away} pixels from the border: {told}; grey values {grey[part].std():.2f}")
     whole = ndimage.binary_erosion(valid, iterations=2) & ~steep
     assert valid.mean() > 0.5 and steep.mean() < 0.1
-    worst = np.percentile(error[whole], 100.0 if ahead == 0.0 else 99.9)
-    assert np.sqrt((error[whole] ** 2).mean() / 2) < 0.1 and worst < 0.3
+    # Lines end where they have been shifted to: the border is ragged by a few pixels, and rows are missing there.
+    inner = ndimage.binary_erosion(valid, iterations=6) & ~steep
+    assert np.sqrt((error[whole] ** 2).mean() / 2) < 0.01 and np.percentile(error[whole], 99.9) < 0.1
+    assert error[inner].max() < (0.03 if ahead == 0.0 else 0.3)
+    # What cubic convolution makes of the picture; rows 3 px apart that are mixed at one column: 3.7.
+    assert grey[inner].std() < 1.4
     # Along the border too: no saw teeth.
     rim = ndimage.binary_erosion(valid, iterations=1) & ~ndimage.binary_erosion(valid, iterations=4) & ~steep
     assert np.sqrt((error[rim] ** 2).mean() / 2) < 0.1

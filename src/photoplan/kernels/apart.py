@@ -18,6 +18,9 @@ from photoplan.kernels.place import ALL, AVERAGE, EMPTY, INTERIOR
 from photoplan.kernels.rows import column_of, shift_across
 from photoplan.kernels.sampling import gather_apart
 
+MOST_TILT = 0.8
+"""Rows that are left beside a place are balanced by weights that change by this part from row to row at most."""
+
 
 @inner
 def _weights(
@@ -49,15 +52,17 @@ def _mean_of_rows(
 ) -> tuple[float, float]:
     """Mean of the rows around a place, each at its own x; the weight of the pixels that are usable, and of all.
 
+    Where rows end before the place (at ragged borders) the others still show a ramp where it is.
+
     lines = (frame, nodes, place in the nodes); spot = (ideal x, y, widening along x, along y). The mean of each band is
     in the last of `work`, if there is any usable weight.
     """
     frame, nodes, place = lines
-    wx, wy, base, means = work
+    wx, wy, base, steep, means = work
     groups, height, width, lanes = source.shape
     half, bands = rule[0].shape[1] // 2, means.shape[0]
     top, bottom, in_y, all_y = _weights(rule, half, (spot[1], spot[3]), height, wy)
-    usable, total, last, first = 0.0, 0.0, 1.0, True
+    usable, total, last, first, s1, s2 = 0.0, 0.0, 1.0, True, 0.0, 0.0
     for row in range(top, bottom):
         x = spot[0] + shift_across(frame, nodes, np.float64(row), place)
         if not abs(x) < 1e9:
@@ -65,22 +70,27 @@ def _mean_of_rows(
         down = np.float64(wy[BEFORE + row - top])
         left, right, _, last = _weights(rule, 0, (x, spot[2]), width, wx)
         total += down * last
+        away = row - spot[1]
         for col in range(left, right):
             if valid.size > 0 and valid[row, col] == 0:
                 continue
             weight = down * np.float64(wx[BEFORE + col - left])
-            usable += weight
+            usable, s1, s2 = usable + weight, s1 + weight * away, s2 + weight * away * away
             # Relative to one of the pixels, so that a constant image stays constant to the last bit.
             for band in range(bands):
                 value = np.float64(source[band // lanes, row, col, band % lanes])
                 if first:
-                    base[band], means[band] = value, 0.0
+                    base[band], means[band], steep[band] = value, 0.0, 0.0
                 means[band] += weight * (value - base[band])
+                steep[band] += weight * away * (value - base[band])
             first = False
     total += (all_y - in_y) * last
+    # Factors 1 and (row − y) · tilt of the weights, so that they are balanced about the place.
+    uneven = abs(s1) > 1e-5 * usable and abs(s1) < MOST_TILT * s2 and spot[3] <= 1.0
+    tilt = -s1 / s2 if uneven else 0.0
     if usable > 0.0:
         for band in range(bands):
-            means[band] = base[band] + means[band] / usable
+            means[band] = base[band] + (means[band] + tilt * steep[band]) / (usable + tilt * s1)
     return usable, total
 
 
@@ -146,7 +156,7 @@ def apart_runs(
     coefficients, taps = rule[0], rule[1]
     groups, height, width, lanes = source.shape
     wx, wy = np.zeros(width + 3 * BEFORE, np.float32), np.zeros(height + 3 * BEFORE, np.float32)
-    work = (wx, wy, np.zeros(out.shape[0]), np.zeros(out.shape[0]))
+    work = (wx, wy, np.zeros(out.shape[0]), np.zeros(out.shape[0]), np.zeros(out.shape[0]))
     columns, across, places = np.zeros(6, np.int64), np.zeros(6, np.float32), np.zeros(6, np.int64)
     buffer, before = np.zeros(4, source.dtype), max(taps // 2 - 1, 0)
     for k in range(runs.shape[0]):
@@ -178,6 +188,6 @@ def apart_runs(
             out_valid[row, col + i] = good
             for band in range(out.shape[0]):
                 if good:
-                    store(work[3][band], rule[3], out, (band, row, col + i))
+                    store(work[4][band], rule[3], out, (band, row, col + i))
                 else:
                     out[band, row, col + i] = 0
