@@ -14,7 +14,7 @@ HEIGHT = 40.0
 
 
 def anchors(scale: float, shifts: NDArray[np.float64] | None, late: float = 0.0) -> tuple[NDArray, ...]:
-    """One box over a tile of 24 × 24 pixels: x and y from 14.27 and 15.21 on, `scale` source pixels from pixel to pixel.
+    """One box over a tile of 24 × 24 pixels: x and y from 14.27 and 15.21 on, a `scale` from pixel to pixel.
 
     `shifts` (rows,): how far each row of the source lies beside; half of it as a change per metre of height.
     """

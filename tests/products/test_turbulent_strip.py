@@ -80,7 +80,9 @@ def test_the_orthophoto_of_a_turbulent_strip_is_where_the_truth_is(
     for away in (0, 1, 2, 6):
         part = (ndimage.binary_erosion(valid, iterations=away) if away else valid) & ~steep
         told = f"rms {np.sqrt((error[part] ** 2).mean() / 2):.4f} px, worst {error[part].max():.3f} px"
-        told += f", {np.percentile(error[part], 99.9):.3f} px in all but a thousandth, {(error[part] > 0.3).sum()} over 0.3"
+        told += (
+            f", {np.percentile(error[part], 99.9):.3f} px in all but a thousandth, {(error[part] > 0.3).sum()} over 0.3"
+        )
         print(f"\n{name}, {away} pixels from the border: {told}; grey values {grey[part].std():.2f}")
     whole = ndimage.binary_erosion(valid, iterations=2) & ~steep
     assert valid.mean() > 0.5 and steep.mean() < 0.1

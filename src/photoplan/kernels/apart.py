@@ -59,7 +59,7 @@ def _mean_of_rows(
     """
     frame, nodes, place = lines
     wx, wy, base, steep, means = work
-    groups, height, width, lanes = source.shape
+    _, height, width, lanes = source.shape
     half, bands = rule[0].shape[1] // 2, means.shape[0]
     top, bottom, in_y, all_y = _weights(rule, half, (spot[1], spot[3]), height, wy)
     usable, total, last, first, s1, s2 = 0.0, 0.0, 1.0, True, 0.0, 0.0

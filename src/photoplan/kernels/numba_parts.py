@@ -287,9 +287,7 @@ def gather_apart(
 ) -> Any:
     """The vectors of `sampling.gather_apart`."""
     taps, lanes, dtype = len(taps_tag), len(lanes_tag), source.dtype
-    signature = types.void(
-        source, rows, gx, types.float32, coefficients, taps_tag, lanes_tag, out, types.int64
-    )
+    signature = types.void(source, rows, gx, types.float32, coefficients, taps_tag, lanes_tag, out, types.int64)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         def data(position: Any) -> Any:

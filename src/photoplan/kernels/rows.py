@@ -1,7 +1,7 @@
 """A field that belongs to the rows of the image: at which row of a turbulent flight each pixel of a run is seen.
 
-Nodes are (rows, columns, 5): shift along x and y, the change of both per metre of height, and the furthest ideal row that
-any row up to this one sees between this column of nodes and the next.
+Nodes are (rows, columns, 5): shift along x and y, the change of both per metre of height, and the furthest ideal row
+that any row up to this one sees between this column of nodes and the next.
 """
 
 from __future__ import annotations
