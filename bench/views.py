@@ -5,9 +5,9 @@
 1024 × 763 pixels over 693 × 720 cells, 2000 × 1500 over 4000 × 4000 cells of rough terrain made here; flat earth. Each
 run is a process of its own, of which the seconds after the imports are counted (reading the terrain, loading kernels
 and drivers included), and the peak memory of the whole. VTK makes a mesh of the posts, a picture and the depth buffer;
-photoplan the nine bands of the matrix and a picture of tints and shades, one ray a pixel. The height error is that of
-the point of each pixel over the bilinear posts below it. Without pyvista (installed into an environment of its own when
-first needed) VTK is left out.
+photoplan the nine bands of the matrix and a picture of tints and shades, one ray a pixel, tile by tile. The height
+error is that of the point of each pixel over the bilinear posts below it. Without pyvista (installed into an
+environment of its own when first needed) VTK is left out.
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ import json
 import statistics
 import subprocess
 import sys
-import time
 import venv
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -101,49 +99,6 @@ def prepare_case(case: Case) -> None:
     (case.folder / "case.json").write_text(json.dumps(told))
 
 
-def photoplan_view(case: Path, out: Path) -> None:
-    """Matrix and picture by this checkout's parts, tile by tile on two threads, without writing files."""
-    from photoplan.geometry.grid import Window  # noqa: PLC0415
-    from photoplan.plan.tiles import Tile  # noqa: PLC0415
-    from photoplan.products.view import job, make  # noqa: PLC0415
-    from photoplan.products.view.camera import CameraRequest  # noqa: PLC0415
-    from photoplan.products.view.content import Scene  # noqa: PLC0415
-    from photoplan.surfaces.seen import Seen  # noqa: PLC0415
-
-    told = json.loads(case.read_text())
-    marks = [(time.perf_counter(), time.process_time())]
-    x, y, z = told["center"]
-    camera = CameraRequest(position=(x, y), altitude=z, azimuth=told["azimuth"], pitch=told["pitch"],
-                           field_of_view=told["field_of_view"], size=tuple(told["size"]), curvature="none")  # fmt: skip
-    address = make.plan_view(make.ViewRequest(Path(told["terrain"]), camera)).address
-    view = address.open()
-    windows = [*view.target.window.tiles(make.TILE)]
-    width, height = view.target.bundle.size
-    bands, picture = np.full((9, height, width), np.nan), np.empty((3, height, width), np.uint8)
-    known: dict[Window, Seen] = {}
-
-    def ground(window: Window) -> None:
-        # With a pixel more all round, as pictures need it.
-        around = Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2) & view.target.window
-        known[around] = view.surface.look(view.target, around)
-        found = job.matrix_bands(view.target, known[around].part(*window.slices(around)))
-        if found is not None:
-            bands[:, *window.slices(view.target.window)] = found[0]
-
-    def paint(window: Window) -> None:
-        scene = Scene.of(view.target, Tile(0, window), known.__getitem__, view.surface, "bicubic")
-        picture[:, *window.slices(view.target.window)] = job.colours_of(scene, view, address.look)
-
-    with ThreadPoolExecutor(2) as pool:
-        for step in (ground, paint):
-            [*pool.map(step, windows)]
-            marks.append((time.perf_counter(), time.process_time()))
-    np.save(out / "matrix.npy", bands[:3])
-    np.save(out / "picture.npy", np.moveaxis(picture, 0, -1))
-    steps = {name: [b - a for a, b in zip(marks[k], marks[k + 1])] for k, name in enumerate(("matrix", "picture"))}
-    (out / "times.json").write_text(json.dumps(steps))
-
-
 def install_pyvista() -> Path:
     """Python with pyvista, in an environment of its own."""
     python = PYVISTA / "bin" / "python"
@@ -197,7 +152,7 @@ def report_views(quick: bool, repeat: int = 3) -> list[dict]:
     """All rows, printed and as values."""
     rows = []
     print("\nPerspective views: ground of every pixel and a picture")
-    ours = [sys.executable, Path(__file__), "--child"]
+    ours = [sys.executable, HERE / "view_photoplan.py"]
     for case in CASES[:1] if quick else CASES:
         prepare_case(case)
         programs: dict[str, list[object]] = {"photoplan": ours}
@@ -242,9 +197,6 @@ def report_views(quick: bool, repeat: int = 3) -> list[dict]:
 
 
 def main() -> int:
-    if sys.argv[1:2] == ["--child"]:
-        photoplan_view(Path(sys.argv[2]), Path(sys.argv[3]))
-        return 0
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="the smaller size only")
     parser.add_argument("--repeat", type=int, default=3, metavar="N", help="runs of each program [3]")

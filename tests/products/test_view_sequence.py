@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -97,10 +99,29 @@ def test_a_film_needs_ffmpeg(small: Block, path: Path, tmp_path: Path, monkeypat
     said = sequence(small, path, tmp_path / "f", *words)
     assert said.code == 0, said.err
     told = (tmp_path / "film.mp4").read_text()
-    assert "-framerate 10" in told and "frame_%05d.png" in told
+    assert "-framerate 10" in told and "frame_%05d.png" in told and "-frames:v 2" in told
     program.write_text("#!/bin/sh\necho no such encoder >&2\nexit 1\n")
     said = sequence(small, path, tmp_path / "f", *words, "--overwrite")
     assert said.code == 1 and "no such encoder" in said.err and (tmp_path / "film.mp4").read_text() == told
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg on the PATH")
+def test_ffmpeg_joins_the_pictures_of_this_run(small: Block, path: Path, tmp_path: Path) -> None:
+    """A longer run before left more pictures in the folder: they are told, and are not part of the film."""
+    out, film = tmp_path / "f", tmp_path / "film.mp4"
+    words = ("--look-at", X0 + 60, Y0 + 90, "--size", 63, 47)
+    assert sequence(small, path, out, "--step", 25, *words).code == 0
+    words = (*words[:3], *LOOK[3:-1], "--size", 63, 47, "--step", 75, "--video", film, "--rate", 10, "--overwrite")
+    said = inside("view", "sequence", small.terrain, "--path", path, "--height", 40, *words, "-o", out)
+    assert said.code == 0, said.err
+    assert "holds 4 more pictures" in said.err and "frame_00004.png" in said.err
+    # Decoded again: three pictures, sides made even, alike but for what H.264 loses.
+    ffmpeg = ["ffmpeg", "-y", "-loglevel", "error", "-i", str(film), str(tmp_path / "again_%d.png")]
+    subprocess.run(ffmpeg, check=True)
+    assert len([*tmp_path.glob("again_*.png")]) == 3
+    again, frame = pixels(tmp_path / "again_3.png"), pixels(out / "frame_00003.png")
+    assert again.shape == (3, 48, 64)
+    assert np.abs(again[:, :47, :63].astype(int) - frame).mean() < 12
 
 
 def test_what_makes_no_path_is_refused(small: Block, path: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ _OF_PHOTO = ("border", "search", "control", "picture", "refine", "focal", "refin
 @click.option("--control", type=PATH, metavar="TABLE", help="Points of the photograph: x, y, E, N, H, name.")
 @click.option("--picture", type=PATH, metavar="PNG", help="The photograph with both lines.")
 @click.option("--refine", is_flag=True, default=None, help="Turn the camera until both lines agree.")
-@click.option("--focal", is_flag=True, default=None, help="Alter its field of view, too.")
+@click.option("--focal", is_flag=True, default=None, help="Alter its camera constant, too.")
 @click.option("--refined", type=PATH, metavar="TOML", help="Write the camera that was found.")
 @click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="CSV, or GeoPackage of points.")
 @ending()
@@ -84,5 +84,7 @@ def told(found: Any) -> list[str]:
         r = found.refined
         rows = zip(r.names, r.after, r.sigma, r.before)
         lines += [f"{name} {after:.4f} ±{sigma:.4f} {r.unit} (was {before:.4f})" for name, after, sigma, before in rows]
+        if r.constant is not None:
+            lines.append(f"camera constant {r.constant[0]:.6f} ±{r.constant[1]:.6f} times that of its camera")
         lines.append(f"from {r.used} columns, of which about {r.correlated:.0f} err together; the standpoint was held")
     return lines

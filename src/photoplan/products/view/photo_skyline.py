@@ -128,7 +128,7 @@ def against_photo(
     Raises
     ------
     UsageError
-        A turn of what is no plane picture, of raised heights, or the camera constant of an image of the project.
+        A turn of what is no plane picture, or of raised heights.
     InputError
         The photograph or the control cannot be used.
     GeometryError
@@ -137,8 +137,6 @@ def against_photo(
     target, size = camera.target, camera.target.bundle.size
     if camera.request.exaggeration != 1.0:
         raise UsageError("a photograph shows heights as they are; leave `exaggeration` away")
-    if request.focal and camera.request.image is not None:
-        raise UsageError("the camera constant of an image is that of its camera in the project; leave `focal` away")
     reader = Photo.open(PhotoRequest(str(request.photo)), size).reader
     control = None if request.control is None else _control(request.control)
     search = max(2, round(_SEARCH * size[1])) if request.search is None else request.search

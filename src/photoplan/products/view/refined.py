@@ -42,11 +42,15 @@ class RefinedCamera:
     """Columns that err together, see `orientation.skyline`."""
     text: str
     """The file that holds it."""
+    constant: tuple[float, float] | None = None
+    """Of an image, where it was free: the factor of its camera's constant, and the standard deviation of that."""
 
     def json_fields(self) -> dict[str, Any]:
         """Its numbers."""
         rows = zip(self.names, self.before, self.after, self.sigma)
         told = {name: {"before": b, "after": a, "sigma": s} for name, b, a, s in rows}
+        if self.constant is not None:
+            told["constant_factor"] = {"before": 1.0, "after": self.constant[0], "sigma": self.constant[1]}
         return {"unit": self.unit, **told, "columns_used": self.used, "columns_correlated": self.correlated}
 
 
@@ -66,10 +70,16 @@ def refined_camera(camera: ViewCamera, match: PhotoMatch, ground: ViewGround, pa
     D = by_differences(numbers, match.turn, 1e-6)
     sigma = np.sqrt(np.diag(D @ match.fit.covariance @ D.T))
     count = len(names) if of_image else len(match.turn)
-    text = _orientation_text(camera, ground, after, path) if of_image else _camera_text(camera.request, after)
+    constant = None
+    if of_image and len(match.turn) > 3:
+        factor = math.exp(match.turn[3])
+        constant = factor, factor * math.sqrt(match.fit.covariance[3, 3])
+    text = _camera_text(camera.request, after)
+    if of_image:
+        text = _orientation_text(camera, ground, after, path, constant)
     told = (tuple(float(v) for v in row[:count]) for row in (before, after, sigma))
     b, a, s = told
-    return RefinedCamera(names[:count], b, a, s, unit, match.fit.used, match.fit.correlated, text)
+    return RefinedCamera(names[:count], b, a, s, unit, match.fit.used, match.fit.correlated, text, constant)
 
 
 def write_refined(path: Path, refined: RefinedCamera) -> None:
@@ -113,7 +123,9 @@ def _camera_text(request: CameraRequest, after: _Floats) -> str:
     return "\n".join([*lines, *(f"{n} = {toml_value(v)}" for n, v in told), ""])
 
 
-def _orientation_text(camera: ViewCamera, ground: ViewGround, after: _Floats, path: Path | None) -> str:
+def _orientation_text(
+    camera: ViewCamera, ground: ViewGround, after: _Floats, path: Path | None, constant: tuple[float, float] | None
+) -> str:
     """An orientation file of one image."""
     project = ground.named
     image = project.image(str(camera.request.image))
@@ -124,4 +136,8 @@ def _orientation_text(camera: ViewCamera, ground: ViewGround, after: _Floats, pa
     table = OrientationTable(
         file, (line,), stated.angle_unit, stated.rotation, crs=project.crs, height_system=stated.height_system
     )
-    return render(OrientationBlock(table), file)[file]
+    note = ""
+    if constant is not None:
+        factor, sigma = constant
+        note = f"# Its camera constant is {factor:.7f} (±{sigma:.7f}) times that of its camera: alter it there, too.\n"
+    return note + render(OrientationBlock(table), file)[file]

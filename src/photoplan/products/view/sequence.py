@@ -140,8 +140,14 @@ def make_sequence(request: SequenceRequest, plans: list[ViewPlan], run: Run) -> 
     run.events.begin(request.output.name, sum(tiles))
     with open_workers(run.executor, run.workers, question, run.events) as workers, together():
         frames = Runner[Path](workers, run.in_flight(workers.threads), run.events).run(works(workers))
+    more = sorted({*request.output.glob("frame_*.png")} - {plan.request.output for plan in plans})
+    if more:
+        run.events.talk(
+            f"{request.output} holds {len(more)} more pictures, of an earlier run or another path, {more[0].name} the "
+            "first of them: remove them before other programs join the pictures"
+        )
     if request.video is not None:
-        write_film(request.video, request.output, request.rate)
+        write_film(request.video, request.output, request.rate, len(frames))
     return Sequence(tuple(frames), sum(kept), request.video)
 
 
@@ -155,8 +161,8 @@ def _path_of(work: Work[Any]) -> Any:
     return lambda tally: work.complete(tally).path
 
 
-def write_film(path: Path, folder: Path, rate: float) -> None:
-    """Join the pictures of a folder by ffmpeg (H.264; sides are made even).
+def write_film(path: Path, folder: Path, rate: float, count: int) -> None:
+    """Join the first `count` pictures of a folder by ffmpeg (H.264; sides are made even).
 
     Raises
     ------
@@ -166,7 +172,7 @@ def write_film(path: Path, folder: Path, rate: float) -> None:
     part = path.with_name(f".{path.stem}.part.mp4")
     pictures = str(folder / "frame_%05d.png")
     words = ["ffmpeg", "-y", "-loglevel", "error", "-framerate", f"{rate:g}", "-i", pictures, "-pix_fmt", "yuv420p"]
-    words += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", str(part)]
+    words += ["-frames:v", str(count), "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", str(part)]
     try:
         said = subprocess.run(words, capture_output=True, text=True, check=False)
         if said.returncode != 0 or not part.is_file():
