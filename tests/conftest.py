@@ -56,6 +56,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: order.get(item.path, len(order)))
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Figures are drawn in full for those tests that look at them; no kernel is compiled twice."""
+    from tools import compiled_once, sketched
+
+    sketched.begin(item)
+    compiled_once.wait_for_each_other()
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder with test data beside the checkout."""

@@ -105,6 +105,7 @@ def test_what_is_not_known_is_refused_before_any_work(photoplan: Here, tmp_path:
     assert not (tmp_path / "products").exists()
 
 
+@pytest.mark.drawn
 def test_it_is_drawn(photoplan: Here, stated: Path) -> None:
     pytest.importorskip("matplotlib")
     said = photoplan("ortho", stated, *ONE[:-1])

@@ -67,6 +67,7 @@ def test_what_is_not_stated_is_free_of_error_and_said(photoplan: Here) -> None:
     assert "limited by" in said.out and "corner: terrain (100%)" in said.out
 
 
+@pytest.mark.drawn
 def test_of_a_project(photoplan: Here, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     block = write_block(tmp_path)

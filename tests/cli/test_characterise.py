@@ -138,6 +138,7 @@ def test_linearity_ends_where_the_sensor_saturates(told):
     assert found["response"]["value"] == pytest.approx(0.4 * 0.5 * PHOTONS_PER_MS, rel=0.01)
 
 
+@pytest.mark.drawn
 def test_report_tables_and_json(folder, tmp_path, run):
     report, tables = tmp_path / "r.html", tmp_path / "csv"
     said = run("characterise", folder / "series.toml", "--report", report, "--csv", tables)

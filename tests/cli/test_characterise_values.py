@@ -79,7 +79,9 @@ def usual(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], flo
     return found
 
 
-@pytest.mark.parametrize(("factor", "kind"), [(16.0, "uint16"), (1 / 4095, "float32")])
+@pytest.mark.parametrize(
+    ("factor", "kind"), [(16.0, "uint16"), pytest.param(1 / 4095, "float32", marks=pytest.mark.slow)]
+)
 def test_the_unit_of_grey_values_changes_nothing_else(
     tmp_path: Path, usual: dict[tuple[str, str], float], factor: float, kind: str
 ) -> None:
@@ -115,7 +117,7 @@ def test_dark_frames_of_another_temperature_are_left_out(tmp_path: Path) -> None
     assert parts["fixed_pattern"]["details"]["dsnu"]["setting"].endswith("20 °C")
 
 
-@pytest.mark.parametrize("largest", [4095.0, 1.0])
+@pytest.mark.parametrize("largest", [pytest.param(4095.0, marks=pytest.mark.slow), 1.0])
 def test_times_with_decimals_in_names_and_values_up_to_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], largest: float
 ) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from tools.command import COMMAND, OPTIONS, Here, Undisturbed, process
+from tools.command import COMMAND, OPTIONS, Here, Undisturbed, inside, process
 from tools.small_block import CRS, NAMES, SIZE, Block, texture, write_image
 
 from photoplan.cli.main import VERBS
@@ -213,13 +213,13 @@ def test_info_refuses_by_name(photoplan: Here, tmp_path: Path, name: str, conten
 
 
 def test_init_check_ortho_by_the_installed_steps(small: Block, undisturbed: Undisturbed, tmp_path: Path) -> None:
-    """A job as the help tells it, each step a process: init → check → ortho."""
+    """A job as the help tells it, its last step a process: init → check → ortho."""
     small.project.unlink()
-    said = process("init", small.folder, *small.init_options(), "--height-system", "same")
+    said = inside("init", small.folder, *small.init_options(), "--height-system", "same")
     assert said.code == 0, said.err
     assert said.out.splitlines() == [str(small.project)]
     assert "3 images" in said.err
-    said = process("check", small.project)
+    said = inside("check", small.project)
     assert said.code == 0, said.err
     said = process("ortho", small.project, *OPTIONS)
     assert said.code == 0, said.err

@@ -99,7 +99,7 @@ def test_orthophoto_of_another_place_is_refused(photoplan: Here, block: Path, ne
 
 def test_control_far_from_the_search_is_refused(photoplan: Here, block: Path, near: Path) -> None:
     spoilt(near, 25.0, 0.0)
-    said = photoplan(*words(block, near, "--search", 2))
+    said = photoplan(*words(block, near, "--search", 2, "--images", IMAGES[0], "--grid", 4))
     assert said.code == 3 and "--search" in said.err
     assert not near.with_name("control.csv").exists()
 

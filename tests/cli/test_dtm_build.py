@@ -117,6 +117,7 @@ class TestBuilt:
         assert facts["covariance"] == "matern" and facts["gross"] == 0
         assert ModelReader(out).layout.side == 16
 
+    @pytest.mark.slow
     def test_fault_26_any_number_of_workers_gives_the_same_model(
         self, photoplan: Here, survey: Path, tmp_path: Path
     ) -> None:

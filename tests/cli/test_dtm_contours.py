@@ -89,6 +89,7 @@ def test_contours_and_labels_in_every_format(hill: Path, tmp_path: Path, photopl
     assert photoplan(*arguments, "--overwrite").code == 0
 
 
+@pytest.mark.drawn
 def test_a_model_file_with_a_wall(tmp_path: Path, photoplan: Any) -> None:
     """Lines end on both sides of the wall, and a preview shows them."""
     model = tmp_path / "model.gpkg"

@@ -98,6 +98,7 @@ def test_lines_of_a_vector_file(photoplan: Here, model: Path, lines: Path, tmp_p
     assert said.code == 3 and "EPSG:32632, the model is in EPSG:32633; reproject" in said.err
 
 
+@pytest.mark.drawn
 def test_a_picture(photoplan: Here, model: Path, lines: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     said = photoplan("dtm", "profile", model, lines, "-o", tmp_path / "o.png", "-o", tmp_path / "o.csv")

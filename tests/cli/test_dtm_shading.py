@@ -28,6 +28,7 @@ def read(path: Path) -> tuple[np.ndarray, Any]:
         return file.read(), file.profile | {"tags": file.tags(), "mask": file.dataset_mask(), "bounds": file.bounds}
 
 
+@pytest.mark.drawn
 def test_hillshade_of_a_plane(ramp_dem: Path, tmp_path: Path, photoplan: Any) -> None:
     out, png = tmp_path / "s.tif", tmp_path / "s.png"
     arguments = ["dtm", "shade", ramp_dem, "--azimuth", 270, "--altitude", 30, "-o", out, "--preview", png]

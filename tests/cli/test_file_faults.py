@@ -131,8 +131,8 @@ class TestFaults11And12Names:
             ("..\\\\..\\\\x", "x_ortho.tif"),
             ("CON", "CON__ortho.tif"),
             ("Büro 第一", "Büro_第一_ortho.tif"),
-            ("a:b*c?", "a_b_c__ortho.tif"),
-            ("-rf", "rf_ortho.tif"),
+            pytest.param("a:b*c?", "a_b_c__ortho.tif", marks=pytest.mark.slow),
+            pytest.param("-rf", "rf_ortho.tif", marks=pytest.mark.slow),
             ("n" * 300, None),
         ],
     )

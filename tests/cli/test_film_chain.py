@@ -144,6 +144,7 @@ def measure_points(case: Case, count: int = 12, seed: int = 11) -> tuple[Path, P
     return image_points, control
 
 
+@pytest.mark.slow
 def test_from_scan_to_orthophoto_by_commands(case: Case) -> None:
     """Calibration, scan, twelve measured points and the terrain; nobody tells where the camera was or how it looked."""
     camera = case.folder / "camera.toml"

@@ -137,6 +137,7 @@ def test_scan_resolution(photoplan: Here, tmp_path: Path) -> None:
     assert "the scan cannot be opened" in said.out
 
 
+@pytest.mark.drawn
 def test_plot_and_report(photoplan: Here, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     scans = {f"scan_{k}": noisy(seed=k) for k in range(3)}

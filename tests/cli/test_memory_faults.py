@@ -34,10 +34,17 @@ def huge(small: Block) -> Block:
     return small
 
 
-@pytest.mark.parametrize("verb", ["ortho", pytest.param("mosaic", marks=pytest.mark.slow)])
-def test_fault_06_an_image_far_larger_than_memory(huge: Block, verb: str) -> None:
+@pytest.mark.parametrize(
+    ("verb", "side"),
+    [
+        ("ortho", 30),
+        pytest.param("ortho", 75, marks=pytest.mark.slow),
+        pytest.param("mosaic", 75, marks=pytest.mark.slow),
+    ],
+)
+def test_fault_06_an_image_far_larger_than_memory(huge: Block, verb: str, side: int) -> None:
     """A sixteenth of it, 300 MB, falls on one tile: that is cut into parts, and each pixel is a mean of a thousand."""
-    bounds = [X0 + 20, Y0 - 40, X0 + 95, Y0 + 35]
+    bounds = [X0 + 95 - side, Y0 - 40, X0 + 95, Y0 - 40 + side]
     words = [verb, huge.project, "--images", "one", "--resolution", "0.25", "--bounds", *bounds]
     said, peak = peak_of(*words, "--memory", "600MB", "--workers", 2)
     assert said.code == 0, said

@@ -89,7 +89,15 @@ class TestFigures:
         cells = [g["cell"] for g in made["summary"] if g["cell"] and g["direction"] is None]
         assert len(cells) == 4 and cells[0]["bounds"] == [-0.5, -0.5, 164.5, 109.5]
 
-    @pytest.mark.parametrize("kind", ["uint8", "int16", "float32", "uint12"])
+    @pytest.mark.parametrize(
+        "kind",
+        [
+            pytest.param("uint8", marks=pytest.mark.slow),
+            "int16",
+            pytest.param("float32", marks=pytest.mark.slow),
+            "uint12",
+        ],
+    )
     def test_fault_24_other_types(self, scene: np.ndarray, tmp_path: Path, photoplan: Here, kind: str) -> None:
         """8, 12 and 15 bits and floats give the same sharpness."""
         path = write(tmp_path / "a.tif", noisy(scene, 50, 4, kind), **({"nbits": 12} if kind == "uint12" else {}))
@@ -182,6 +190,7 @@ class TestFigures:
 
 
 class TestOutputs:
+    @pytest.mark.drawn
     def test_report_and_table(self, image: Path, tmp_path: Path, photoplan: Here) -> None:
         pytest.importorskip("matplotlib")
         page, table = tmp_path / "r.html", tmp_path / "r.csv"
@@ -196,7 +205,7 @@ class TestOutputs:
         assert recorded(tmp_path / "r.run.json", "mtf", image)["settings"]["most_edges"] == 4
         assert float(rows[0]["mtf50_low"]) < float(rows[0]["mtf50"]) < float(rows[0]["mtf50_high"])
         assert "exists already" in refused(photoplan, *words, code=2)
-        assert photoplan("mtf", *words, "--overwrite", "-q").code == 0
+        assert photoplan("mtf", *words[:-4], "--csv", table, "--overwrite", "-q").code == 0
 
     def test_fault_13_outputs_are_no_inputs(self, image: Path, photoplan: Here) -> None:
         before = image.read_bytes()

@@ -37,6 +37,7 @@ def strip(angle: float = 5.0) -> np.ndarray:
 ROIS = [word for k in range(len(FREQUENCIES)) for word in ("--roi", 100 * k, 0, 100, 80)]
 
 
+@pytest.mark.drawn
 def test_bars_in_windows(photoplan: Here, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     file = write(tmp_path / "bars.tif", strip())

@@ -14,7 +14,7 @@ import pytest
 import rasterio
 from rasterio.transform import Affine
 from tools.adjust_project import Make, write_project
-from tools.command import Here, Said, edit, process, start, wait_for
+from tools.command import Here, Said, edit, inside, start, wait_for
 
 import photoplan as photoplan_package
 from photoplan.products.adjust import run as adjust
@@ -494,7 +494,7 @@ class TestInterruption:
             "--orientation",
             data / "ext.csv",
         )
-        said = process("init", tmp_path, *words, "--height-system", "same")
+        said = inside("init", tmp_path, *words, "--height-system", "same")
         assert said.code == 0, said.err
         before = (tmp_path / "project.toml").read_bytes()
         running = start("tie", tmp_path / "project.toml", "--workers", 1)

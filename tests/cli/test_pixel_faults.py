@@ -42,7 +42,12 @@ class TestFaults22And24Pixels:
 
     @pytest.mark.parametrize(
         ("dtype", "top", "options"),
-        [("uint16", 4095, {"nbits": 12}), ("uint16", 65535, {}), ("int16", 32767, {}), ("float32", 1.0, {})],
+        [
+            ("uint16", 4095, {"nbits": 12}),
+            pytest.param("uint16", 65535, {}, marks=pytest.mark.slow),
+            ("int16", 32767, {}),
+            ("float32", 1.0, {}),
+        ],
         ids=["12-bit", "16-bit", "int16", "float"],
     )
     def test_fault_24_more_than_8_bits(

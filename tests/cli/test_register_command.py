@@ -39,6 +39,7 @@ def write(path: Path, size: tuple[int, int] = (200, 150), at: tuple[float, float
     return path
 
 
+@pytest.mark.drawn
 def test_rasters_of_one_map_are_compared_where_both_are(photoplan: Here, tmp_path: Path) -> None:
     """8 and 16 bit, of different sizes and origins, half a pixel beside where the second says that it is."""
     first = write(tmp_path / "a.tif", **MAP)

@@ -227,6 +227,7 @@ def test_files_given_as_options_replace_the_projects(folder: Path) -> None:
     assert load_project(folder / "project.toml").observations.control == ("control.csv",)
 
 
+@pytest.mark.drawn
 def test_the_report_shows_residuals(folder: Path) -> None:
     result = run(folder, "--report", str(folder / "report.html"))
     assert str(folder / "report.html") in result.stdout

@@ -18,9 +18,9 @@ def photoplan(capsys):
 @pytest.fixture(scope="module")
 def image(tmp_path_factory):
     rng = np.random.default_rng(31)
-    seen, _ = taken(any_edges(rng, 320), 0.5, rng)
+    seen, _ = taken(any_edges(rng, 224), 0.5, rng)
     path = tmp_path_factory.mktemp("scene") / "scene.tif"
-    with rasterio.open(path, "w", driver="GTiff", width=320, height=320, count=1, dtype="uint8") as file:
+    with rasterio.open(path, "w", driver="GTiff", width=224, height=224, count=1, dtype="uint8") as file:
         file.write(np.clip(np.rint(seen), 0, 255).astype(np.uint8), 1)
     return path
 

@@ -17,6 +17,7 @@ import psutil
 import pytest
 import rasterio
 from tools.command import OPTIONS, Here, Undisturbed, inside, patience, process, sabotage, start, wait_for
+from tools.forked import Mishap, forked
 from tools.small_block import NAMES, Block
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals and limits")
@@ -76,10 +77,8 @@ class TestFault03Killed:
     def test_fault_03_another_command_does_not_take_the_tiles(self, small: Block, undisturbed: Undisturbed) -> None:
         """Tiles of other parameters are of no use; their log is started afresh."""
         folder = small.folder / "products"
-        running = start(*ortho(small, "--kernel", "nearest"), env=sabotage(hold=small.folder / "go", quick=2))
-        wait_for(lambda: tiles_done(folder) >= 2, running)
-        running.kill()
-        running.communicate()
+        forked(ortho(small, "--kernel", "nearest"), small.folder / "said", Mishap(end_at=2))
+        assert tiles_done(folder) >= 1
         again = inside(*ortho(small, "--json"))
         assert json.loads(again.out)["products"][0]["resumed_tiles"] == 0
         assert (folder / "one_ortho.tif").read_bytes() == undisturbed.bytes_of("one")
@@ -154,6 +153,7 @@ def at_work(begun: Path, count: int, running: subprocess.Popen[str]) -> list[psu
 
 
 class TestFault05DeadWorkers:
+    @pytest.mark.slow
     def test_fault_05_one_worker_is_killed(self, small: Block, undisturbed: Undisturbed, tmp_path: Path) -> None:
         victim = tmp_path / "victim"
         victim.touch()
@@ -163,6 +163,7 @@ class TestFault05DeadWorkers:
         assert said.code == 0, said.err
         assert (small.folder / "products" / "one_ortho.tif").read_bytes() == undisturbed.bytes_of("one")
 
+    @pytest.mark.slow
     def test_fault_05_a_tile_that_always_kills_its_worker(self, small: Block, undisturbed: Undisturbed) -> None:
         """Tried three times, then listed with exit code 4; other products are there, and its other tiles are kept."""
         words = ["ortho", small.project, *OPTIONS, "--executor", "processes", "--workers", 2]
@@ -187,7 +188,7 @@ class TestFault25Interrupts:
             ("threads", [signal.SIGTERM]),
             pytest.param("threads", [signal.SIGINT, signal.SIGINT], marks=pytest.mark.slow),
             pytest.param("processes", [signal.SIGINT], marks=pytest.mark.slow),
-            ("processes", [signal.SIGTERM, signal.SIGTERM]),
+            pytest.param("processes", [signal.SIGTERM, signal.SIGTERM], marks=pytest.mark.slow),
         ],
         ids=["threads-TERM", "threads-INT-INT", "processes-INT", "processes-TERM-TERM"],
     )

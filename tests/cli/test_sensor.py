@@ -65,6 +65,7 @@ def test_figures_of_a_modern_camera(photoplan: Here):
     assert found["mtf_both_x_100"]["value"] == pytest.approx(both)
 
 
+@pytest.mark.drawn
 def test_plain_text_report_and_table(photoplan: Here, tmp_path: Path):
     pytest.importorskip("matplotlib")
     report, table = tmp_path / "sensor.html", tmp_path / "sensor.csv"

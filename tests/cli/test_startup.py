@@ -45,7 +45,7 @@ def test_an_orthophoto_loads_nothing_that_it_does_not_need(tmp_path: Path) -> No
         first = sorted((block / "images").glob("*.jpg"))[0].stem
         words = ["ortho", tmp_path / "project.toml", "--images", f"{first}*", "--resolution", 2, "--overwrite"]
         environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
-        for _ in range(2):  # the first may compile
+        for _ in range(2):
             talk = subprocess.run(
                 [sys.executable, "-c", SCRIPT, *map(str, words), "--no-quicklook", "-q"],
                 env=environment,
@@ -53,8 +53,11 @@ def test_an_orthophoto_loads_nothing_that_it_does_not_need(tmp_path: Path) -> No
                 capture_output=True,
                 text=True,
             ).stdout
-    product, modules, threads = talk.splitlines()
-    assert Path(product).name == f"{first}_ortho.tif"
-    heavy = [name for name in HEAVY if USABLE or not name.startswith("scipy")]  # else numba loads it
-    assert [name for name in heavy if name in modules.split()] == []
-    assert threads == "1"
+            product, modules, threads = talk.splitlines()
+            assert Path(product).name == f"{first}_ortho.tif"
+            assert threads == "1"
+            heavy = [name for name in HEAVY if USABLE or not name.startswith("scipy")]  # else numba loads it
+            found = [name for name in heavy if name in modules.split()]
+            if not found:
+                break  # the first of the two may compile, and load what that needs
+    assert found == []

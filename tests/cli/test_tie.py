@@ -36,6 +36,7 @@ def names(*images: str) -> list[str]:
     return [word for image in images for word in ("--images", image)]
 
 
+@pytest.mark.drawn
 def test_table_project_and_picture(photoplan: Here, project: Path) -> None:
     output = project.with_name("a.csv")
     said = photoplan("tie", project, *names(*NEAR), *FAST, "-o", output, "--overwrite")

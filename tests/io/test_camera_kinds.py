@@ -49,7 +49,10 @@ ALLOWED = {
 def named(file: Path) -> set[str]:
     """Kinds that the code of a file names, strings included (they may be imports by name)."""
     words: set[str] = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    source = file.read_text(encoding="utf-8")
+    if not any(kind in source for kind in KINDS):
+        return words
+    for node in ast.walk(ast.parse(source)):
         for value in (getattr(node, field, None) for field in ("id", "attr", "name", "value")):
             if isinstance(value, str) and "\n" not in value:
                 words.update(value.replace(".", " ").split())

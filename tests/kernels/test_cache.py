@@ -30,6 +30,7 @@ print(before, is_compiled("int16", 3, "bilinear"), *compiled)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not COMPILED, reason="nothing is compiled")
 def test_second_process_loads_what_the_first_compiled(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}

@@ -157,11 +157,12 @@ def test_frame_and_image_meet_without_a_seam(inside: float | None) -> None:
     assert np.quantile(np.abs(drawn.values - exact)[edge], 0.95) < 1e-5
 
 
-def test_standard_deviations_of_edges_are_those_of_their_errors() -> None:
+@thinned("count", 12, 40)
+def test_standard_deviations_of_edges_are_those_of_their_errors(count: int) -> None:
     rng = np.random.default_rng(3)
     pattern = silhouettes()["block"]
     normalised = []
-    for _ in range(40):
+    for _ in range(count):
         image, x, y = frame_scene(pattern, matrix(0.3), rng)
         found = fit_edges(image, pattern, matrix(0.0), (x + rng.uniform(-2, 2), y + rng.uniform(-2, 2)))
         assert found is not None

@@ -24,7 +24,7 @@ def errors(found: FiducialResult, truth: dict[str, tuple[float, float]]) -> NDAr
     return np.array([(m.x - truth[m.name][0], m.y - truth[m.name][1]) for m in found.marks])
 
 
-@thinned("count", 5, 30)
+@thinned("count", 3, 30)
 def test_marks_of_scans_of_any_kind_within_a_twentieth_of_a_pixel_and_standard_deviations_are_true(count: int) -> None:
     rng = np.random.default_rng(1)
     off, sigmas, tops = [], [], []

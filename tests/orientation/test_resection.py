@@ -96,10 +96,11 @@ def test_camera_constant_and_principal_point_of_hilly_terrain() -> None:
     assert both.covariance.shape == (9, 9)
 
 
-def test_errors_are_as_large_as_the_covariance_says() -> None:
+@thinned("runs", 60, 200)
+def test_errors_are_as_large_as_the_covariance_says(runs: int) -> None:
     rng = np.random.default_rng(7)
     ratios = []
-    for _ in range(200):
+    for _ in range(runs):
         pose = aerial_pose(rng, tilt=0.2)
         X = ground_below(rng, pose, 15, 200.0)
         found = resect(measured(frame(pose), X, rng, 0.5, 0.08), AERIAL, NoLens())

@@ -421,7 +421,7 @@ def test_the_stated_calibration_is_used(tmp_path: Path) -> None:
     np.testing.assert_allclose(report.figures.cameras[0].after, 3600.0, atol=1e-3)
 
 
-@pytest.mark.parametrize("where", ["project", "option"])
+@pytest.mark.parametrize("where", ["project", pytest.param("option", marks=pytest.mark.slow)])
 def test_what_is_known_of_a_camera_beforehand_counts(tmp_path: Path, where: str) -> None:
     """Known to a millionth of a pixel a wrong camera constant stays; hardly known it becomes what it is without."""
     plain = write_project(tmp_path, Make(stated={"focal_px": 3597.0}))

@@ -79,7 +79,7 @@ def difference(path: Path, cameras: dict[str, Camera]) -> float:
     return worst
 
 
-@pytest.mark.parametrize("curvature", ["none", "strict"])
+@pytest.mark.parametrize("curvature", [pytest.param("none", marks=pytest.mark.slow), "strict"])
 def test_affine_corrections_of_polynomials_are_found_and_used(tmp_path: Path, curvature: str) -> None:
     path, cameras = satellites(tmp_path, curvature, "affine")
     assert difference(path, cameras) > 2.0
@@ -118,7 +118,7 @@ def test_fault_14_axes_of_control_exchanged_are_refused(tmp_path: Path) -> None:
     assert said.code == 3 and "coordinates of control do not fit" in said.err
 
 
-def flown(folder: Path, entries: str = "") -> tuple[Path, dict[str, Camera]]:
+def flown(folder: Path, entries: str = "", count: int = 120) -> tuple[Path, dict[str, Camera]]:
     """Nadir and forward line of a flight whose file has a wrong boresight and a late clock; the true cameras."""
     strip = Strip(lines=9000, waves=0.002)
     path = strip.strip_file(folder)
@@ -133,13 +133,13 @@ def flown(folder: Path, entries: str = "") -> tuple[Path, dict[str, Camera]]:
         project_text += f'line = "strip.toml"\ndetectors = "{name}"\n'
     (folder / "project.toml").write_text(project_text)
     rng = np.random.default_rng(4)
-    at = cameras["nadir"].rays(rng.uniform((5, 5), (395, 8995), (120, 2)), 100.0)[0]
-    measured(folder, cameras, at + np.column_stack([np.zeros((120, 2)), rng.uniform(-60, 60, 120)]), 0.05)
+    at = cameras["nadir"].rays(rng.uniform((5, 5), (395, 8995), (count, 2)), 100.0)[0]
+    measured(folder, cameras, at + np.column_stack([np.zeros((count, 2)), rng.uniform(-60, 60, count)]), 0.05)
     return folder / "project.toml", cameras
 
 
 def test_boresight_and_clock_of_a_strip_are_found_and_used(tmp_path: Path) -> None:
-    path, cameras = flown(tmp_path)
+    path, cameras = flown(tmp_path, count=60)
     assert difference(path, cameras) > 3.0
     report = adjust_project(AdjustRequest(path))
     assert difference(path, cameras) < 0.1
@@ -177,7 +177,7 @@ def test_fault_18_broken_corrections_are_refused_by_name(tmp_path: Path) -> None
 
 
 def test_fault_23_points_on_lines_without_orientation_are_named(tmp_path: Path) -> None:
-    path, _ = flown(tmp_path)
+    path, _ = flown(tmp_path, count=40)
     table = (tmp_path / "flight.csv").read_text().splitlines()
     # The last third of the record is lost: lines from about 7000 on.
     (tmp_path / "flight.csv").write_text("\n".join(table[: len(table) * 72 // 100]))

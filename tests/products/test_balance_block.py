@@ -62,6 +62,7 @@ def differences(block: Block, photoplan: Here, name: str) -> float:
     return float(np.sqrt(np.nanmean((pixels[0] - pixels[1]) ** 2) + np.nanmean((pixels[2] - pixels[1]) ** 2)))
 
 
+@pytest.mark.drawn
 def test_tables_are_written_and_orthophotos_made_with_them(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
     photoplan = Here(capsys)
     before = differences(block, photoplan, "before")

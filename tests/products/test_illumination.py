@@ -79,6 +79,7 @@ def correlation(grey: NDArray[np.float64], mountain: Mountain, light: NDArray[np
     return max(abs(float(np.corrcoef(band[lit], light[lit])[0, 1])) for band in grey)
 
 
+@pytest.mark.drawn
 @pytest.mark.parametrize("correct", ["c", pytest.param("cosine", marks=pytest.mark.slow)])
 def test_slopes_lose_their_light_and_shadows_stay(
     correct: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -48,7 +48,7 @@ def made(small: Block, **settings: object) -> tuple[Path, NDArray[np.generic], N
 class TestPosition:
     """A scene that is painted with its own coordinates tells where each product pixel came from."""
 
-    @pytest.mark.parametrize("kernel", ["bilinear", "bicubic", "lanczos3"])
+    @pytest.mark.parametrize("kernel", ["bilinear", "bicubic", pytest.param("lanczos3", marks=pytest.mark.slow)])
     @pytest.mark.parametrize("kappa", [0.0, 37.0])
     def test_level_scene_to_float_precision(self, small: Block, kernel: str, kappa: float) -> None:
         """A vertical image of level ground: X and Y are linear in the image, and linear kernels reproduce them."""
@@ -111,12 +111,23 @@ class TestPosition:
         assert np.percentile(np.abs(pixels[2][row, col] - height)[inner], 99) < 0.03
 
 
-@pytest.mark.parametrize(("dtype", "value"), [("uint8", 77), ("uint16", 40_001), ("int16", -1234), ("float32", 0.1)])
-@pytest.mark.parametrize("kernel", ["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"])
+VALUES = {"uint8": 77, "uint16": 40_001, "int16": -1234, "float32": 0.1}
+KERNELS = ("nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3")
+#: Kinds that other tests compile, too; the others are for `make test-slow`.
+FEW = {*((kernel, "uint8") for kernel in KERNELS), ("bicubic", "uint16"), ("bilinear", "int16"), ("bicubic", "float32")}
+
+
+@pytest.mark.parametrize(
+    ("dtype", "kernel"),
+    [
+        pytest.param(dtype, kernel, marks=[] if (kernel, dtype) in FEW else pytest.mark.slow)
+        for dtype in VALUES
+        for kernel in KERNELS
+    ],
+)
 @pytest.mark.parametrize("resolution", [0.9, 4.0])
-def test_a_constant_image_stays_constant(
-    small: Block, dtype: str, value: float, kernel: str, resolution: float
-) -> None:
+def test_a_constant_image_stays_constant(small: Block, dtype: str, kernel: str, resolution: float) -> None:
+    value = VALUES[dtype]
     alone(small, np.full((2, SIZE[1], SIZE[0]), value, dtype), (2, 1, 20), "  k1: -0.1\n")
     _, pixels, valid = made(small, resolution=resolution, kernel=kernel, nodata="mask")
     assert valid.mean() > 0.5

@@ -201,6 +201,7 @@ def test_without_matplotlib_the_extra_is_named(tmp_path: Path, monkeypatch: pyte
 
 
 class TestCommand:
+    @pytest.mark.drawn
     def test_a_measured_restoration(self, photoplan: Here, scene: Path, tmp_path: Path) -> None:
         report = tmp_path / "report.html"
         words = ("restore", scene, "--output", tmp_path / "a", "--cells", 2, "--workers", 1, "--report", report)

@@ -11,6 +11,7 @@ import pytest
 import rasterio
 from tools.command import Said, inside
 from tools.facet_scene import CONTRAST, GROUND, GSD, Scene, write_scene
+from tools.sketched import drawn
 from tools.small_block import X0, Y0
 
 CLOUDS = (".las", ".laz", ".ply")
@@ -71,7 +72,8 @@ def judge(scene: Scene, folder: Path) -> Judged:
 def made(scene: Scene) -> Path:
     clouds = [word for kind in CLOUDS for word in ("--points", scene.path.parent / f"points{kind}")]
     report = scene.path.parent / "report.html"
-    said = surface(scene, "--start", GROUND, "--json", "--residuals", *clouds, "--report", report)
+    with drawn():
+        said = surface(scene, "--start", GROUND, "--json", "--residuals", *clouds, "--report", report)
     assert said.code == 0, said.err
     files = [Path(file) for file in json.loads(said.out)["other_files"]]
     assert len(files) == 9 and all(file.exists() for file in files) and report.exists()

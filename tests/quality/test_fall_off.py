@@ -48,7 +48,7 @@ def test_terms_span_the_general_polynomial() -> None:
         assert np.linalg.matrix_rank(A) == np.linalg.matrix_rank(np.column_stack([A, powers])) == A.shape[1]
 
 
-@thinned("runs", 40, 80)
+@thinned("runs", 10, 80)
 def test_simulated_parts_are_recovered_with_true_standard_deviations(runs: int) -> None:
     errors, corners = [], []
     truth = dict(zip(TERMS, FACTORS))

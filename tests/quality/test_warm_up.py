@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tools.thinned import thinned
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.camera.warm_up import warm_up
@@ -40,12 +41,15 @@ def test_repeated_measurements() -> None:
     np.testing.assert_allclose(found.sigma0, SPREAD / np.sqrt(5), rtol=0.15)
 
 
-@pytest.mark.parametrize("reference", ["first", pytest.param("mean", marks=pytest.mark.slow)])
-def test_parameters_have_true_standard_deviations(reference: str) -> None:
+@pytest.mark.parametrize(
+    ("reference", "runs"),
+    [("first", 30), *(pytest.param(each, 60, marks=pytest.mark.slow) for each in ("first", "mean"))],
+)
+def test_parameters_have_true_standard_deviations(reference: str, runs: int) -> None:
     errors: dict[str, list[float]] = {"shift_x": [], "shift_y": [], "scale": [], "rotation": []}
     truth = {"shift_x": DRIFT[0] * COURSE, "shift_y": DRIFT[1] * COURSE, "scale": SCALE * COURSE}
     truth["rotation"] = ROTATION * COURSE
-    for seed in range(60):
+    for seed in range(runs):
         found = warm_up(TIMES, measured(tuple(MARKS), seed), reference=reference)
         for name, values in truth.items():
             course = found.course(name)
@@ -59,9 +63,10 @@ def test_parameters_have_true_standard_deviations(reference: str) -> None:
     assert all(0.75 < s < 1.25 for s in spreads.values())
 
 
-def test_exponential_course_is_recovered() -> None:
+@thinned("runs", 20, 60)
+def test_exponential_course_is_recovered(runs: int) -> None:
     size, tau = [], []
-    for seed in range(60):
+    for seed in range(runs):
         a = warm_up(TIMES, measured(("mark", "target"), seed)).course("shift_x").approach
         assert a is not None and a.change is not None and a.sigma_change is not None
         assert a.time_constant is not None and a.sigma_time_constant is not None

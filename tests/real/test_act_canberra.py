@@ -40,6 +40,7 @@ def camera(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.drawn
 @pytest.mark.parametrize("name", SCANS)
 def test_four_corner_marks_are_found_unaided(
     name: str, shared: Path, camera: Path, tmp_path: Path, photoplan: Here

@@ -61,6 +61,7 @@ def deviations(project: Path, truth: Published) -> tuple[np.ndarray, np.ndarray]
     return np.concatenate([off, small], axis=1) / sigma, np.array([n in measured for n in truth.names])
 
 
+@pytest.mark.slow
 def test_sigma0_memory_and_control(block: tuple[dict, Path, int, Published]) -> None:
     report, project, peak, _ = block
     (group,) = [g for g in report["groups"] if g["name"].startswith("image points")]
@@ -84,6 +85,7 @@ def test_sigma0_memory_and_control(block: tuple[dict, Path, int, Published]) -> 
     assert (rms <= 0.75).all()
 
 
+@pytest.mark.slow
 def test_orientations_lie_within_three_sigma_of_the_published_ones(block: tuple[dict, Path, int, Published]) -> None:
     """As many as normally distributed errors allow: 0.27 % lie beyond three standard deviations."""
     report, project, _, truth = block

@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from tools.sketched import drawn
 
 from photoplan.errors import ResourceError, UsageError
 from photoplan.kernels.collocation import correlation
@@ -73,7 +74,8 @@ def facts(built, measured):
 
 @pytest.fixture(scope="module")
 def document(facts):
-    return build_page(facts)
+    with drawn():
+        return build_page(facts)
 
 
 def test_nothing_outside_the_document_is_asked_for(document):
@@ -145,6 +147,7 @@ def test_many_findings_are_counted(document):
     assert "and 10 more of this kind" in document
 
 
+@pytest.mark.drawn
 def test_the_same_model_has_the_same_report(facts, document):
     assert build_page(facts) == document
 

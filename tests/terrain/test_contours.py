@@ -352,8 +352,12 @@ def test_triangles_meet_bilinear_meshes_without_a_gap() -> None:
 # -- smoothing and simplifying ---------------------------------------------------------------------------------------
 
 
+#: Of each kind of ground, whole numbers and rough, one; all in `make test-slow`.
+SEEDS = [pytest.param(seed, marks=[] if seed in (1, 4) else pytest.mark.slow) for seed in range(6)]
+
+
 @pytest.mark.parametrize("simplify", [False, True])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_smoothed_lines_never_cross(seed: int, simplify: bool) -> None:
     rng = np.random.default_rng(seed)
     heights = rough(seed) if seed % 2 else rng.integers(0, 6, (36, 36)).astype(np.float32)
@@ -364,7 +368,7 @@ def test_smoothed_lines_never_cross(seed: int, simplify: bool) -> None:
     assert sorted(line.height for line in lines) == sorted(line.height for line in before)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_lines_anywhere_inside_their_bands_never_cross(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """What smoothing may do at worst: every vertex at a random place of its range, half of them at its ends."""
     rng = np.random.default_rng(seed)

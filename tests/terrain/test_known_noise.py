@@ -46,7 +46,7 @@ def test_terraces(lines: bool) -> None:
     "ground, count, noise, family",
     [
         (hills, 500, 0.1, "auto"),
-        (fractal(3.0, 61, 1), 900, 0.3, "auto"),
+        pytest.param(fractal(3.0, 61, 1), 900, 0.3, "auto", marks=pytest.mark.slow),
         pytest.param(hills, 300, 0.3, "exponential", marks=pytest.mark.slow),
     ],
 )

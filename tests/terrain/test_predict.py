@@ -35,7 +35,7 @@ class TestPlane:
     @pytest.fixture(
         params=[
             "even",
-            "dense and thin",
+            pytest.param("dense and thin", marks=pytest.mark.slow),
             "profiles",
             "with lines",
         ]
@@ -124,6 +124,7 @@ class TestInvariance:
         np.testing.assert_allclose(heights - by[2], plain[0], atol=2e-6)
         np.testing.assert_allclose(sigmas, plain[1], atol=2e-6)
 
+    @pytest.mark.slow
     def test_another_order_of_points(self, xyz: Any, way: Any, plain: Any) -> None:
         """Blocks for the covariance function are drawn from the points: they may change it a little, no more."""
         model = built(terrain(xyz[::-1].copy(), line(way[::-1].copy())), grid_width=0.5)

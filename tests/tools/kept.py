@@ -58,7 +58,7 @@ def kept(name: str, make: Callable[[Path], None], code: Iterable[str], inputs: I
     above.mkdir(parents=True, exist_ok=True)
     code, maker = list(code), Path(inspect.getfile(make))
     assert all(_source(module) for module in code), code
-    with _locked(above / f"{name}.lock"):
+    with locked(above / f"{name}.lock"):
         folder = above / f"{name}-{_key(maker, [*code, *_imports(maker)], inputs)}"
         if not folder.is_dir():
             _forget(above)
@@ -78,7 +78,8 @@ def _forget(above: Path) -> None:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
+    """Processes come in one after the other."""
     with path.open("w") as file:
         if os.name == "posix":
             fcntl.flock(file, fcntl.LOCK_EX)
