@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
@@ -165,6 +167,33 @@ def test_a_drawn_region_comes_before_the_score() -> None:
     sees = inside[1] & ~unseen[1] & (cost[1] < 1e6)
     assert (drawn[:, west][sees[:, west]] == 2).all() and (free[:, west][sees[:, west]] != 2).any()
     np.testing.assert_array_equal(drawn[:, ~west], free[:, ~west])
+
+
+@pytest.mark.parametrize(
+    ("window", "asked"),
+    [(Window(0, 0, SIDE, SIDE), 3), (Window(30, 40, 40, 30), 3), (Window(60, 0, 30, 9), 3), (Window(40, 0, 9, 9), 1)],
+)
+def test_others_are_asked_only_where_a_drawn_image_does_not_see_all(
+    window: Window, asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever is not asked would change nothing: the shares are those of a rule that asks all at once."""
+    penalty, rows = BestImage._penalty, set()
+
+    def counted(self: BestImage, row: int, *rest: object) -> object:
+        rows.add(row)
+        return penalty(self, row, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(BestImage, "_penalty", counted)
+    rule = BestImage(levels(), drawn=Half())
+    found = rule.share(tile(window), CAMERAS, SURFACE)
+    assert len(rows) == asked
+    # Beside an image that is preferred by so much no drawn region settles anything.
+    all_asked = replace(rule, ranks=(0.0, 0.0, 0.0, -1e9)).share(tile(window), CAMERAS, SURFACE)
+    assert len(rows) == 3
+    np.testing.assert_array_equal(found.owner, all_asked.owner)
+    np.testing.assert_array_equal(found.hidden, all_asked.hidden)
+    for row in found.clear:
+        np.testing.assert_array_equal(found.clear[row], all_asked.clear[row])
 
 
 @pytest.mark.parametrize("values", [(-1, 0, 0, 0), (0, 0, 0, 0), (np.nan, 1, 1, 1), (1e9, 0, 0, 0)])

@@ -2,35 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from tools.function_surface import raster_surface
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.plan.feather import Feather, feather_of
-from photoplan.plan.ground import TileGround
+from photoplan.plan.owner import Share
 from photoplan.plan.tiles import Tiles
-from photoplan.targets.map import MapTarget
 
 SIDE = 120
 GRID = MapGrid.covering((0, 0, SIDE, SIDE), 1.0, "EPSG:32632")
-SURFACE = raster_surface(np.zeros((SIDE + 60, SIDE + 60), np.float32), -29.5, SIDE + 29.5, 1.0)
-
-
 WIDE = Window(-40, -40, SIDE + 80, SIDE + 80)
-
-
-class Masks:
-    """What images see, by their number in the place of a camera."""
-
-    def __init__(self, *seen: np.ndarray) -> None:
-        self.seen = seen
-
-    def sees(self, ground: TileGround, camera: Any, surface: Any) -> np.ndarray:
-        return padded(self.seen[camera])[ground.window.slices(WIDE)]
 
 
 def padded(values: np.ndarray) -> np.ndarray:
@@ -38,12 +21,11 @@ def padded(values: np.ndarray) -> np.ndarray:
 
 
 def weights(owner: np.ndarray, width: int, seen: list[np.ndarray], window: Window = GRID.window) -> np.ndarray:
-    feather = Feather(Masks(*seen), width)
+    feather = Feather(width)
     wide = feather.around(window)
-    target = MapTarget(GRID)
-    ground = TileGround.of(target, wide, SURFACE.relief(target, wide))
-    numbers: Any = {k: k for k in range(len(seen))}
-    found = feather.weights(padded(owner)[wide.slices(WIDE)], ground, window, numbers, SURFACE)
+    at = wide.slices(WIDE)
+    share = Share(padded(owner)[at], clear={k: padded(each)[at] for k, each in enumerate(seen)})
+    found = feather.weights(share, wide, window)
     none = np.zeros((1, window.height, window.width), np.float32)
     return np.stack([found[k][0] if k in found else none for k in range(len(seen))])[:, 0]
 
@@ -107,26 +89,24 @@ def test_weights_do_not_depend_on_the_window_and_three_add_up() -> None:
 
 
 def test_bands_pass_in_strips_of_their_own() -> None:
-    feather = Feather(Masks(everything(), everything()), 32, bands=True)
-    assert feather.reaches == (2, 4, 8, 16) and Feather(Masks(), 32).reaches == (16,)
-    wide, target = feather.around(GRID.window), MapTarget(GRID)
-    ground = TileGround.of(target, wide, SURFACE.relief(target, wide))
-    cameras: Any = {0: 0, 1: 1}
-    found = feather.weights(padded(halves())[wide.slices(WIDE)], ground, GRID.window, cameras, SURFACE)
+    feather = Feather(32, bands=True)
+    assert feather.reaches == (2, 4, 8, 16) and Feather(32).reaches == (16,)
+    wide = feather.around(GRID.window)
+    clear = {k: np.ones((wide.height, wide.width), bool) for k in range(2)}
+    found = feather.weights(Share(padded(halves())[wide.slices(WIDE)], clear=clear), wide, GRID.window)
     (first, _), (second, seen) = found[0], found[1]
     both = (first[:, 60] > 0) & (second[:, 60] > 0)
-    assert both.sum(axis=1).tolist() == [4, 8, 16, 32] and seen.shape == ground.relief.shape
+    assert both.sum(axis=1).tolist() == [4, 8, 16, 32] and seen.shape == (wide.height, wide.width)
     np.testing.assert_allclose((first + second)[:, 60, 44:76], 1, atol=1e-6)
 
 
 def test_widths_that_cannot_be() -> None:
-    rule = Masks()
-    assert feather_of(rule, 0.0, 0.1, 512) is None and feather_of(rule, 0.1, 0.1, 512) is None
-    made = feather_of(rule, 2.0, 0.1, 512)
+    assert feather_of(0.0, 0.1, 512) is None and feather_of(0.1, 0.1, 512) is None
+    made = feather_of(2.0, 0.1, 512)
     assert made is not None and made.width == 20 and made.reach == 10
     for metres in (-1.0, np.nan, np.inf, 1e9):
         with pytest.raises(UsageError, match="`feather`"):
-            feather_of(rule, metres, 0.1, 512)
+            feather_of(metres, 0.1, 512)
 
 
 def test_tiles_know_the_sources_around_them() -> None:

@@ -18,7 +18,7 @@ What an image does not see it does not paint, whatever its score.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -99,39 +99,51 @@ class BestImage:
     """Whether ground that none of its images sees is painted with what hides it."""
 
     def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
-        """The least penalty of those that see a pixel; visibility is asked only of images that come first somewhere."""
-        rows = sorted(cameras)
+        """The least penalty of those that see a pixel; visibility is asked only of images that come first somewhere.
+
+        Where regions are drawn, others are asked only if those that were drawn do not see all that there is.
+        """
         drawn = None if self.drawn is None else self.drawn.rows(ground.window)
         wide = _wide(ground, surface)
         slope = _slope(wide, ground.window)
-        scores = [self._penalty(row, cameras[row], (ground, slope), drawn) for row in rows]
-        cost = np.stack([penalty for penalty, _ in scores])
-        inside = cost.min(axis=0)
-        blind = cost if not self.paints_hidden else cost.copy()
-        looked: set[int] = set()
-        while True:
-            best = np.argmin(cost, axis=0)
-            ahead = np.unique(best[np.isfinite(cost.min(axis=0))])
-            asked = [int(k) for k in ahead if k not in looked]
-            for k in asked:
-                self._look(cost[k], scores[k][1], cameras[rows[k]], (ground, wide), surface)
-            looked.update(asked)
-            if not asked:
-                break
-        seen = np.isfinite(cost.min(axis=0))
-        hidden = np.isfinite(inside) & ~seen
+        costs: dict[int, NDArray[np.float32]] = {}
+        scales: dict[int, NDArray[np.float32]] = {}
+        clear: dict[int, NDArray[np.bool_]] = {}
+        inside = np.zeros(ground.relief.shape, np.bool_)
+
+        def among(rows: list[int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            """Penalties (images, height, width) before it is asked what hides the ground from images, and after."""
+            for row in rows:
+                if row not in costs:
+                    costs[row], scales[row] = self._penalty(row, cameras[row], (ground, slope), drawn)
+                    np.logical_or(inside, np.isfinite(costs[row]), out=inside)
+            cost = np.stack([costs[row] for row in rows])
+            blind = cost if not self.paints_hidden else cost.copy()
+            while True:
+                best = np.argmin(cost, axis=0)[np.isfinite(cost.min(axis=0))]
+                ahead = [rows[k] for k in np.flatnonzero(np.bincount(best)).tolist()]
+                asked = [row for row in ahead if row not in clear]
+                for row in asked:
+                    costs[row] = cost[rows.index(row)]
+                    self._look(costs[row], scales[row], cameras[row], (ground, wide), surface)
+                    clear[row] = costs[row] < 0.5 * _RIMMED
+                if not asked:
+                    return blind, cost
+
+        given = [] if drawn is None or self.paints_hidden else np.flatnonzero(np.bincount(drawn.ravel())).tolist()
+        rows = [value - 1 for value in given if value - 1 in cameras] or sorted(cameras)
+        blind, cost = among(rows)
+        # No penalty of others is below this one.
+        least = min(self.ranks, default=0.0) - self.weights.coarseness * (_LEVEL + _STEEPEST)
+        if len(rows) < len(cameras) and not ((cost.min(axis=0) < least) | np.isnan(ground.relief)).all():
+            rows = sorted(cameras)
+            blind, cost = among(rows)
+        best, seen = np.argmin(cost, axis=0), np.isfinite(cost.min(axis=0))
         if self.paints_hidden:
             best = np.where(seen, best, np.argmin(blind, axis=0))
-        paints = np.isfinite(inside) if self.paints_hidden else seen
-        return Share(np.where(paints, np.array(rows)[best] + 1, 0).astype(np.uint16), hidden)
-
-    def sees(self, ground: TileGround, camera: Projection, surface: Surface) -> NDArray[np.bool_]:
-        """Pixels of a tile that an image sees, and away from its border and from what it does not see."""
-        wide = _wide(ground, surface)
-        alone = replace(self, ranks=(), drawn=None)
-        cost, scale = alone._penalty(0, camera, (ground, _slope(wide, ground.window)), None)
-        self._look(cost, scale, camera, (ground, wide), surface)
-        return np.asarray(cost < 0.5 * _RIMMED)
+        paints = inside if self.paints_hidden else seen
+        owner = np.where(paints, np.array(rows)[best] + 1, 0).astype(np.uint16)
+        return Share(owner, inside & ~seen, clear)
 
     def _look(
         self,

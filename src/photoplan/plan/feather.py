@@ -9,33 +9,20 @@ such weights of its own, of the width of its detail.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Projection
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.plan.ground import TileGround
-from photoplan.surfaces.base import Surface
+from photoplan.plan.owner import Share
 
 
-class Seeing(Protocol):
-    """A rule of ownership that can tell what an image sees well."""
-
-    def sees(self, ground: TileGround, camera: Projection, surface: Surface) -> NDArray[np.bool_]:
-        """Pixels of a tile that an image may paint beside others, shape (height, width)."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Feather:
     """Weights of images along seams."""
 
-    rule: Seeing
     width: int
     """Of the strip in which images pass into each other, pixels."""
     bands: bool = False
@@ -61,35 +48,33 @@ class Feather:
 
     def weights(
         self,
-        owner: NDArray[np.uint16],
-        ground: TileGround,
+        share: Share,
+        wide: Window,
         window: Window,
-        cameras: Mapping[int, Projection],
-        surface: Surface,
     ) -> dict[int, tuple[NDArray[np.float32], NDArray[np.bool_]]]:
         """Weights of the images that share pixels of a window, by row of the table of sources, shape (bands, height,
-        width); all 0 where one alone paints. With each the pixels of `ground` that it sees or owns.
+        width); all 0 where one alone paints. With each the pixels of `wide` that it sees or owns.
 
         Parameters
         ----------
-        owner : ndarray of uint16
-            Row plus one of who owns the pixels of `ground`; 0: nobody.
-        ground : TileGround
-            `around` the window.
+        share : Share
+            Of the pixels `around` the window, which are `wide`.
         """
+        owner = share.owner
+        assert owner is not None
         rows = [int(value) - 1 for value in np.unique(owner) if value]
-        at = window.slices(ground.window)
+        at = window.slices(wide)
         if len(rows) < 2 or not self.reach:
             return {}
         painted = owner[at] > 0
         found = {}
         for row in rows:
             mine = owner == row + 1
-            shares = [_twice(mine, reach // 2)[at] for reach in self.reaches]
-            if not shares[-1].any():
+            parts = [_twice(mine, reach // 2)[at] for reach in self.reaches]
+            if not parts[-1].any():
                 continue
-            sees = self.rule.sees(ground, cameras[row], surface)
-            weights = np.stack([share * _from_edge(sees, r)[at] for share, r in zip(shares, self.reaches)])
+            sees = share.clear[row]
+            weights = np.stack([part * _from_edge(sees, r)[at] for part, r in zip(parts, self.reaches)])
             weights[:, ~painted] = 0.0
             # Whom nobody else can stand in for keeps what is his.
             weights[mine[at] & (weights == 0)] = np.finfo(np.float32).tiny
@@ -99,7 +84,7 @@ class Feather:
         return {row: (weights, seen) for row, (weights, seen) in shared.items() if weights.any()}
 
 
-def feather_of(rule: Seeing, metres: float, resolution: float, tile: int, bands: bool = False) -> Feather | None:
+def feather_of(metres: float, resolution: float, tile: int, bands: bool = False) -> Feather | None:
     """The feather of a width in metres, by bands or not; None: it is less than a pixel to both sides.
 
     Raises
@@ -109,7 +94,7 @@ def feather_of(rule: Seeing, metres: float, resolution: float, tile: int, bands:
     """
     if not (np.isfinite(metres) and metres >= 0):
         raise UsageError(f"`feather` {metres:g}; a width in metres is needed, 0 for none")
-    made = Feather(rule, round(min(metres / resolution, 1e9)), bands)
+    made = Feather(round(min(metres / resolution, 1e9)), bands)
     if made.reach > tile:
         raise UsageError(
             f"`feather` {metres:g} m is {made.width} pixels; at most {2 * tile} are possible with tiles of {tile}: "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -25,6 +25,9 @@ class Share:
     source, and it paints whatever it shows."""
     hidden: NDArray[np.bool_] | None = None
     """Pixels that lie in images, but that no source sees, painted or not; None: nobody has asked."""
+    clear: Mapping[int, NDArray[np.bool_]] = field(default_factory=dict)
+    """By row, of the sources that paint at least: pixels that they see, and away from their border and from what they
+    do not see."""
 
 
 class Ownership(Protocol):

@@ -162,7 +162,7 @@ def _feathered(
     feather, blends = product.feather, []
     if len(feather.reaches) > 1:
         tile, depth, at = replace(tile, window=wide), (ground, None), np.s_[:, :]
-    for row, (weights, seen) in feather.weights(share.owner, ground, made.window, cameras, surface).items():
+    for row, (weights, seen) in feather.weights(share, wide, made.window).items():
         wanted = np.zeros(seen.shape, np.bool_)
         wanted[made.window.slices(wide)] = weights[-1] > 0
         if len(feather.reaches) > 1:

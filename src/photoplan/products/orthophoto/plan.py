@@ -222,7 +222,7 @@ def product_plan(
         return ProductPlan(name=name, sources=images, target=MapTarget(grid), rule=rule, tiles=tiles, owners=owners)
     best = _best(images, settings, settings.choice, looks, regions)
     choice = settings.choice
-    feather = feather_of(best, choice.feather, grid.resolution, settings.tile, choice.blend == "multiband")
+    feather = feather_of(choice.feather, grid.resolution, settings.tile, choice.blend == "multiband")
     return ProductPlan(
         name=name, sources=images, target=MapTarget(grid), rule=rule, tiles=tiles, owners=best, feather=feather
     )
