@@ -21,7 +21,7 @@ from photoplan.products.view.camera import CameraRequest
 from photoplan.products.view.content import Scene
 
 #: Side of the tiles, pixels.
-TILE = 256
+TILE = 128
 
 
 def main(case, out):
