@@ -9,7 +9,7 @@ import click
 from photoplan.cli.options import several
 
 _RGB: dict[str, Any] = {"type": int, "nargs": 3, "default": None, "metavar": "R G B"}
-_LOOK = ("haze", "haze_colour", "sky", "nodata", "samples", "kernel", "shadows")
+_LOOK = ("haze", "haze_colour", "sky", "nodata", "water_colour", "samples", "kernel", "shadows")
 
 #: Contents, light, lines and pairs.
 look_options = several(
@@ -27,6 +27,7 @@ look_options = several(
     click.option("--haze-colour", help="Colour of the horizon in haze [200 210 222].", **_RGB),
     click.option("--sky", help="Colour of the sky [186 212 238].", **_RGB),
     click.option("--nodata", help="Colour of ground that no content shows [214 214 214].", **_RGB),
+    click.option("--water-colour", help="Colour of water that no raster or photo shows [112 150 184].", **_RGB),
     click.option("--samples", type=int, help="Rays along each side of a pixel [2]."),
     click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic]."),
     click.option(

@@ -43,6 +43,9 @@ camera_options = several(
     click.option("--reference", type=float, help="Height that it leaves [where the picture's middle meets ground]."),
     click.option("--farthest", type=float, help="See no further than this, metres [all]."),
     click.option("--bound", type=float, help="Largest error of ground coordinates, metres [0.01]."),
+    click.option(
+        "--water", type=float, metavar="H", help="Height of water that covers what is lower or has no height."
+    ),
     click.option("--crs", help="CRS of a terrain model that does not state it."),
     click.option("--force", is_flag=True, help="Also from below the ground, or where none is seen."),
 )
@@ -84,7 +87,7 @@ def take_request(options: dict[str, Any], **more: Any) -> Any:
     """The request, taken out of the options of a verb."""
     from photoplan.products.view.make import ViewRequest
 
-    given = {name: value for name in ("farthest", "bound") if (value := options.pop(name)) is not None}
+    given = {name: value for name in ("farthest", "bound", "water") if (value := options.pop(name)) is not None}
     named = {name: options.pop(name) for name in ("source", "crs", "force")}
     return ViewRequest(camera=take_camera(options), **named, **given, **more)
 

@@ -86,7 +86,7 @@ def visible_area(request: AreaRequest, events: Events = SILENT) -> VisibleArea:
     inputs = [each for each in (view.source, view.matrix) if each is not None]
     check_output(output, inputs, overwrite=request.overwrite)
     with recording("view area", request, inputs) as record:
-        ground = open_view_ground(view.source, view.crs)
+        ground = open_view_ground(view.source, view.crs, view.water)
         check_output(output, ground.files, overwrite=request.overwrite)
         camera = view_camera(camera_request(view), ground, view.force)
         grid = _grid(request, ground, camera)

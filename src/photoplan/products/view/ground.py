@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from photoplan.errors import InputError, UsageError
+from photoplan.geometry.bounds import odd_place
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.project.ground import ground_of
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.scene import input_files
 from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.flooded import flooded
 from photoplan.surfaces.objects import ObjectSurface, painted_surface
 
 
@@ -29,6 +32,8 @@ class ViewGround:
     project: Project | None
     files: tuple[Path, ...]
     """That decide the ground."""
+    water: float | None = None
+    """Height of water that covers what is lower, metres; the terrain has it in it."""
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -49,7 +54,7 @@ class ViewGround:
         return self.project
 
 
-def open_view_ground(path: Path, crs: str | None = None) -> ViewGround:
+def open_view_ground(path: Path, crs: str | None = None, water: float | None = None) -> ViewGround:
     """The ground of a project file (``.toml``) or of a terrain model.
 
     Parameters
@@ -57,12 +62,26 @@ def open_view_ground(path: Path, crs: str | None = None) -> ViewGround:
     path : Path
     crs : str, optional
         CRS of a terrain model that does not state its own.
+    water : float, optional
+        Height of water that covers what is lower, or has no height, metres.
 
     Raises
     ------
+    UsageError
+        The water lies higher than any on earth.
     InputError
         The file cannot be used.
     """
+    ground = _dry_ground(path, crs)
+    if water is None:
+        return ground
+    odd = odd_place((math.nan, math.nan, water), camera=False)
+    if odd or not math.isfinite(water):
+        raise UsageError(f"`water`: {odd or f'{water}; a height in metres is needed'}")
+    return replace(ground, terrain=flooded(ground.terrain, water, ground.bounds), water=water)
+
+
+def _dry_ground(path: Path, crs: str | None) -> ViewGround:
     if path.suffix.lower() != ".toml":
         model = open_terrain(path, crs, "with `crs` EPSG:nnnn")
         return ViewGround(model.surface, model.bounds, model.crs, model.height_system, None, (model.path,))

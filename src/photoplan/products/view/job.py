@@ -51,6 +51,8 @@ class LookRequest:
     sky: Colour = (186, 212, 238)
     nodata: Colour = (214, 214, 214)
     """Ground that no content shows."""
+    water_colour: Colour = (112, 150, 184)
+    """Water on which no raster or photo shows anything."""
     samples: int = 2
     """Rays along each side of a pixel, of which its colour is the mean."""
     kernel: str = "bicubic"
@@ -62,7 +64,7 @@ class LookRequest:
             raise UsageError(f"`haze` {self.haze} per kilometre; 0 to 100 are allowed, 0.1 is much")
         if not 1 <= self.samples <= 8:
             raise UsageError(f"`samples` {self.samples}; 1 to 8 rays along each side of a pixel are allowed")
-        for name in ("haze_colour", "sky", "nodata"):
+        for name in ("haze_colour", "sky", "nodata", "water_colour"):
             if not all(0 <= v <= 255 for v in getattr(self, name)):
                 raise UsageError(f"`{name}` {getattr(self, name)}; red, green and blue from 0 to 255 are needed")
         Lighting(self.azimuth, self.altitude)
@@ -75,6 +77,7 @@ class ViewAddress:
     source: str
     """Project or terrain model."""
     crs: str | None
+    water: float | None
     camera: CameraRequest
     look: LookRequest
     heights: tuple[float, float]
@@ -106,6 +109,8 @@ class OpenView:
     light: Lighting
     matrix: MatrixFile | None
     photo: Photo | None
+    water: float | None
+    """Height of water, metres."""
 
     @property
     def shift(self) -> int:
@@ -118,14 +123,14 @@ def _open(address: ViewAddress) -> OpenView:
     for path, digest in address.digests:
         if fingerprint(path).digest != digest:
             raise InputError(f"{path}: has changed since the run was planned; run it again")
-    ground = open_view_ground(Path(address.source), address.crs)
+    ground = open_view_ground(Path(address.source), address.crs, address.water)
     camera = view_camera(address.camera, ground, force=True)
     light = Lighting(address.look.azimuth, address.look.altitude, camera.request.exaggeration)
     layers = open_layers(address.look.contents, ground, light, address.heights)
     matrix = None if address.matrix is None else MatrixFile(Path(address.matrix))
     photo = None if address.look.photo is None else Photo.open(address.look.photo, camera.target.bundle.size)
     surface = seen_surface(ground, address.farthest, address.bound)
-    return OpenView(camera.target, surface, layers, light, matrix, photo)
+    return OpenView(camera.target, surface, layers, light, matrix, photo, ground.water)
 
 
 def seen_surface(ground: ViewGround, farthest: float, bound: float) -> SeenSurface:
@@ -222,8 +227,12 @@ def colours_of(scene: Scene, view: OpenView, look: LookRequest) -> Colours:
     seen = scene.seen
     out = np.empty((3, *seen.owner.shape), np.float32)
     out[:] = np.array(look.nodata, np.float32)[:, None, None]
+    water = (seen.owner == 0) & (seen.XYZ[..., 2] == view.water)
+    out = np.where(water, np.array(look.water_colour, np.float32)[:, None, None], out)
     for k, (request, layer) in enumerate(zip(look.contents, view.layers)):
         over, there = layer.paint(scene, out)
+        if request.kind in ("shade", "tint", "slope"):
+            there = there & ~water
         opacity = np.float32(1.0 if request.kind == "shade" and k else request.opacity)
         out = np.where(there, out + opacity * (over - out), out)
     if look.shadows:

@@ -65,6 +65,8 @@ class ViewRequest:
     """Largest error of ground coordinates across the line of sight, metres."""
     crs: str | None = None
     """CRS of a terrain model that does not state it."""
+    water: float | None = None
+    """Height of water that covers what is lower or has none, metres."""
     force: bool = False
     """Also where the point of view lies below the ground."""
     lines: tuple[LinesRequest, ...] = ()
@@ -132,6 +134,7 @@ class ViewPlan:
             "field_of_view_deg": list(self.field_of_view),
             "farthest_m": self.request.farthest,
             "error_bound_m": self.request.bound,
+            **({} if self.request.water is None else {"water_m": self.request.water}),
             **({} if self.stereo is None else {"stereo": self.stereo.how, "base_m": self.stereo.base}),
             "expected": self.first,
         }
@@ -149,7 +152,7 @@ def plan_view(request: ViewRequest) -> ViewPlan:
     GeometryError
         The point of view lies below the ground, or sees none of it.
     """
-    ground = open_view_ground(request.source, request.crs)
+    ground = open_view_ground(request.source, request.crs, request.water)
     camera = view_camera(camera_request(request), ground, request.force)
     _check_driver(request)
     surface = seen_surface(ground, request.farthest, request.bound)
@@ -169,6 +172,7 @@ def plan_view(request: ViewRequest) -> ViewPlan:
     address = ViewAddress(
         source=str(request.source.resolve()),
         crs=request.crs,
+        water=request.water,
         camera=camera.request,
         look=replace(request.look, contents=contents),
         heights=heights,
@@ -178,6 +182,8 @@ def plan_view(request: ViewRequest) -> ViewPlan:
         digests=tuple((str(Path(each["path"]).resolve()), each["sampled_sha256"]) for each in inputs),
     )
     told: list[Any] = [camera.request, _look_facts(address.look), heights, request.farthest, request.bound, TILE]
+    if request.water is not None:
+        told.append(("water", request.water))
     if request.lines:
         drawn = [(each.layer, each.interval, each.options) for each in request.lines]
         told += [drawn, request.text_size, request.lettering is not None]
@@ -322,7 +328,7 @@ def _job(plan: ViewPlan) -> ViewJob:
     """What workers are told; of a pair for both pictures."""
     if plan.stereo is None:
         return ViewJob(plan.address, plan.request.kind == "matrix", draw(plan, plan.camera))
-    ground = open_view_ground(plan.request.source, plan.request.crs)
+    ground = open_view_ground(plan.request.source, plan.request.crs, plan.request.water)
     left, right = (
         ViewJob(replace(plan.address, camera=eye), overlay=draw(plan, view_camera(eye, ground, force=True)))
         for eye in eyes(plan.camera, plan.stereo.metres)
@@ -335,7 +341,7 @@ def draw(plan: ViewPlan, camera: ViewCamera) -> Overlay | None:
     request = plan.request
     if not request.lines:
         return None
-    ground = open_view_ground(request.source, request.crs)
+    ground = open_view_ground(request.source, request.crs, request.water)
     reach = min(request.farthest, 1.5 * (plan.first.farthest or 0.0) + 1000.0)
     drawing = open_drawing(request.lines, ground, reach, camera.target.center)
     sight = Sight(camera.target, seen_surface(ground, request.farthest, request.bound))
@@ -352,7 +358,7 @@ def _complete(
 ) -> ViewResult:
     tally.check(file.path)
     facts = plan.json_fields()
-    names = ("standpoint", "camera", "earth_radius", "bend_per_metre", "error_bound_m", "stereo", "base_m")
+    names = ("standpoint", "camera", "earth_radius", "bend_per_metre", "error_bound_m", "water_m", "stereo", "base_m")
     told = {name: facts[name] for name in names if name in facts}
     tags = {
         "PHOTOPLAN_VERSION": __version__,

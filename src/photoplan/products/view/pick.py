@@ -89,7 +89,7 @@ def pick(request: PickRequest) -> tuple[Picked, ...]:
         check_output(request.output, [request.view.source], overwrite=request.overwrite)
     inputs = [request.view.source, request.file, request.view.matrix]
     with recording("view pick", request, inputs) as record:
-        ground = open_view_ground(request.view.source, request.view.crs)
+        ground = open_view_ground(request.view.source, request.view.crs, request.view.water)
         camera = view_camera(camera_request(request.view), ground, request.view.force)
         found = [*_of_pixels(request, ground, camera), *_of_points(request, ground, camera)]
         if request.output is not None:

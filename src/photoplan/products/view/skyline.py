@@ -89,7 +89,7 @@ def skyline(request: SkylineRequest) -> Skyline:
         if each is not None:
             check_output(each, [name for name in inputs if name is not None], overwrite=request.overwrite)
     with recording("view skyline", request, inputs) as record:
-        ground = open_view_ground(view.source, view.crs)
+        ground = open_view_ground(view.source, view.crs, view.water)
         camera = view_camera(camera_request(view), ground, view.force)
         surface = seen_surface(ground, view.farthest, view.bound)
         if photo is None:
