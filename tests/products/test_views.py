@@ -237,6 +237,17 @@ def test_commands_say_what_will_be_seen_and_take_files_of_cameras(small: Block, 
     assert inside("view", *words, "--dry-run").code == 3
 
 
+def test_the_word_panorama_looks_all_around_from_the_north(small: Block, tmp_path: Path) -> None:
+    words = (small.terrain, "--from", X0, Y0, "--height", 30, "--size", 90, 20, "--samples", 1, "-q")
+    for name, more in (("a", ("panorama",)), ("c", ("panorama", "--panorama", "sphere"))):
+        assert inside("view", *more, *words, "-o", tmp_path / f"{name}.png").code == 0
+    stated = ("--azimuth", 0, "--panorama", "cylinder", "-o", tmp_path / "b.png")
+    assert inside("view", *words, *stated).code == 0
+    a, b, c = (rasterio.open(tmp_path / f"{name}.png").read() for name in "abc")
+    np.testing.assert_array_equal(a, b)
+    assert (a != c).any()
+
+
 def test_an_input_that_changes_is_noticed(small: Block, tmp_path: Path) -> None:
     model = tmp_path / "dem.tif"
     model.write_bytes(small.terrain.read_bytes())

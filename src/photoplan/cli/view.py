@@ -18,9 +18,11 @@ VERBS = {
 
 
 class _Views(LazyGroup):
-    """`photoplan view FILE …` is `photoplan view picture FILE …`."""
+    """`photoplan view FILE …` is `photoplan view picture FILE …`, and `panorama` one with `--panorama cylinder`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if args[:1] == ["panorama"]:
+            args = ["picture", "--panorama", "cylinder", *args[1:]]
         given = not args or args[0] in (*self.verbs, *ctx.help_option_names)
         return super().parse_args(ctx, args if given else ["picture", *args])
 
@@ -30,6 +32,8 @@ command = _Views(
     verbs=VERBS,
     package="photoplan.cli.view_",
     help="""Perspective views of a project or a terrain model: photoplan view FILE --from X Y --look-at X Y -o PICTURE.
+
+    `photoplan view panorama` looks all around (picture --panorama cylinder; --panorama sphere comes after it).
 
     Pictures can be measured: `matrix` gives the ground point of every pixel, `pick` that of single ones.
     """,

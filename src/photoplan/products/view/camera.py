@@ -85,6 +85,8 @@ class CameraRequest:
         far = odd_place((0.0, 0.0, self.reference or 0.0), camera=True)
         if odd is not None or far is not None:
             raise UsageError(odd or f"`reference`: {far}")
+        if self.panorama and self.look_at is None and self.azimuth is None:
+            object.__setattr__(self, "azimuth", 0.0)
         if self.position is not None and (self.look_at is None) == (self.azimuth is None):
             raise UsageError("a standpoint needs either `look_at` X Y [Z] or `azimuth`")
         if self.look_at is not None and len(self.look_at) not in (2, 3):
