@@ -137,14 +137,16 @@ def _back(target: ViewTarget, hits: Hits) -> NDArray[np.float64]:
 
 def pixel_size(target: ViewTarget, uvh: NDArray[np.float64]) -> NDArray[np.float64]:
     """Side of a square of the area that pixels (..., 3) cover at their depth, across the line of sight, metres."""
-    uv = uvh[..., :2]
-    here = target.bundle.directions(uv)
-    (ax, ay, az), (bx, by, bz) = (np.moveaxis(target.bundle.directions(uv + s) - here, -1, 0) for s in _HALVES)
-    # The solid angle of the pixel, times the squared distance, per unit of depth.
-    x, y, z = np.moveaxis(here, -1, 0)
-    volume = (ay * bz - az * by) * x + (az * bx - ax * bz) * y + (ax * by - ay * bx) * z
-    area = 4 * np.abs(volume) / np.sqrt(dot(here, here))
-    return np.asarray(np.abs(uvh[..., 2]) * np.sqrt(area))
+    flat, area = uvh.reshape(-1, 3), np.empty(uvh[..., 2].size)
+    for start in range(0, len(flat), MOST_RAYS):
+        uv = flat[start : start + MOST_RAYS, :2]
+        here = target.bundle.directions(uv)
+        (ax, ay, az), (bx, by, bz) = (np.moveaxis(target.bundle.directions(uv + s) - here, -1, 0) for s in _HALVES)
+        # The solid angle of the pixel, times the squared distance, per unit of depth.
+        x, y, z = np.moveaxis(here, -1, 0)
+        volume = (ay * bz - az * by) * x + (az * bx - ax * bz) * y + (ax * by - ay * bx) * z
+        area[start : start + MOST_RAYS] = 4 * np.abs(volume) / np.sqrt(dot(here, here))
+    return np.asarray(np.abs(uvh[..., 2]) * np.sqrt(area).reshape(uvh.shape[:-1]))
 
 
 def ground_size(target: ViewTarget, seen: Seen) -> NDArray[np.float64]:
