@@ -42,7 +42,10 @@ class Tremor(Protocol):
     """What of a mapping changes from line to line of the image, apart from the rest: a turbulent flight."""
 
     def part(self, XYZ: NDArray[np.float64]) -> TremorPart | None:
-        """For the ground that points (n, 3) enclose; None: the image does not show it."""
+        """For the ground that points (n, 3) enclose; None: the image does not show it.
+
+        Ground beside it has the same part: what is made of it can be kept.
+        """
         ...
 
     def told(self, height: float) -> str:
@@ -65,11 +68,6 @@ class TremorPart(Protocol):
     @property
     def rows(self) -> tuple[int, int]:
         """First and last row at which anything of the ground can be seen."""
-        ...
-
-    @property
-    def columns(self) -> tuple[float, float]:
-        """First and last ideal column of the ground."""
         ...
 
     def shifts(

@@ -69,8 +69,8 @@ class LineLook:
     def tangents(self, column: _Floats) -> _Floats:
         """Tangents (n, 2) of columns (n,); straight on where the line has ended."""
         inside = np.clip(column, *_span(self.columns))
-        values = chebyshev.chebval(self._unit(inside), self.coefficients).T
-        return np.asarray(values + self.slope(inside) * (column - inside)[:, None])
+        values, away = chebyshev.chebval(self._unit(inside), self.coefficients).T, column - inside
+        return np.asarray(values + self.slope(inside) * away[:, None] if np.any(away) else values)
 
     def slope(self, column: _Floats) -> _Floats:
         """Change of the tangents (n, 2) from column to column."""
@@ -97,12 +97,21 @@ class LineLook:
         """The columns (n,) with these tangents along the chord (n,), by Newton's method."""
         first, last = self._along_ends
         at = self._ends[0] + (along - first) * (self._ends[1] - self._ends[0]) / (last - first)
+        values, slopes = self._chord
         for _ in range(12):
-            step = (self.tangents(at) @ self.axes[0] - along) / (self.slope(at) @ self.axes[0])
+            inside = np.clip(at, *_span(self.columns))
+            unit = self._unit(inside)
+            slope = chebyshev.chebval(unit, slopes)
+            step = (chebyshev.chebval(unit, values) + slope * (at - inside) - along) / slope
             at = at - step
             if not (np.abs(step) > 1e-11 * self.columns).any():
                 break
         return np.asarray(at)
+
+    @cached_property
+    def _chord(self) -> tuple[_Floats, _Floats]:
+        """Polynomials of the tangents along the chord, and of their change from column to column."""
+        return self.coefficients @ self.axes[0], self._slopes @ self.axes[0]
 
     @cached_property
     def _along_ends(self) -> tuple[float, float]:

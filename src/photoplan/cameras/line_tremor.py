@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +36,8 @@ _CLOSE, _NEAR = 1e-5, 0.05
 _TOLD = 300
 #: Rows by which the smooth part may bend between the points that enclose a piece of ground.
 _AROUND = 16.0
+#: Parts begin and end at multiples of so many lines, so that pieces of ground beside each other have the same.
+_SHARED = 256
 #: Rows between which points are looked for whose row is known but for the shift.
 _ANY = (-1e6, 1e6)
 
@@ -73,9 +75,8 @@ class LineTremor:
         first, last = max(rows[0], int(np.floor(begin))), min(rows[1], int(np.ceil(end)))
         if last <= first:
             return None
-        straight = replace(self.rough, track=_straight_track(self.rough.track, first, last))
-        ideal = straight.project_homogeneous(XYZ)[..., 0]
-        return StraightPart(straight, self.rough, (first, last), (float(np.nanmin(ideal)), float(np.nanmax(ideal))))
+        first, last = max(first // _SHARED * _SHARED, int(np.floor(begin))), -(-last // _SHARED) * _SHARED
+        return _straight_part(self, first, min(last, int(np.ceil(end))))
 
     def _rows(self, low: float, high: float) -> tuple[int, int]:
         """First and last row at which anything can be seen that the smooth part sees from row `low` to `high` on."""
@@ -157,7 +158,6 @@ class StraightPart:
     smooth: LineCamera
     rough: LineCamera
     rows: tuple[int, int]
-    columns: tuple[float, float]
 
     def shifts(self, columns: _Floats, rows: _Floats, heights: Sequence[float]) -> _Floats:
         """See `TremorPart`."""
@@ -189,6 +189,12 @@ class StraightPart:
         point = self.smooth.rays(middle, height)[0]
         lift = float(self.rough.ground.height(self.rough.ground(point))[0])
         return lift if np.isfinite(lift) else height
+
+
+@lru_cache(maxsize=64)
+def _straight_part(tremor: LineTremor, first: int, last: int) -> StraightPart:
+    track = _straight_track(tremor.rough.track, first, last)
+    return StraightPart(replace(tremor.rough, track=track), tremor.rough, (first, last))
 
 
 def smoothed(camera: LineCamera) -> LineTremor | None:

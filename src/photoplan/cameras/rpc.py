@@ -76,6 +76,11 @@ class RationalFunctions:
                 f"its middle is at longitude {lon:g}°, latitude {lat:g}°, height {height:g} m, which is nowhere on "
                 "earth; are the offsets in degrees and metres?"
             )
+        if not (max(self.ground_scale[:2]) <= 180 and self.ground_scale[2] < 1e5):
+            told = ", ".join(f"{scale:g}" for scale in self.ground_scale)
+            raise InputError(
+                f"scales {told} (longitude, latitude, height) exceed the earth; are they in degrees and metres?"
+            )
         if (coefficients[1::2, 0] == 0).any():
             raise InputError("a denominator vanishes in the middle of the image; the first of its coefficients is 0")
         if (coefficients[::2, 1:3] == 0).all(axis=1).any():

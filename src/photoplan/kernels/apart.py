@@ -68,22 +68,32 @@ def _mean_of_rows(
         if not abs(x) < 1e9:
             continue
         down = np.float64(wy[BEFORE + row - top])
-        left, right, _, last = _weights(rule, 0, (x, spot[2]), width, wx)
+        left, right, in_x, last = _weights(rule, 0, (x, spot[2]), width, wx)
         total += down * last
         away = row - spot[1]
-        for col in range(left, right):
-            if valid.size > 0 and valid[row, col] == 0:
-                continue
-            weight = down * np.float64(wx[BEFORE + col - left])
-            usable, s1, s2 = usable + weight, s1 + weight * away, s2 + weight * away * away
+        if valid.size > 0:
+            in_x = 0.0
+            for col in range(left, right):
+                if valid[row, col] == 0:
+                    wx[BEFORE + col - left] = np.float32(0.0)
+                in_x += np.float64(wx[BEFORE + col - left])
+        share = down * in_x
+        usable, s1, s2 = usable + share, s1 + share * away, s2 + share * away * away
+        for band in range(bands if in_x != 0.0 else 0):
+            line, lane = source[band // lanes, row], band % lanes
             # Relative to one of the pixels, so that a constant image stays constant to the last bit.
-            for band in range(bands):
-                value = np.float64(source[band // lanes, row, col, band % lanes])
-                if first:
-                    base[band], means[band], steep[band] = value, 0.0, 0.0
-                means[band] += weight * (value - base[band])
-                steep[band] += weight * away * (value - base[band])
-            first = False
+            if first:
+                base[band], means[band], steep[band] = 0.0, 0.0, 0.0
+                for col in range(left, right):
+                    if wx[BEFORE + col - left] != 0.0:
+                        base[band] = np.float64(line[col, lane])
+            level, value = base[band], 0.0
+            for col in range(left, right):
+                # Invalid pixels may hold anything, but 0 has been put there: see `pack`.
+                value += np.float64(wx[BEFORE + col - left]) * (np.float64(line[col, lane]) - level)
+            means[band] += down * value
+            steep[band] += down * away * value
+        first = first and in_x == 0.0
     total += (all_y - in_y) * last
     # Factors 1 and (row − y) · tilt of the weights, so that they are balanced about the place.
     uneven = abs(s1) > 1e-5 * usable and abs(s1) < MOST_TILT * s2 and spot[3] <= 1.0

@@ -235,8 +235,9 @@ def _assemble(
     table, origin, frame, nodes = None, np.zeros(2), np.zeros(5), np.empty((0, 0, 2), np.float32)
     tremor = image.tremor
     if tremor is not None:
-        residual, nodes = residual * tremor.stretch + tremor.residual, tremor.nodes
-        low, high = low + tremor.low, high + tremor.high
+        shaken = tremor.nodes(low, high)
+        residual, nodes = residual * tremor.stretch + tremor.residual, shaken.nodes
+        low, high = low + shaken.low, high + shaken.high
     if image.grid is not None:
         table = image.grid.table(low, high)
         scales = scales[0] * max(0.0, 2.0 - image.grid.stretch), scales[1] * image.grid.stretch
@@ -250,7 +251,7 @@ def _assemble(
     if table is not None and image.grid is not None:
         frame = np.array([*(table.first - origin), *(1.0 / np.array(image.grid.spacing)), image.grid.stretch])
     if tremor is not None:
-        frame = np.array([*(tremor.first - origin), 1.0 / tremor.spacing, 1.0, 1.0, tremor.height])
+        frame = np.array([*(shaken.first - origin), 1.0 / tremor.spacing, 1.0, 1.0, tremor.heights[0]])
     corners /= corners[..., 2:].mean(axis=1, keepdims=True)
     corners[..., :2] -= origin * corners[..., 2:]
     return Anchors(

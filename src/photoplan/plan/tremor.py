@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -14,32 +15,48 @@ from photoplan.geometry.motion import cubic_convolution
 _Floats = NDArray[np.float64]
 #: Spacing of nodes along a line, pixels; finer where that misses more than a part of the tolerance.
 _SPACINGS = (512.0, 256.0, 128.0, 64.0, 32.0)
-#: Places along a line at which shifts are computed.
-_PLACES = 3
-#: Lines that are measured strictly.
-_MEASURED = 16
-#: Half the range of heights at least, metres: shifts change with height, and have to be told from rounding.
-_HEIGHTS = 20.0
+#: Places along a line at which shifts are computed, and columns beyond its ends over which they are known.
+_PLACES, _BEYOND = 5, 64.0
+#: Lines that are measured strictly, and places along each.
+_MEASURED, _MEASURED_ALONG = 16, 12
+#: Heights are counted by steps of this, metres, so that tiles of alike ground have one table.
+_HEIGHTS = 32.0
 #: Where points pass through the line at less than this part of its speed, a position has no accuracy: not reported.
 _SLOW = 0.2
 #: What is missed beside the places that are measured.
 _BESIDE = 1.3
+#: Rows around those that a tile needs: between the rows shifts are cubic.
+_AROUND = 3
+
+
+@dataclass(frozen=True, eq=False)
+class TremorNodes:
+    """The nodes that one tile needs."""
+
+    first: tuple[float, float]
+    """Ideal x and real y of the first node."""
+    nodes: NDArray[np.float32]
+    """(rows, columns, 5): real minus ideal position, its change per metre of height, and how far rows come, see
+    `Anchors.field`."""
+    low: _Floats
+    """Lowest shift (x, y)."""
+    high: _Floats
+    """Highest shift (x, y)."""
 
 
 @dataclass(frozen=True, eq=False)
 class TremorTable:
-    """The nodes that one tile needs."""
+    """The shifts of some lines: strict at a few places along each, polynomials between them."""
 
     part: TremorPart
-    first: tuple[float, float]
-    """Ideal x and real y of the first node."""
+    rows: _Floats
+    places: _Floats
+    strict: _Floats
+    """(rows, places, 4): shifts and their changes per metre of height."""
     spacing: float
     """Of the nodes along x, pixels; along y they lie on the lines."""
-    height: float
-    """Of the values, metres."""
-    nodes: NDArray[np.float32]
-    """(rows, columns, 5): real minus ideal position, its change per metre of height, and how far rows come, see
-    `Anchors.field`."""
+    heights: tuple[float, float]
+    """Of the values, and half the range over which they hold, metres."""
     residual: float
     """Worst difference to the strict position, pixels, but for points that pass through the line very slowly."""
     stretch: float
@@ -55,46 +72,83 @@ class TremorTable:
         right, bottom = (np.array(size) - 0.5 - self.low).tolist()
         return left, top, right, bottom
 
+    def nodes(self, low: _Floats, high: _Floats) -> TremorNodes:
+        """Nodes for ideal positions (x, y) from `low` to `high`."""
+        columns = _columns(low[0] - 2.0, high[0] + 2.0, self.spacing)
+        nodes = _along(self.strict, self.places, columns)
+        around = self.heights[1] * np.abs(nodes[..., 3])
+        seen = (self.rows[:, None] - nodes[..., 1]).T
+        with np.errstate(invalid="ignore"):
+            needed = ((seen + around.T >= low[1] - 1.0) & (seen - around.T <= high[1] + 1.0)).any(axis=0)
+        some = np.flatnonzero(needed)
+        begin, end = (some[0], some[-1] + 1) if len(some) else (0, 1)
+        begin, end = max(begin - _AROUND, 0), min(end + _AROUND, len(self.rows))
+        nodes, around = nodes[begin:end], around[begin:end]
+        come = np.arange(len(nodes))[:, None] - nodes[..., 1] + around
+        come[:, :-1] = np.maximum(come[:, :-1], come[:, 1:])
+        # Rows without orientation see nothing.
+        come = np.fmax.accumulate(np.nan_to_num(come, nan=-np.inf), axis=0) + 1e-3
+        kept = np.concatenate([nodes, come[..., None]], axis=-1).astype(np.float32)
+        lowest, highest = _range(nodes, self.heights[1])
+        return TremorNodes((float(columns[0]), float(self.rows[begin])), kept, lowest, highest)
+
 
 def tremor_table(part: TremorPart, width: int, heights: tuple[float, float], tolerance: float) -> TremorTable:
-    """Nodes of some lines of an image of a width, over a range of heights."""
+    """The table of some lines of an image of a width, over a range of heights at least; kept for the next tile."""
+    low, high = np.floor(heights[0] / _HEIGHTS) * _HEIGHTS, np.ceil(heights[1] / _HEIGHTS) * _HEIGHTS
+    return _table(part, width, (float(low), float(max(high, low + _HEIGHTS))), tolerance)
+
+
+@lru_cache(maxsize=48)
+def _table(part: TremorPart, width: int, heights: tuple[float, float], tolerance: float) -> TremorTable:
     rows = np.arange(part.rows[0] - 2.0, part.rows[1] + 3.0)
-    left, right = max(part.columns[0], -0.5 - width), min(part.columns[1], 2.0 * width)
-    middle, half = (heights[0] + heights[1]) / 2, max((heights[1] - heights[0]) / 2, _HEIGHTS)
+    left, right = -_BEYOND, width - 1 + _BEYOND
+    middle, half = (heights[0] + heights[1]) / 2, (heights[1] - heights[0]) / 2
     # Along a line shifts are smooth: a few places tell what all others are.
-    places = (left + right) / 2 + (right - left + 4.0) / 2 * chebyshev.chebpts1(_PLACES)
+    places = (left + right) / 2 + (right - left) / 2 * chebyshev.chebpts1(_PLACES)
     low, high = part.shifts(places, rows, (middle - half, middle + half))
     strict = np.concatenate([(low + high) / 2, (high - low) / (2 * half)], axis=-1)
     for spacing in _SPACINGS:
-        first = spacing * np.floor((left - 2.0) / spacing)
-        columns = first + spacing * np.arange(int((right + 2.0 - first) // spacing) + 2)
+        columns = _columns(left, right, spacing)
         nodes = _along(strict, places, columns)
         middles = _along(strict, places, (columns[1:] + columns[:-1]) / 2)[..., :2]
         bent = (nodes[:, 1:, :2] + nodes[:, :-1, :2]) / 2 - middles
-        if not np.nanmax(np.hypot(bent[..., 0], bent[..., 1]), initial=0.0) > tolerance / 4:
+        if not np.nanmax(np.hypot(bent[..., 0], bent[..., 1]), initial=0.0) > tolerance:
             break
     stretch = _stretch(nodes, half)
     k = np.unique(np.r_[np.argsort(stretch)[-_MEASURED:], np.linspace(0, len(stretch) - 1, _MEASURED)].astype(np.int64))
-    missed = float(np.nanmax(_missed(part, columns, rows, nodes, (middle, half), k + 1) * stretch[k], initial=0.0))
-    come = np.arange(len(rows))[:, None] - nodes[..., 1] + half * np.abs(nodes[..., 3])
-    come[:, :-1] = np.maximum(come[:, :-1], come[:, 1:])
-    # Rows without orientation see nothing.
-    come = np.fmax.accumulate(np.nan_to_num(come, nan=-np.inf), axis=0) + 1e-3
-    kept = np.concatenate([nodes, come[..., None]], axis=-1).astype(np.float32)
+    some = np.unique(np.linspace(0, len(columns) - 2, _MEASURED_ALONG).astype(np.int64))
+    missed = float(
+        np.nanmax(_missed(part, columns, rows, nodes, (middle, half), k + 1, some) * stretch[k], initial=0.0)
+    )
     furthest = np.nanmax(np.abs(nodes), axis=(0, 1), initial=0.0)
-    around = half * furthest[2:]
     last_digits = [float(np.spacing(np.float32(each.max()))) for each in (furthest[:2], furthest[2:])]
+    lowest, highest = _range(nodes, half)
     return TremorTable(
         part=part,
-        first=(float(first), float(rows[0])),
+        rows=rows,
+        places=places,
+        strict=strict,
         spacing=spacing,
-        height=middle,
-        nodes=kept,
+        heights=(middle, half),
         residual=_BESIDE * missed + last_digits[0] + half * last_digits[1],
         stretch=float(stretch.max()),
-        low=np.nanmin(nodes[..., :2], axis=(0, 1), initial=0.0) - around - 1.0,
-        high=np.nanmax(nodes[..., :2], axis=(0, 1), initial=0.0) + around + 1.0,
+        low=lowest,
+        high=highest,
     )
+
+
+def _columns(left: float, right: float, spacing: float) -> _Floats:
+    """Nodes at whole multiples of the spacing, from before `left` to behind `right`."""
+    first = np.floor(left / spacing)
+    return spacing * np.arange(first, np.floor(right / spacing) + 2.0)
+
+
+def _range(nodes: _Floats, half: float) -> tuple[_Floats, _Floats]:
+    """Lowest and highest shifts (x, y)."""
+    around = half * np.nanmax(np.abs(nodes[..., 2:]), axis=(0, 1), initial=0.0)
+    low, high = (find(nodes[..., :2], axis=(0, 1), initial=0.0) for find in (np.nanmin, np.nanmax))
+    return low - around - 1.0, high + around + 1.0
 
 
 def _along(values: _Floats, places: _Floats, columns: _Floats) -> _Floats:
@@ -103,7 +157,7 @@ def _along(values: _Floats, places: _Floats, columns: _Floats) -> _Floats:
     for j in range(len(places)):
         for other in np.delete(places, j):
             weights[:, j] *= (columns - other) / (places[j] - other)
-    return np.asarray(np.einsum("mk,nkc->nmc", weights, values))
+    return np.asarray(weights @ values)
 
 
 def _stretch(nodes: _Floats, half: float) -> _Floats:
@@ -130,13 +184,17 @@ def _missed(
     nodes: _Floats,
     heights: tuple[float, float],
     k: NDArray[np.int64],
+    some: NDArray[np.int64],
 ) -> _Floats:
-    """What the table misses between columns and heights, between rows k (m,) and the next; (m,), ideal pixels."""
+    """What the table misses between columns and heights, between rows k (m,) and the next; (m,), ideal pixels.
+
+    Behind the columns `some`.
+    """
     w = cubic_convolution(np.full(len(k), 0.5))
     between = np.asarray(sum(w[:, j, None, None] * nodes[k - 1 + j] for j in range(4)))
-    between = (between[:, 1:] + between[:, :-1]) / 2
+    between = (between[:, some + 1] + between[:, some]) / 2
     worst, away = np.zeros(len(k)), (0.0, 0.5 * heights[1])
-    strict = part.shifts((columns[1:] + columns[:-1]) / 2, rows[k] + 0.5, [heights[0] + each for each in away])
+    strict = part.shifts((columns[some + 1] + columns[some]) / 2, rows[k] + 0.5, [heights[0] + each for each in away])
     for each, found in zip(away, strict):
         miss = between[..., :2] + each * between[..., 2:] - found
         worst = np.maximum(worst, np.hypot(miss[..., 0], miss[..., 1]).max(axis=1))
