@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -44,7 +44,7 @@ class Tremor(Protocol):
     def part(self, XYZ: NDArray[np.float64]) -> TremorPart | None:
         """For the ground that points (n, 3) enclose; None: the image does not show it.
 
-        Ground beside it has the same part: what is made of it can be kept.
+        Ground beside it has the same part, one that can be a key: what is made of it can be kept.
         """
         ...
 
@@ -53,7 +53,7 @@ class Tremor(Protocol):
         ...
 
 
-class TremorPart(Protocol):
+class TremorPart(Hashable, Protocol):
     """Some lines of such an image.
 
     The smooth part says where a ground point would lie, *ideally*; the real position differs by a shift that belongs to

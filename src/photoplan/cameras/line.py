@@ -81,12 +81,20 @@ class LineCamera:
         return Moments(point[inside], xy[inside])
 
     def project_homogeneous(self, XYZ: ArrayLike) -> _Floats:
-        """Ground (..., 3) to (x, y, 1); NaN behind the camera, and at lines whose orientation is not known."""
+        """Ground (..., 3) to (x·w, y·w, w); NaN behind the camera, and at lines whose orientation is not known.
+
+        Along a line the mapping is projective: w is the depth in the camera at the moment at which a point is seen.
+        Across it is parallel; where a line looks further ahead than to the sides, w is 1.
+        """
         XYZ = np.asarray(XYZ, float)
-        out = np.ones(XYZ.shape)
-        out[..., :2] = self.seen_from(self.ground(XYZ).reshape(-1, 3)).reshape(*XYZ.shape[:-1], 2)
-        out[np.isnan(out[..., 0])] = np.nan
-        return out
+        P = self.ground(XYZ).reshape(-1, 3)
+        xy = self.seen_from(P)
+        out = np.full((len(P), 3), np.nan)
+        seen = np.flatnonzero(np.isfinite(xy[:, 0]))
+        S, R = self.track(xy[seen, 1])
+        w = np.einsum("ni,ni->n", R[:, :, 2], P[seen] - S) if self.look.is_wide else np.ones(len(seen))
+        out[seen] = np.column_stack([xy[seen] * w[:, None], w])
+        return out.reshape(XYZ.shape)
 
     def derivatives(self, XYZ: ArrayLike) -> _Floats:
         """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN where there is no position."""

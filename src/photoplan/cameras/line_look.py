@@ -89,6 +89,13 @@ class LineLook:
         """Tangent of a column in the middle of the line."""
         return float(np.linalg.norm(self.slope(np.array([(self.columns - 1) / 2]))))
 
+    @cached_property
+    def is_wide(self) -> bool:
+        """Whether it looks further to the sides than ahead."""
+        middle = self.tangents(np.array([0.0, self.columns - 1.0])).mean(axis=0)
+        half = abs(self.along(self._ends[1]) - self.along(self._ends[0])) / 2
+        return bool(half > abs(middle @ self.axes[1]))
+
     def along(self, column: float) -> float:
         """Tangent along the line's chord."""
         return float(self.tangents(np.array([column]))[0] @ self.axes[0])

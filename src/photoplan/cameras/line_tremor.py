@@ -65,7 +65,7 @@ class LineTremor:
 
     def part(self, XYZ: _Floats) -> StraightPart | None:
         """See `Tremor`."""
-        seen = self.smooth.project_homogeneous(XYZ)[..., :2].reshape(-1, 2)
+        seen = self.smooth.seen_from(self.smooth.ground(XYZ).reshape(-1, 3))
         seen = seen[np.isfinite(seen[:, 0])]
         if not len(seen):
             return None

@@ -37,8 +37,7 @@ def _root(c1: float, c2: float, c3: float, b: float, start: float) -> float:
             new = 0.5 * (low + high)
         step = new - t
         t = new
-        # The next step would be about the square of this one.
-        if abs(step) < 2e-4:
+        if abs(step) < 1e-6:
             break
     return t
 

@@ -236,7 +236,7 @@ def _assemble(
     tremor = image.tremor
     if tremor is not None:
         shaken = tremor.nodes(low, high)
-        residual, nodes = residual * tremor.stretch + tremor.residual, shaken.nodes
+        residual, nodes = residual * shaken.stretch + tremor.residual, shaken.nodes
         low, high = low + shaken.low, high + shaken.high
     if image.grid is not None:
         table = image.grid.table(low, high)

@@ -42,6 +42,8 @@ class TremorNodes:
     """Lowest shift (x, y)."""
     high: _Floats
     """Highest shift (x, y)."""
+    stretch: float
+    """See `TremorTable.stretch`: of these rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,8 @@ class TremorTable:
     part: TremorPart
     rows: _Floats
     places: _Floats
+    length: float
+    """Of the line, pixels from the first to the last."""
     strict: _Floats
     """(rows, places, 4): shifts and their changes per metre of height."""
     spacing: float
@@ -59,8 +63,9 @@ class TremorTable:
     """Of the values, and half the range over which they hold, metres."""
     residual: float
     """Worst difference to the strict position, pixels, but for points that pass through the line very slowly."""
-    stretch: float
-    """Pixels in the image of a pixel of the ideal position at most, but for such points."""
+    stretch: _Floats
+    """Pixels in the image of a pixel of the ideal position at most, but for such points: between rows, at columns
+    spread evenly along the line, (n − 3, k)."""
     low: _Floats
     """Lowest shift (x, y)."""
     high: _Floats
@@ -90,7 +95,11 @@ class TremorTable:
         come = np.fmax.accumulate(np.nan_to_num(come, nan=-np.inf), axis=0) + 1e-3
         kept = np.concatenate([nodes, come[..., None]], axis=-1).astype(np.float32)
         lowest, highest = _range(nodes, self.heights[1])
-        return TremorNodes((float(columns[0]), float(self.rows[begin])), kept, lowest, highest)
+        last = self.stretch.shape[1] - 1
+        left, right = np.clip(np.array([low[0], high[0]]) / self.length * last, 0, last)
+        stretch = self.stretch[begin : max(end - 3, begin), int(left) : int(np.ceil(right)) + 1].max(initial=1.0)
+        first = (float(columns[0]), float(self.rows[begin]))
+        return TremorNodes(first=first, nodes=kept, low=lowest, high=highest, stretch=float(stretch))
 
 
 def tremor_table(part: TremorPart, width: int, heights: tuple[float, float], tolerance: float) -> TremorTable:
@@ -108,19 +117,19 @@ def _table(part: TremorPart, width: int, heights: tuple[float, float], tolerance
     places = (left + right) / 2 + (right - left) / 2 * chebyshev.chebpts1(_PLACES)
     low, high = part.shifts(places, rows, (middle - half, middle + half))
     strict = np.concatenate([(low + high) / 2, (high - low) / (2 * half)], axis=-1)
+    # What is measured is measured at some places spread along the line.
+    some = np.linspace(0.0, width - 1.0, _MEASURED_ALONG)
     for spacing in _SPACINGS:
-        columns = _columns(left, right, spacing)
-        nodes = _along(strict, places, columns)
-        middles = _along(strict, places, (columns[1:] + columns[:-1]) / 2)[..., :2]
-        bent = (nodes[:, 1:, :2] + nodes[:, :-1, :2]) / 2 - middles
-        if not np.nanmax(np.hypot(bent[..., 0], bent[..., 1]), initial=0.0) > tolerance:
+        ends = np.stack([some - spacing / 2, some + spacing / 2])
+        nodes = _along(strict, places, ends.ravel()).reshape(len(rows), 2, len(some), 4)
+        bent = nodes[..., :2].mean(axis=1) - _along(strict, places, some)[..., :2]
+        if not np.nanmax(np.hypot(bent[..., 0], bent[..., 1]), initial=0.0) > tolerance / 4:
             break
+    nodes = nodes.mean(axis=1)
     stretch = _stretch(nodes, half)
-    k = np.unique(np.r_[np.argsort(stretch)[-_MEASURED:], np.linspace(0, len(stretch) - 1, _MEASURED)].astype(np.int64))
-    some = np.unique(np.linspace(0, len(columns) - 2, _MEASURED_ALONG).astype(np.int64))
-    missed = float(
-        np.nanmax(_missed(part, columns, rows, nodes, (middle, half), k + 1, some) * stretch[k], initial=0.0)
-    )
+    worst = stretch.max(axis=1)
+    k = np.unique(np.r_[np.argsort(worst)[-_MEASURED:], np.linspace(0, len(worst) - 1, _MEASURED)].astype(np.int64))
+    missed = float(np.nanmax(_missed(part, some, rows, nodes, (middle, half), k + 1) * worst[k], initial=0.0))
     furthest = np.nanmax(np.abs(nodes), axis=(0, 1), initial=0.0)
     last_digits = [float(np.spacing(np.float32(each.max()))) for each in (furthest[:2], furthest[2:])]
     lowest, highest = _range(nodes, half)
@@ -128,11 +137,12 @@ def _table(part: TremorPart, width: int, heights: tuple[float, float], tolerance
         part=part,
         rows=rows,
         places=places,
+        length=width - 1.0,
         strict=strict,
         spacing=spacing,
         heights=(middle, half),
         residual=_BESIDE * missed + last_digits[0] + half * last_digits[1],
-        stretch=float(stretch.max()),
+        stretch=stretch,
         low=lowest,
         high=highest,
     )
@@ -161,19 +171,19 @@ def _along(values: _Floats, places: _Floats, columns: _Floats) -> _Floats:
 
 
 def _stretch(nodes: _Floats, half: float) -> _Floats:
-    """Pixels in the image of a pixel of the ideal position at most, between rows (n − 3,), at places not too slow.
+    """Pixels in the image of a pixel of the ideal position at most, between rows (n − 3, columns), not where too slow.
 
     A point that passes the line slowly is found at another row, and all that the line does meanwhile comes with it.
     """
     n = len(nodes)
-    worst = np.ones(n - 3)
+    worst = np.ones((n - 3, nodes.shape[1]))
     for u in (0.0, 0.25, 0.5, 0.75):
         w = ((4 - 3 * u) * u - 1) / 2, (9 * u - 10) * u / 2, ((8 - 9 * u) * u + 1) / 2, (3 * u - 2) * u / 2
         slope = np.asarray(sum(w[k] * nodes[k : n - 3 + k] for k in range(4)))
         along = np.abs(slope[..., 0]) + half * np.abs(slope[..., 2])
         pace = 1.0 - slope[..., 1] - half * np.abs(slope[..., 3])
         longer = np.where(pace > _SLOW, np.hypot(1.0, along) / np.where(pace > _SLOW, pace, 1.0), 1.0)
-        worst = np.fmax(worst, longer.max(axis=1))
+        worst = np.fmax(worst, longer)
     return np.asarray(np.hypot(1.0, worst))
 
 
@@ -184,17 +194,12 @@ def _missed(
     nodes: _Floats,
     heights: tuple[float, float],
     k: NDArray[np.int64],
-    some: NDArray[np.int64],
 ) -> _Floats:
-    """What the table misses between columns and heights, between rows k (m,) and the next; (m,), ideal pixels.
-
-    Behind the columns `some`.
-    """
+    """What nodes interpolated to columns miss, between heights and between rows k (m,) and the next; (m,), pixels."""
     w = cubic_convolution(np.full(len(k), 0.5))
     between = np.asarray(sum(w[:, j, None, None] * nodes[k - 1 + j] for j in range(4)))
-    between = (between[:, some + 1] + between[:, some]) / 2
     worst, away = np.zeros(len(k)), (0.0, 0.5 * heights[1])
-    strict = part.shifts((columns[some + 1] + columns[some]) / 2, rows[k] + 0.5, [heights[0] + each for each in away])
+    strict = part.shifts(columns, rows[k] + 0.5, [heights[0] + each for each in away])
     for each, found in zip(away, strict):
         miss = between[..., :2] + each * between[..., 2:] - found
         worst = np.maximum(worst, np.hypot(miss[..., 0], miss[..., 1]).max(axis=1))
