@@ -8,10 +8,10 @@ import pytest
 from photoplan.kernels import facets_grey, facets_height, facets_radiometry, facets_solve, facets_transfer
 
 
-def carried(low, high, posts, out) -> None:
+def carried(low, high, posts, out, wall=np.inf) -> None:
     steep = np.empty((-(-(len(posts) - 1) // facets_transfer.CELL), -(-(posts.shape[1] - 1) // facets_transfer.CELL)))
     facets_transfer.steepness(posts, steep)
-    facets_transfer.transfer(low, high, 1, (0.0, 100.0), posts, steep, out)
+    facets_transfer.transfer(low, high, 1, (0.0, 100.0), posts, steep, wall, out)
 
 
 def test_a_ray_ends_at_the_first_facet_that_it_meets() -> None:
@@ -33,6 +33,11 @@ def test_a_ray_ends_at_the_first_facet_that_it_meets() -> None:
                 assert abs(out[0, k, 0] - at[below]) < 1e-3
             elif not -0.01 <= at[below] <= 20.01:
                 assert np.isnan(out[0, k]).all()
+        without = np.empty_like(out)
+        carried(low, high, posts, without, wall=1.5)
+        facing = 9 if slope > 0 else 7
+        face = (out[0, :, 0] > facing) & (out[0, :, 0] < facing + 1)
+        assert face.any() and (np.isnan(without[0, :, 0]) == (face | np.isnan(out[0, :, 0]))).all()
 
 
 def test_a_place_moves_as_stated_when_the_surface_rises() -> None:

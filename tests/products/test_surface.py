@@ -154,6 +154,18 @@ def test_two_images_and_a_wrong_start(tmp_path: Path) -> None:
     assert 0.6 < np.sqrt(np.mean(judged.normalised**2)) < 1.6
 
 
+def test_heights_that_are_searched(scene: Scene, tmp_path: Path) -> None:
+    """The start is 15 m above the ground; facets begin on the finest level where the search left them."""
+    words = ["--start", GROUND + 15, "--reach", 20, "--search", "--output", tmp_path, "--no-quicklook"]
+    said = surface(scene, *words)
+    assert said.code == 0, said.err
+    assert "  1 level, the coarsest with heights of 1.5 m" in said.err and "heights searched within 20 m (" in said.err
+    judged = judge(scene, tmp_path)
+    print(judged.rms, judged.error.mean(), np.sqrt(np.mean(judged.normalised**2)))
+    assert judged.rms < 0.02 and abs(judged.error.mean()) < 0.005
+    assert 0.6 < np.sqrt(np.mean(judged.normalised**2)) < 1.6
+
+
 def test_a_plan_is_told_and_nothing_is_written(scene: Scene, tmp_path: Path) -> None:
     said = surface(scene, "--dry-run", "--output", tmp_path / "new")
     assert said.code == 0 and "surface of 5 images: 25 × 41 heights of 1.5 m" in said.out

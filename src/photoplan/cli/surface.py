@@ -20,6 +20,11 @@ from photoplan.cli.options import PATH, bounds_option, dry_run_option, executing
 )
 @click.option("--reach", type=float, metavar="M", help="How far the start may be wrong [a tenth of the flying height].")
 @click.option(
+    "--search/--no-search",
+    default=None,
+    help="Whether heights are searched within the reach first: strong relief [from a reach of 24 px of parallax on].",
+)
+@click.option(
     "--points", type=PATH, multiple=True, metavar="FILE", help="Also as points, .las, .laz or .ply; may be repeated."
 )
 @click.option("--residuals", is_flag=True, help="Also the residuals of every image: NAME_residuals.tif.")

@@ -126,7 +126,7 @@ def _hit(posts, steep, u, v, ku, kv, top, bottom, slope, z):
 
 
 @kernel
-def transfer(low, high, step, levels, posts, steep, out):
+def transfer(low, high, step, levels, posts, steep, wall, out):
     """Where the rays of all pixels of a window first meet the surface: what hides behind it is met by none.
 
     Parameters
@@ -141,10 +141,12 @@ def transfer(low, high, step, levels, posts, steep, out):
         Heights, metres, none of them NaN.
     steep : ndarray
         See `steepness`.
+    wall : float
+        Times by which pixels lie closer on a facet than on level ground beyond which they are left out; infinite: none.
     out : ndarray, shape (height, width, 4), float32
         Column and row of the posts where the ray of a pixel ends, and by how much these change if the surface there
         rises, 1/m: (X − X0)/(Z − Z0) of Schlüter 2001, eq. 1, over 1 less the surface's own rise along the ray.
-        NaN where a ray meets nothing inside the posts.
+        NaN where a ray meets nothing inside the posts, or a wall.
     """
     rows, columns = posts.shape
     top, bottom, slope = posts[0, 0], posts[0, 0], 0.0
@@ -183,6 +185,8 @@ def transfer(low, high, step, levels, posts, steep, out):
                 u, v = u0 + z * ku, v0 + z * kv
                 if u >= 0.0 and v >= 0.0 and u <= columns - 1.0 and v <= rows - 1.0:
                     towards = max(1.0 - _rise(posts, u, v, ku, kv), _GRAZING)
+                    if towards > wall:
+                        continue
                     out[r, c, 0], out[r, c, 1] = u, v
                     out[r, c, 2], out[r, c, 3] = ku / towards, kv / towards
                 if np.isnan(z):

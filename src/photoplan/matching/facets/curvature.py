@@ -80,6 +80,11 @@ class Roughness:
         """Half the gradient of the weighted sum of their squares, shape (rows, columns)."""
         return _transposed(self.weights * curvatures(heights))
 
+    def around(self, heights: _Doubles) -> Roughness:
+        """The same variances, with the robust factors of heights (rows, columns)."""
+        single = curvatures(heights) ** 2 / self.squares
+        return Roughness(self.squares, np.where(self.factors > 0, (_FREEDOM + 1) / (_FREEDOM + single), 0.0))
+
     def estimated(self, heights: _Doubles, smoother: Smoother) -> Roughness:
         """Variances with which the band around the smoothing length holds what it does in heights (rows, columns)."""
         mean = smoother.mean
@@ -89,9 +94,7 @@ class Roughness:
         # In parts of what is usual at a place, all places count alike.
         change = mean((weighed - noise) / usual, _SHARED) / np.maximum(mean(drawn / usual, _SHARED), 1e-30)
         # Of smooth terrain it falls with the 2.5th power of the variance: whole steps would not settle.
-        squares = self.squares * np.sqrt(np.clip(change, 1 / _MOST, _MOST))
-        single = curvatures(heights) ** 2 / squares
-        return Roughness(squares, np.where(self.factors > 0, (_FREEDOM + 1) / (_FREEDOM + single), 0.0))
+        return Roughness(self.squares * np.sqrt(np.clip(change, 1 / _MOST, _MOST)), self.factors).around(heights)
 
     def sandwich(self, heights: _Doubles, smoother: Smoother, variances: _Doubles, stiffer: float) -> _Doubles:
         """Variances of heights (rows, columns), of the pixels' noise and of what smoothing takes away.

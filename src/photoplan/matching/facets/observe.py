@@ -9,16 +9,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Camera, project
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.facets_transfer import CELL, steepness, transfer
 from photoplan.matching.facets.pyramid import Pyramid
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
 
+#: Posts around a window that are adjusted with it and belong to its neighbours: half a patch of the roughness, the
+#: border of which nothing is learnt, and some more.
+MARGIN = 24
 #: Rays are followed for pixels this far apart, or closer where rays between them would be off by more than this part of
 #: a grey facet.
 _STEP, _OFF = 32, 0.001
+#: Times by which pixels lie closer on a facet than on level ground from which on they are left out: on a wall, whose
+#: grey values are finer than the facets of the map, or beside the edge of what hides the ground behind it.
+_WALL = 3.0
 #: Points along a side of a block that are projected to find its pixels.
 _POINTS = 9
 
@@ -68,6 +74,19 @@ class Facets:
         return self.to_map(np.stack([u, v], axis=-1))
 
 
+def facets_of(grid: MapGrid, window: Window, level: int, ratio: int, margin: int = MARGIN) -> Facets:
+    """Facets of a level over a window of a map and `margin` posts around it.
+
+    Posts of a level are every 2^level-th pixel of the map, counted from its first: the same for every window.
+    """
+    step = 1 << level
+    first = np.array([window.col, window.row]) // step - margin
+    last = -(-(np.array(window.stop) - 1) // step) + margin
+    left, top = grid.to_map(first * step)
+    columns, rows = (last - first + 1).tolist()
+    return Facets(float(left), float(top), grid.resolution * step, (rows, columns), ratio)
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """An image that takes part."""
@@ -99,24 +118,35 @@ class Sight:
         places = np.empty((*self.raw.shape, 4), np.float32)
         steep = np.empty((-(-(heights.shape[0] - 1) // CELL), -(-(heights.shape[1] - 1) // CELL)))
         steepness(heights, steep)
-        transfer(self.low, self.high, self.step, self.levels, heights, steep, places)
+        transfer(self.low, self.high, self.step, self.levels, heights, steep, _WALL, places)
         return replace(self, places=places)
 
 
 def look(view: View, level: int, facets: Facets, heights: tuple[float, float]) -> Sight | None:
     """Pixels of a level of a view that may look at a block between two heights, metres; None: there are none."""
-    low, high = heights
-    high = min(high, float(view.camera.vantage.point[2]) - 1e-3)
-    low = max(low, view.camera.vantage.floor)
+    seen = pixels_between(view, level, facets, heights)
+    return None if seen is None else _followed(view.camera, seen[1], seen[0], level, facets, _known(view, heights))
+
+
+def pixels_between(
+    view: View, level: int, facets: Facets, heights: tuple[float, float]
+) -> tuple[Window, _Floats] | None:
+    """Window of a level of a view that may look at a block between two heights, metres, and its grey values, shape
+    (h, w); None: there is none."""
+    low, high = _known(view, heights)
     if not low < high:
         return None
     window = _window(view, level, facets, (low, high))
     if window.width < 2 or window.height < 2:
         return None
     raw = view.pyramid.read(level, window)
-    if not np.isfinite(raw).any():
-        return None
-    return _followed(view.camera, raw, window, level, facets, (low, high))
+    return (window, raw) if np.isfinite(raw).any() else None
+
+
+def _known(view: View, heights: tuple[float, float]) -> tuple[float, float]:
+    """The part of a range of heights that a view may see."""
+    low, high = heights
+    return max(low, view.camera.vantage.floor), min(high, float(view.camera.vantage.point[2]) - 1e-3)
 
 
 def _window(view: View, level: int, facets: Facets, heights: tuple[float, float]) -> Window:

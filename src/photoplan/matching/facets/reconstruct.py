@@ -13,15 +13,13 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.block import Block
 from photoplan.matching.facets.curvature import Roughness
 from photoplan.matching.facets.judged import fit, grey_places, grey_sigmas, residual_pictures
-from photoplan.matching.facets.observe import Facets, Sight, View, look
+from photoplan.matching.facets.observe import MARGIN, Facets, Sight, View, facets_of, look
 from photoplan.matching.facets.radiometry import Transfer, first_guess
+from photoplan.matching.facets.search import Search, search
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
 
-#: Posts around a window that are adjusted with it and belong to its neighbours: half a patch of the roughness, the
-#: border of which nothing is learnt, and some more.
-MARGIN = 24
 #: Iterations of the coarsest level and of others until roughness is estimated; for the last level and others, how many
 #: estimates follow each other, and iterations after each series.
 _FIRST, _THEN = (4, 2), (((3, 1), (2, 2)), ((3, 1),))
@@ -53,6 +51,8 @@ class Scheme:
     """Level of the image pyramids that the finest facets use: images that are much finer than these."""
     reach: float = 0.0
     """How far the start may be wrong, metres: what the coarsest level does not pull in is tried there."""
+    search: Search | None = None
+    """How heights are searched within the reach with which the coarsest level then begins; None: they are not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,19 +80,6 @@ class Found:
     """Of every view: Σ of squared residuals in its own grey values, and redundancy; shape (n, 2)."""
     moves: tuple[float, ...]
     """Mean last correction of the heights on each level, the finest first, pixels of parallax; 0: nothing was seen."""
-
-
-def facets_of(grid: MapGrid, window: Window, level: int, ratio: int, margin: int = MARGIN) -> Facets:
-    """Facets of a level over a window of a map and `margin` posts around it.
-
-    Posts of a level are every 2^level-th pixel of the map, counted from its first: the same for every window.
-    """
-    step = 1 << level
-    first = np.array([window.col, window.row]) // step - margin
-    last = -(-(np.array(window.stop) - 1) // step) + margin
-    left, top = grid.to_map(first * step)
-    columns, rows = (last - first + 1).tolist()
-    return Facets(float(left), float(top), grid.resolution * step, (rows, columns), ratio)
 
 
 def reconstruct(
@@ -124,6 +111,12 @@ def reconstruct(
         None: fewer than two images see any of it, or the start knows no height here.
     """
     block: Block | None = None
+    reach = scheme.reach
+    if scheme.search is not None:
+        found = search(views, grid, window, scheme.ratio, scheme.base, scheme.search, start, scheme.reach)
+        if found is None:
+            return None
+        start, reach = found, scheme.search.room
     moves = [0.0] * (scheme.coarsest + 1)
     for level in range(scheme.coarsest, -1, -1):
         facets = facets_of(grid, window, level, scheme.ratio)
@@ -133,9 +126,12 @@ def reconstruct(
         block = _opened(views, level + scheme.base, facets, heights, block) or block
         if block is None or block.facets is not facets:
             continue
-        block.limits = _limits(start, facets, scheme.reach)
+        block.limits = _limits(start, facets, reach)
         if level == scheme.coarsest:
-            block.heights = _lifted(block, scheme.reach)
+            if scheme.search is None:
+                block.heights = _lifted(block, reach)
+            else:
+                block.roughness = block.roughness.around(block.heights)
         block.adjust(_FIRST[level < scheme.coarsest], True)
         for estimates, iterations in _THEN[level > 0]:
             block.roughen(estimates)

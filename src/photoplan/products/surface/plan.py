@@ -19,6 +19,7 @@ from photoplan.io.point_cloud import check_cloud
 from photoplan.io.project.model import Project
 from photoplan.io.run_record import run_key
 from photoplan.matching.facets.reconstruct import Scheme
+from photoplan.matching.facets.search import Planes, Search
 from photoplan.plain import pick
 from photoplan.products.orthophoto.look import Looked, extent_text, look_at
 from photoplan.project.open_terrain import open_terrain
@@ -42,6 +43,9 @@ _SOME = 32.0
 _SHARED = 0.2
 #: Levels at most.
 _LEVELS = 8
+#: Pixels of parallax of the reach from which on heights are searched; those for which the coarsest level of a search
+#: has planes, up and down; and by how many pixels of parallax the facets may move what was found.
+_RELIEF, _PLANES, _ROOM = 24.0, 24.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,9 @@ class SurfaceSettings:
     """`terrain` (the project's), a height in metres, or a file of heights."""
     reach: float | None = None
     """How far the start may be wrong, metres; None: a tenth of the flying height."""
+    search: bool | None = None
+    """Whether heights are first searched post by post within the reach, for strong relief; None: where the reach is
+    many pixels of parallax."""
     residuals: bool = False
     """Whether to write the residuals of every image, too."""
     points: tuple[Path, ...] = ()
@@ -103,9 +110,19 @@ class SurfacePlan:
             f"of {g.resolution / s.ratio:.3g} m",
             f"  GSD {self.gsd:.3g} m, {s.ratio**2} pixels of each image per height{reduced}; one pixel of parallax is "
             f"{self.height_error:.3g} m of height",
-            f"  {s.coarsest + 1} levels, the coarsest with heights of {g.resolution * 2**s.coarsest:g} m; start: "
-            f"{self.settings.start}",
+            f"  {s.coarsest + 1} level{'s' * (s.coarsest > 0)}, the coarsest with heights of "
+            f"{g.resolution * 2**s.coarsest:g} m; start: {self.settings.start}{self._searched}",
         ])  # fmt: skip
+
+    @property
+    def _searched(self) -> str:
+        s = self.scheme
+        if s.search is None:
+            return ""
+        pixels, levels = s.reach / self.height_error, s.search.coarsest + 1
+        return (
+            f", heights searched within {s.reach:.3g} m ({pixels:.0f} px) of it on {levels} level{'s' * (levels > 1)}"
+        )
 
     def json_fields(self) -> dict[str, object]:
         """What a dry run tells."""
@@ -113,6 +130,7 @@ class SurfacePlan:
             **pick(self, "images", "blind", "gsd", "key", height_of_a_pixel="height_error"),
             **pick(self.grid, "bounds", "resolution", "width", "height"),
             "levels": self.scheme.coarsest + 1,
+            "search_levels": 0 if self.scheme.search is None else self.scheme.search.coarsest + 1,
             "grey_resolution": self.grey_grid.resolution,
         }
 
@@ -167,7 +185,12 @@ def plan_surface(
     ratio = max(1, round(settings.resolution / gsd / 2**base))
     height_error = _height_of_a_pixel(looked, gsd)
     reach = settings.reach or _usual_reach(looked, height_error)
-    scheme = Scheme(ratio, _coarsest(reach, looked, height_error, base), base, reach)
+    coarsest = _coarsest(reach, looked, height_error, base)
+    scheme = Scheme(ratio, coarsest, base, reach)
+    wanted = reach > _RELIEF * height_error if settings.search is None else settings.search
+    if wanted:
+        pixel = height_error * settings.resolution / ratio / gsd
+        scheme = Scheme(ratio, 0, base, reach, _search(looked, pixel, reach, coarsest))
     used = tuple(one.name for one in looked)
     files = [Path(path) for path, _ in ScenesAddress.of(project, used).digests]
     if settings.start not in ("terrain",) and _number(settings.start) is None:
@@ -280,6 +303,16 @@ def _usual_reach(looked: Sequence[Looked], height_error: float) -> float:
         vantage = one.scene.camera.vantage
         heights.append(float(vantage.point[2]) - (low + high) / 2 if vantage.central else 0.0)
     return _WRONG * float(np.median(heights)) or _SOME * height_error
+
+
+def _search(looked: Sequence[Looked], pixel: float, reach: float, coarsest: int) -> Search:
+    """How heights are searched; `pixel`: that of one pixel of parallax on the finest level."""
+    at = float(np.median([sum(one.look.footprint.height_range) / 2 for one in looked]))
+    vantages = [one.scene.camera.vantage for one in looked]
+    central = all(vantage.central for vantage in vantages)
+    ceiling = min(float(vantage.point[2]) for vantage in vantages) if central else math.inf
+    level = math.ceil(math.log2(max(1.0, reach / pixel / _PLANES)))
+    return Search(Planes(pixel, at, ceiling), min(level, coarsest), _ROOM * pixel)
 
 
 def _coarsest(reach: float, looked: Sequence[Looked], height_error: float, base: int) -> int:

@@ -1,0 +1,69 @@
+"""Heights searched on planes, against a block that stands on level ground; cameras are parallel rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matching.test_facets import Pixels
+
+from photoplan.cameras.base import Vantage
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.matching.facets.observe import View
+from photoplan.matching.facets.pyramid import Pyramid
+from photoplan.matching.facets.search import Planes, Search, search
+
+SIDE, TALL = 200, 30.0
+BLOCK = (slice(60, 120), slice(70, 140))
+
+
+@dataclass(frozen=True)
+class Parallel:
+    """Rays that all go by `slope` pixels of one metre along X for each metre of height."""
+
+    slope: float
+    field = None
+    vantage = Vantage(np.array([100.0, -100.0, 1e5]), reach=1e6)
+
+    def project_homogeneous(self, XYZ: np.ndarray) -> np.ndarray:
+        x = XYZ[..., 0] - 0.5 + self.slope * XYZ[..., 2]
+        return np.stack([x, -XYZ[..., 1] - 0.5, np.ones(x.shape)], axis=-1)
+
+
+def seen(slope: float, texture: np.ndarray) -> np.ndarray:
+    """What such a camera sees of the block: for every pixel the first thing on its ray, from above."""
+    tall = np.zeros((SIDE, SIDE), bool)
+    tall[BLOCK] = True
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    out, met = np.zeros((SIDE, SIDE)), np.zeros((SIDE, SIDE), bool)
+    for z in np.linspace(TALL, 0, 61):
+        at = columns - slope * z
+        near = np.clip(np.rint(at).astype(int), 0, SIDE - 1)
+        left, part = np.clip(np.floor(at).astype(int), 0, SIDE - 2), at - np.floor(at)
+        # What was met higher up hides this.
+        hit = ~met & (tall[rows, near] if z > 0 else True)
+        out = np.where(hit, texture[rows, left] * (1 - part) + texture[rows, left + 1] * part, out)
+        met |= hit
+    return out
+
+
+def test_a_block_on_level_ground() -> None:
+    """30 m, which is 15 pixels of parallax between the outer ones of three cameras, found from ground 5 m below."""
+    rng = np.random.default_rng(3)
+    texture = rng.normal(100, 20, (SIDE, SIDE))
+    views = []
+    for slope in (-0.25, 0.0, 0.25):
+        image = seen(slope, texture) + rng.normal(0, 2, (SIDE, SIDE))
+        views.append(View(Parallel(slope), Pyramid(Pixels(image), span=3)))
+    grid = MapGrid(0.0, 0.0, 2.0, 100, 100, "EPSG:32633")
+    window = Window(20, 20, 60, 60)
+    how = Search(Planes(2.0, 0.0), 1, 6.0)
+    found = search(views, grid, window, 2, 0, how, lambda XY: np.full(XY.shape[:-1], -5.0), 60.0)
+    assert found is not None
+    uv = found.facets.to_posts(grid.to_map(np.array([20.0, 20.0]))).astype(int)
+    heights, margin = (a[uv[1] : uv[1] + 60, uv[0] : uv[0] + 60] for a in (found.heights, found.margin))
+    true = np.zeros((100, 100))
+    true[30:60, 35:70] = TALL
+    off, sure = np.abs(heights - true[20:80, 20:80]), margin > 0.5
+    print((off < 1).mean(), sure.mean(), (off[sure] < 1).mean())
+    assert (off < 1).mean() > 0.9 and sure.mean() > 0.7 and (off[sure] < 1).mean() > 0.97
