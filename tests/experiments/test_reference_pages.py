@@ -12,6 +12,7 @@ import pytest
 from photoplan.cli.dtm import VERBS as DTM_VERBS
 from photoplan.cli.main import VERBS
 from photoplan.cli.view import VERBS as VIEW_VERBS
+from photoplan.cli.view import spelled_out
 from photoplan.io.project.file import project_schema
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,8 +58,8 @@ def examples():
                 if not call or re.search(r"…|\[options\]|\[-", call[1]):
                     continue
                 words = shlex.split(re.split(r"\s+#", call[1])[0])
-                if words[0] == "view" and words[1] not in VIEW_VERBS:
-                    words.insert(1, "picture")
+                if words[0] == "view":
+                    words = ["view", *spelled_out(words[1:])]
                 verb = " ".join(words[:2]) if words[0] in GROUPS else words[0]
                 yield pytest.param(verb, words[len(verb.split()) :], id=f"{page.stem}: {call[1][:40]}")
 

@@ -17,14 +17,19 @@ VERBS = {
 }
 
 
+def spelled_out(words: list[str]) -> list[str]:
+    """Words after `view` with their verb: a FILE is a picture of it, a panorama a picture all around."""
+    if words[:1] == ["panorama"]:
+        return ["picture", "--panorama", "cylinder", *words[1:]]
+    return words if words[0] in VERBS else ["picture", *words]
+
+
 class _Views(LazyGroup):
-    """`photoplan view FILE …` is `photoplan view picture FILE …`, and `panorama` one with `--panorama cylinder`."""
+    """`photoplan view FILE …` is `photoplan view picture FILE …`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        if args[:1] == ["panorama"]:
-            args = ["picture", "--panorama", "cylinder", *args[1:]]
-        given = not args or args[0] in (*self.verbs, *ctx.help_option_names)
-        return super().parse_args(ctx, args if given else ["picture", *args])
+        help_only = not args or args[0] in ctx.help_option_names
+        return super().parse_args(ctx, args if help_only else spelled_out(args))
 
 
 command = _Views(
