@@ -167,6 +167,25 @@ def test_a_pair_is_two_views_a_base_apart(small: Block, tmp_path: Path) -> None:
     assert record["view"]["stereo"] == "side-by-side" and record["view"]["base_m"] == 4
 
 
+def test_the_camera_of_an_image_makes_a_pair_with_its_lens(tmp_path: Path) -> None:
+    small = write_block(tmp_path / "block")
+    ground = open_view_ground(small.project)
+    camera = view_camera(CameraRequest(image=ground.named.images[0].name), ground)
+    left, right = (view_camera(eye, ground).target for eye in eyes(camera, 10.0))
+    apart = right.center - left.center
+    assert np.linalg.norm(apart) == pytest.approx(10.0)
+    np.testing.assert_allclose((left.center + right.center) / 2, camera.target.center, atol=1e-6)
+    # What the left eye sees at a pixel, the image sees from half a base further on.
+    pixel = np.array([[30.0, 20.0, 80.0]])
+    np.testing.assert_allclose(camera.target.to_ground(pixel) - left.to_ground(pixel), [apart / 2], atol=1e-5)
+    out = tmp_path / "pair.png"
+    words = ("--camera", camera.request.image, "--content", "shade", "--samples", 1, "--stereo", "anaglyph", "-q")
+    said = inside("view", small.project, *words, "-o", out)
+    assert said.code == 0, said.err
+    red, green, _ = pixels(out).astype(int)
+    assert (red != green).mean() > 0.3
+
+
 def test_parallax_is_camera_constant_times_base_by_depth(small: Block) -> None:
     ground = open_view_ground(small.terrain)
     request = CameraRequest(position=(X0, Y0), altitude=300.0, azimuth=70.0, pitch=-30.0, roll=20.0, curvature="none")
@@ -177,6 +196,6 @@ def test_parallax_is_camera_constant_times_base_by_depth(small: Block) -> None:
     focal = 600 / np.tan(np.radians(30))
     assert x - u == pytest.approx(focal * 6.0 / depth, rel=1e-9)
     assert (y, depth) == (pytest.approx(v), pytest.approx(other))
-    with pytest.raises(UsageError, match="standpoint and a plane picture"):
+    with pytest.raises(UsageError, match="needs a plane picture"):
         eyes(view_camera(CameraRequest(position=(X0, Y0), azimuth=0.0, panorama="cylinder"), ground), 1.0)
     assert Stereo("anaglyph").stated(100.0).base == 3.3

@@ -104,6 +104,11 @@ class FrameCamera:
         pose = Pose(self.pose.center, self.pose.R_ground_camera @ R)
         return dataclasses.replace(self, interior=interior, pose=pose)
 
+    def moved(self, aside: float) -> FrameCamera:
+        """It from so many metres to the right along the rows of its picture."""
+        R = self.pose.R_ground_camera
+        return dataclasses.replace(self, pose=Pose(self.pose.center + aside * R[:, 0], R))
+
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the image in pixels."""

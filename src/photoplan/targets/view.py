@@ -6,7 +6,7 @@ one box of anchors, exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -62,6 +62,10 @@ class Posed(CentralCamera, Protocol):
 
     def turned(self, R: NDArray[np.float64], longer: float) -> Posed:
         """It with its axes turned by R, shape (3, 3), about themselves, and a camera constant that is longer."""
+        ...
+
+    def moved(self, aside: float) -> Posed:
+        """It from so many metres to the right along the rows of its picture."""
         ...
 
 
@@ -125,6 +129,12 @@ class ViewTarget:
             raise UsageError(f"a view from {type(camera).__name__}; its rays do not meet in a point")
         straight, warps, curvature = parts
         return cls(FrameBundle(straight), camera.center, warps, curvature / 2)
+
+    def moved(self, aside: float) -> ViewTarget:
+        """A plane picture from so many metres to the right along its rows; its axes and warps stay."""
+        assert isinstance(self.bundle, FrameBundle)
+        camera = self.bundle.camera.moved(aside)
+        return replace(self, bundle=FrameBundle(camera), center=self._on_map(camera.center))
 
     @property
     def window(self) -> Window:

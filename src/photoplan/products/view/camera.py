@@ -40,6 +40,8 @@ class CameraRequest:
 
     image: str | None = None
     """An image of the project: its orientation, camera and lens as they are; with a standpoint None."""
+    aside: float | None = None
+    """How far the camera of an image is moved to the right along its rows, metres: an eye of a stereo pair."""
     position: tuple[float, float] | None = None
     """X, Y of the standpoint."""
     height: float = 1.7
@@ -76,6 +78,8 @@ class CameraRequest:
     def __post_init__(self) -> None:
         if (self.image is None) == (self.position is None):
             raise UsageError("a view needs one `camera`: an image of the project, or a standpoint `position` X Y")
+        if self.aside is not None and self.image is None:
+            raise UsageError("`aside` belongs to the camera of an image; a standpoint is moved by its `position`")
         numbers = {f.name: getattr(self, f.name) for f in fields(self)}
         for name, value in numbers.items():
             flat = value if isinstance(value, tuple) else (value,)
@@ -203,7 +207,7 @@ def _of_image(request: CameraRequest, ground: ViewGround) -> ViewCamera:
             raise UsageError("the project states its own earth curvature or refraction; leave `curvature` to it")
         warps, bend, radius = _round(replace(request, curvature="bend"), ground, camera.center)
         plain = ViewTarget(plain.bundle, camera.center, warps, bend)
-    return _stretched(request, ground, plain, radius)
+    return _stretched(request, ground, plain.moved(request.aside) if request.aside else plain, radius)
 
 
 def _round(

@@ -60,11 +60,13 @@ def eyes(camera: ViewCamera, base: float) -> tuple[CameraRequest, CameraRequest]
     Raises
     ------
     UsageError
-        It is the camera of an image, or a panorama: they have no other place.
+        It is a panorama: it has no rows to move along.
     """
     request, target = camera.request, camera.target
-    if request.image is not None or not isinstance(target.bundle, FrameBundle):
-        raise UsageError("a stereo pair needs a standpoint and a plane picture; images and panoramas have one place")
+    if not isinstance(target.bundle, FrameBundle):
+        raise UsageError("a stereo pair needs a plane picture; panoramas have one place only")
+    if request.image is not None:
+        return replace(request, aside=-base / 2), replace(request, aside=base / 2)
     assert request.position is not None and request.altitude is not None
     right = map_axes(target.warps, target.center).T @ target.bundle.camera.pose.R_ground_camera[:, 0]
     at = np.array([*request.position, request.altitude])
