@@ -46,7 +46,7 @@ class TestFaults22And24Pixels:
             ("uint16", 4095, {"nbits": 12}),
             pytest.param("uint16", 65535, {}, marks=pytest.mark.slow),
             ("int16", 32767, {}),
-            ("float32", 1.0, {}),
+            pytest.param("float32", 1.0, {}, marks=pytest.mark.slow),
         ],
         ids=["12-bit", "16-bit", "int16", "float"],
     )

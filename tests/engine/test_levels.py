@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tools.arrays import noise, product
 from tools.pinhole import Pinhole
+from tools.thinned import some
 from tools.twin import strict_positions, strict_scales, twin_reduce, twin_resample
 
 from photoplan.engine.arrays import ArrayReader
@@ -65,7 +66,7 @@ def coarse(scale: float) -> tuple[Pinhole, MapGrid, LevelSurface]:
 
 
 @pytest.mark.parametrize("scale", [4.5, 10.0, 30.0])
-@pytest.mark.parametrize("kernel", ["bilinear", "bicubic", pytest.param("lanczos3", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kernel", some(["bilinear", "bicubic", "lanczos3"], 1))
 def test_reduced_sources_make_the_same_product_as_whole_ones(scale: float, kernel: str) -> None:
     """Smooth light with detail down to the product's own resolution: means before the kernel hardly show."""
     cam, grid, surface = coarse(scale)

@@ -14,7 +14,7 @@ mpl = pytest.importorskip("matplotlib")
         ("homogeneous-anchors", {"steps": 3}),
         ("resampling-kernels", {"steps": 21}),
         ("anchor-residual", {"samples": 3, "steps": 3}),
-        ("road-edge", {}),
+        pytest.param("road-edge", {}, marks=pytest.mark.slow),
         ("marks", {}),
         ("true-orthophoto", {"resolution": 2.0}),
         ("pyramid-strip", {"lines": 500, "columns": 400}),

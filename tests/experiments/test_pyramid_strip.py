@@ -33,6 +33,7 @@ def test_ground_and_image_are_inverse():
     assert np.degrees(np.abs(np.diff(angles)).max(axis=1)).min() / strips.LINE > 0.8
 
 
+@pytest.mark.slow
 def test_figures_on_the_page():
     rows = re.findall(
         r"^\| ([\d.]+) \| ([\d.]+) % \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", PAGE.read_text("utf-8"), re.M

@@ -22,6 +22,7 @@ def test_edge_lies_within_a_fifth_of_a_pixel_with_the_hybrid_model(width, seed):
     assert outcome.rms("grid") > 8 * outcome.rms("hybrid")
 
 
+@pytest.mark.slow
 def test_grid_alone_gets_worse_with_its_width_and_the_hybrid_model_does_not():
     outcomes = [road.run(width) for width in (2.5, 5.0, 10.0)]
     grid = [o.rms("grid") for o in outcomes]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+from tools.thinned import some
 
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.geometry.grid import MapGrid
@@ -51,9 +52,11 @@ def make(
         return file.complete({"SOURCE": "test"})
 
 
-@pytest.mark.parametrize("compress", ["none", "deflate", "zstd", "lzw"])
+@pytest.mark.parametrize("compress", some(["none", "deflate", "zstd", "lzw"], 1, 2))
 @pytest.mark.parametrize("nodata", ["auto", "mask"])
-@pytest.mark.parametrize(("bands", "dtype"), [(3, "uint8"), (1, "uint16"), (2, "int16"), (4, "float32"), (5, "uint8")])
+@pytest.mark.parametrize(
+    ("bands", "dtype"), some([(3, "uint8"), (1, "uint16"), (2, "int16"), (4, "float32"), (5, "uint8")], 0, 2, 3)
+)
 def test_pixels_and_validity_come_back(tmp_path: Path, compress: str, nodata: Any, bands: int, dtype: str) -> None:
     pixels, valid = scene(bands, dtype)
     facts = make(tmp_path / "a.tif", pixels, valid, compress=compress, nodata=nodata)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from defusedxml import ElementTree
 from tools.small_model import EMPTY, LAYOUT, grid_unit, hills, lines, unit_at, wall_line
+from tools.thinned import some
 
 from photoplan.errors import UsageError
 from photoplan.geometry.crs import canonical_crs, same_crs
@@ -131,7 +132,7 @@ def test_obj_ply_and_landxml_say_the_same(model: MemoryUnits, tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("crs", "heights"),
-    [("EPSG:25832", "EPSG:7837"), ("EPSG:3875", "ellipsoidal"), (LOCAL, None), ("EPSG:25832", None)],
+    some([("EPSG:25832", "EPSG:7837"), ("EPSG:3875", "ellipsoidal"), (LOCAL, None), ("EPSG:25832", None)], 0, 2),
 )
 def test_landxml_states_its_systems_and_is_read_with_them(
     model: MemoryUnits, tmp_path: Path, crs: str, heights: str | None

@@ -29,14 +29,19 @@ def many(gather):
     return run
 
 
+#: Two kernels of numba are compiled for each.
+QUICK = {("bilinear", "uint8"), ("lanczos3", "uint8"), ("bicubic", "float32"), ("nearest", "float32")}
 GATHER = {"loops": many(sampling.gather_loops), "vectors": many(sampling.gather)}
 
 
 @pytest.mark.parametrize(
-    "dtype",
-    ["uint8", pytest.param("int16", marks=pytest.mark.slow), pytest.param("uint16", marks=pytest.mark.slow), "float32"],
+    ("name", "bands", "dtype"),
+    [
+        pytest.param(*kind, dtype, marks=[] if (kind[0], dtype) in QUICK else pytest.mark.slow)
+        for dtype in ("uint8", "int16", "uint16", "float32")
+        for kind in (("nearest", 1), ("bilinear", 4), ("bicubic", 1), ("lanczos3", 4))
+    ],
 )
-@pytest.mark.parametrize(("name", "bands"), [("nearest", 1), ("bilinear", 4), ("bicubic", 1), ("lanczos3", 4)])
 def test_vectors_and_loops_gather_what_the_weights_say(name, bands, dtype):
     source = noise((bands, 20, 30), dtype)
     kernel, rng, count = KERNELS[name], np.random.default_rng(0), 200 if COMPILED else 20

@@ -17,9 +17,10 @@ from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.cameras.plane import Affine2D
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
-from photoplan.orientation.bundle.adjust import _left, _selected, _started, adjust_block
+from photoplan.orientation.bundle.adjust import _selected, _started, adjust_block
 from photoplan.orientation.bundle.block import Active, AdjustSettings, Block, BlockCamera, BlockImage
 from photoplan.orientation.bundle.far import loose_points
+from photoplan.orientation.bundle.loop import _left
 from photoplan.orientation.bundle.model import build_model
 from photoplan.orientation.bundle.robust import weights_of
 from photoplan.orientation.bundle.rows import linearise

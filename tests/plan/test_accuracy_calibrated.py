@@ -9,7 +9,7 @@ import pytest
 from tools.function_surface import FunctionSurface
 from tools.sim_block import FOCAL, SIZE, simulate
 from tools.source_errors import moved, pose_errors
-from tools.thinned import thinned
+from tools.thinned import some, thinned
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
@@ -98,7 +98,7 @@ def errors_of_a_block(seed: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array([np.concatenate(drawn), np.concatenate(real)]), np.concatenate(stated)
 
 
-@pytest.mark.parametrize("kind", CAMERAS)
+@pytest.mark.parametrize("kind", some(CAMERAS, 1, 3))
 @thinned("blocks", 4, 200)
 def test_normalised_errors_of_pixels(kind: str, blocks: int) -> None:
     found = [errors_of_a_block(seed, kind)[0] for seed in range(blocks)]

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.arrays import noise, product
+from tools.thinned import some
 from tools.twin import TwinSource, twin_compose
 
 from photoplan.cameras.base import project
@@ -69,7 +70,7 @@ def engine_positions(anchors: Anchors, relief: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", LENSES)
-@pytest.mark.parametrize("tolerance", [0.02, 0.002])
+@pytest.mark.parametrize("tolerance", some([0.02, 0.002], 1))
 def test_one_box_a_tile_and_the_engines_positions_keep_the_reported_residual(name: str, tolerance: float) -> None:
     camera = oblique(LENSES[name])
     seen = 0
@@ -153,14 +154,14 @@ def test_a_crop_of_a_tile_has_the_same_positions_bit_by_bit() -> None:
     np.testing.assert_array_equal(part, whole[40:200, 270:300])
 
 
-@settings(max_examples=15, deadline=None)
+@pytest.mark.parametrize("kernel", some(["bilinear", "bicubic", "lanczos3"], 1))
+@settings(max_examples=10, deadline=None)
 @given(
     name=st.sampled_from(sorted(LENSES)),
     kappa=st.floats(-3.1, 3.1),
     resolution=st.sampled_from([0.6, 1.0, 1.3, 2.4, 9.0]),
-    kernel=st.sampled_from(["bilinear", "bicubic", "lanczos3"]),
 )
-def test_every_pixel_as_the_twin_says(name: str, kappa: float, resolution: float, kernel: str) -> None:
+def test_every_pixel_as_the_twin_says(kernel: str, name: str, kappa: float, resolution: float) -> None:
     """Positions, source window, reduction and widening of the kernel count the field."""
     pose = Pose.from_angles((0.123, 0.377, 100), (0.3, -0.1, kappa))
     camera = FrameCamera(Interior.digital((180, 140), (162.0, 162.0)), LENSES[name], pose)

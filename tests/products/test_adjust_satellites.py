@@ -138,6 +138,7 @@ def flown(folder: Path, entries: str = "", count: int = 120) -> tuple[Path, dict
     return folder / "project.toml", cameras
 
 
+@pytest.mark.slow
 def test_boresight_and_clock_of_a_strip_are_found_and_used(tmp_path: Path) -> None:
     path, cameras = flown(tmp_path, count=60)
     assert difference(path, cameras) > 3.0

@@ -9,6 +9,8 @@ import pytest
 import rasterio
 import rasterio.enums
 from numpy.typing import NDArray
+from tools.kinds import FEW
+from tools.kinds import NAMES as KERNELS
 from tools.small_block import FOCAL, NAMES, SIZE, X0, Y0, YAML, Z0, Block, make_project, write_image, write_terrain
 
 from photoplan.cameras.base import project
@@ -112,9 +114,6 @@ class TestPosition:
 
 
 VALUES = {"uint8": 77, "uint16": 40_001, "int16": -1234, "float32": 0.1}
-KERNELS = ("nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3")
-#: Kinds that other tests compile, too; the others are for `make test-slow`.
-FEW = {*((kernel, "uint8") for kernel in KERNELS), ("bicubic", "uint16"), ("bilinear", "int16"), ("bicubic", "float32")}
 
 
 @pytest.mark.parametrize(

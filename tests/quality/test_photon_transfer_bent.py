@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tools.camera_model import Sensor
+from tools.thinned import some
 
 from photoplan.quality.camera.frame_statistics import Level, StackSums
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
@@ -35,7 +36,7 @@ def test_gain_of_a_response_that_loses_three_percent() -> None:
     assert found.bent and "is not linear" in " ".join(found.notes)
 
 
-@pytest.mark.parametrize("compression", [0.0, 0.03, pytest.param(0.06, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("compression", some([0.0, 0.03, 0.06], 1))
 def test_normalised_errors_of_the_gain_spread_by_one(compression: float) -> None:
     sensor = Sensor(compression=compression, shape=(60, 80))
     found = [transfer_of(sensor, 100 + seed) for seed in range(60)]

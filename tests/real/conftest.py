@@ -46,6 +46,18 @@ def brighton(block: Path) -> list[Path]:
 
 
 @pytest.fixture(scope="session")
+def thirds(block: Path) -> list[Path]:
+    """Every third image of it."""
+
+    def make(folder: Path) -> list[Path]:
+        project = drone_project(block, folder)
+        names = [image.name for image in load_project(project).images]
+        return make_orthos(folder, names[1::3], 0.1)
+
+    return kept_orthos("brighton-thirds", make, block)
+
+
+@pytest.fixture(scope="session")
 def ngi(shared: Path) -> list[Path]:
     """The four DMC frames at 5 m."""
 

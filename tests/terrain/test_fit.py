@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tools.build_terrain import built, directly, line, scattered, terrain
 from tools.build_terrain import unit_of as unit_at
 from tools.random_field import random_field
+from tools.thinned import thinned
 
 from photoplan.surfaces.measured import MeasuredLine
 from photoplan.terrain.build import Built, plan_build
@@ -62,10 +63,11 @@ def test_parameters_of_random_fields_are_recovered(
     assert (np.abs(relative - 1) < 0.2).all(), relative
 
 
-def test_on_level_ground_the_whole_spread_of_the_heights_is_noise() -> None:
+@thinned("runs", 1, 3)
+def test_on_level_ground_the_whole_spread_of_the_heights_is_noise(runs: int) -> None:
     """A lake, an airfield: no signal at all. The noise is not bounded by the median of the deviations."""
     rng = np.random.default_rng(0)
-    for _ in range(3):
+    for _ in range(runs):
         place = rng.uniform(0, 250, (1000, 2)) + 1000
         found = estimated(np.column_stack([place, 100 + rng.normal(0, 0.05, 1000)]), "auto")
         assert found.noise == pytest.approx(0.05, rel=0.15)
