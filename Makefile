@@ -9,7 +9,7 @@ OLDEST := .venv-oldest
 # Every process would compile all sources of photoplan and of the tests anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-nojit test-plain test-oldest lint docs bench clean
+.PHONY: demo test test-times test-slow test-nojit test-plain test-oldest lint docs bench clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -29,6 +29,10 @@ PROCESSES = $(shell $(PYTHON) -c "import os; print(min(5, 1 + (os.cpu_count() or
 test: $(STAMP)
 	$(MAKE) $(SIDE_BY_SIDE) lint docs test-nojit
 	$(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile -m "not slow and not bench"
+
+# Which tests take the processor's time: folders, files, the dearest tests. Of some only: `make test-times TESTS=tests/cli`.
+test-times: $(STAMP)
+	PYTHONPATH=tests $(BIN)/python -m pytest -q -n 0 -p tools.cputimes -m "not slow and not bench" $(TESTS)
 
 # What is too long for every change: large inputs, simulations at their full size, new invented cases, kernels without
 # numba's inside, and the oldest libraries that pyproject.toml allows.

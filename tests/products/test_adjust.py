@@ -11,7 +11,7 @@ import numpy as np
 import pyogrio
 import pytest
 from tools.adjust_project import CAMERA, FILM, Made, Make, misses, write_project
-from tools.thinned import some
+from tools.thinned import some, thinned
 
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation, rotation_from_angles
@@ -209,10 +209,11 @@ def test_images_that_drop_out_do_not_shift_the_others(tmp_path: Path) -> None:
     np.testing.assert_allclose(rotations[1:], made.rotations[1:], atol=2e-7)
 
 
-def test_standard_deviations_are_those_of_the_map(tmp_path: Path) -> None:
-    """Twenty noisy blocks: errors of orientations divided by their standard deviations spread by about one."""
+@thinned("blocks", 8, 20)
+def test_standard_deviations_are_those_of_the_map(tmp_path: Path, blocks: int) -> None:
+    """Noisy blocks: errors of orientations divided by their standard deviations spread by about one."""
     z: list[np.ndarray] = []
-    for seed in range(20):
+    for seed in range(blocks):
         made = write_project(tmp_path / str(seed), Make(pixel_noise=0.3, seed=seed, unit="gon", start=(0.5, 0.05)))
         project = load_project(made.path)
         inputs, starts = started(read_inputs(project, project.select()))
@@ -222,7 +223,7 @@ def test_standard_deviations_are_those_of_the_map(tmp_path: Path) -> None:
             off = (result.angles[k] - true + 200) % 400 - 200
             z += [(pose.center - made.centers[k]) / result.sigma_center[k], off / result.sigma_angles[k]]
     spread = float(np.sqrt((np.concatenate(z) ** 2).mean()))
-    print(f"\nspread of normalised errors of 160 orientations: {spread:.3f}")
+    print(f"\nspread of normalised errors of {8 * blocks} orientations: {spread:.3f}")
     assert 0.85 < spread < 1.15
 
 

@@ -177,6 +177,7 @@ def test_fault_18_broken_corrections_are_refused_by_name(tmp_path: Path) -> None
     assert said.code == 3 and "c.toml" in said.err and "time_offset_s" in said.err
 
 
+@pytest.mark.slow
 def test_fault_23_points_on_lines_without_orientation_are_named(tmp_path: Path) -> None:
     path, _ = flown(tmp_path, count=40)
     table = (tmp_path / "flight.csv").read_text().splitlines()

@@ -196,7 +196,14 @@ class Product:
         return content(self.path(out)) == content(self.path(undisturbed))
 
 
-@pytest.fixture(scope="module", params=CASES)
+#: Of these the loop is that of a product beside them: maps of terrain are all made as `shade` is, `true` as `ortho`.
+LIKE_OTHERS = ("true", "slope", "aspect", "tint", "export")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=pytest.mark.slow if name in LIKE_OTHERS else []) for name in CASES],
+)
 def product(request: pytest.FixtureRequest, inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> Product:
     return Product(request.param, inputs, tmp_path_factory.mktemp(request.param))
 

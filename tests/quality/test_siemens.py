@@ -139,7 +139,7 @@ def test_clipped_stars_and_unknown_contrast_are_refused():
             StarRules(**wrong)
 
 
-@pytest.mark.parametrize("sine", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sine", some([False, True]))
 def test_standard_deviations_hold_the_error_of_the_object_s_contrast(sine):
     """The widest rings know their wave far better than the level of the widest sectors that it is compared with."""
     shape, centre = (200, 200), (100.3, 98.8)

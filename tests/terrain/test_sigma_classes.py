@@ -37,7 +37,7 @@ def test_every_class_of_places(name: str) -> None:
     [
         pytest.param("slope 2.5, much noise", 0.85, 1.15, marks=pytest.mark.slow),
         ("cliff", 0.8, 1.15),
-        ("contours", 0.75, 1.35),
+        pytest.param("contours", 0.75, 1.35, marks=pytest.mark.slow),
     ],
 )
 def test_one_field(name: str, low: float, high: float) -> None:
