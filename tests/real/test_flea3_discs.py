@@ -14,7 +14,6 @@ import re
 import numpy as np
 import pytest
 import rasterio
-from tools.thinned import some
 
 from photoplan.quality.colour.discs import disc_displacements, find_discs
 from photoplan.quality.colour.model import ChromaticModel, fit_band
@@ -24,15 +23,13 @@ PLANES = {"G": (0, 3), "B": (1,), "R": (2,)}
 STRONGEST = {400: "G", 450: "B", 500: "G", 550: "G", 600: "R", 650: "R", 700: "R"}
 
 
-@pytest.fixture(scope="module", params=some([[450, 650], [*STRONGEST]], 0), ids=["two", "all"])
-def series(request, shared):
+@pytest.fixture(scope="module")
+def series(shared):
     """Discs by wavelength and exposure time."""
     numbers = np.add.outer(2 * (np.arange(SIZE[1]) % 2), np.arange(SIZE[0]) % 2)
     found = {}
     for path in sorted((shared / "data" / "flea3_exposure_series" / "disks").glob("*.tif")):
         wavelength, time = map(int, re.search(r"_(\d+)nm_(\d+)ms", path.name).groups())
-        if wavelength not in request.param:
-            continue
         with rasterio.open(path) as file:
             grey = file.read(1)
         planes = np.where(np.isin(numbers, PLANES[STRONGEST[wavelength]]), numbers, -1)
