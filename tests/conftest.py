@@ -28,20 +28,24 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 #: Files that take longest, the longest first: one that began last would keep one process busy when all others are done.
 DEAR = (
     "products/test_every_run.py",
+    "terrain/test_fit.py",
     "kernels/test_rectify.py",
     "cli/test_run_faults.py",
-    "terrain/test_fit.py",
     "products/test_restore_design.py",
+    "cli/test_adjust_command.py",
     "orientation/test_mark_search.py",
+    "terrain/test_build.py",
+    "experiments/test_design_pages.py",
+    "cli/test_mtf_command.py",
+    "products/test_plausibility.py",
+    "products/test_adjust.py",
+    "orientation/test_resection.py",
     "cli/test_tie.py",
     "kernels/test_area.py",
-    "real/test_brighton_ties.py",
-    "real/test_usgs_marks.py",
     "quality/test_edge_response.py",
-    "orientation/test_mark_catalogue.py",
-    "terrain/test_build.py",
-    "terrain/test_known_noise.py",
-    "terrain/test_predict.py",
+    "quality/test_chromatic.py",
+    "real/test_brighton.py",
+    "cli/test_memory_faults.py",
 )
 
 

@@ -64,6 +64,7 @@ def test_the_same_command_goes_on_and_another_filter_is_not_overwritten(photopla
     assert "exists" in again.err
 
 
+@pytest.mark.slow
 def test_dry_run_writes_nothing_and_says_what_is_taken_as_light_by_default(photoplan, image, tmp_path):
     said = photoplan("restore", image, "--output", tmp_path / "a", "--dry-run", "--json")
     assert said.code == 0 and "linearisation: linear (by default" in said.err

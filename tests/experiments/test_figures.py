@@ -16,7 +16,7 @@ mpl = pytest.importorskip("matplotlib")
         ("anchor-residual", {"samples": 3, "steps": 3}),
         pytest.param("road-edge", {}, marks=pytest.mark.slow),
         ("marks", {}),
-        ("true-orthophoto", {"resolution": 2.0}),
+        pytest.param("true-orthophoto", {"resolution": 2.0}, marks=pytest.mark.slow),
         ("pyramid-strip", {"lines": 500, "columns": 400}),
     ],
 )

@@ -58,6 +58,7 @@ def test_photo_is_strict():
         assert (between[:, 2] > road.terrain(between[:, 0], between[:, 1])).all()
 
 
+@pytest.mark.slow
 def test_half_level_of_the_photo_lies_on_the_projected_edge():
     view = road.camera()
     image = road.photo(view)[0]

@@ -39,6 +39,7 @@ def series(shared):
     return found
 
 
+@pytest.mark.slow
 def test_centres_repeat_within_a_twentieth_of_a_pixel(series):
     print()
     checked = []
@@ -63,6 +64,7 @@ def test_centres_repeat_within_a_twentieth_of_a_pixel(series):
     assert checked == [400, 450, 500, 600, 650, 700]
 
 
+@pytest.mark.slow
 def test_lateral_aberration_grows_with_the_wavelength(series):
     """Against 550 nm: from green to red scale and shift grow, from one axis outside the crop; blue turns back."""
     reference = series[550][25]

@@ -130,6 +130,7 @@ class TestRidge:
         top = np.column_stack([np.full(200, 30.0), np.linspace(5, 55, 200)])
         assert np.mean(surface_of(smeared).heights(top) - roof(top)) < -0.02
 
+    @pytest.mark.slow
     def test_what_happens_on_one_side_does_not_reach_the_other(self) -> None:
         """A bump of a metre on the left; with the line it moves the right side by a few per cent at most."""
 
@@ -208,6 +209,7 @@ class TestWall:
         error = surface_of(model).heights(INNER) - expected
         assert np.sqrt(np.mean(error**2)) < NOISE and np.abs(error).max() < 6 * NOISE
 
+    @pytest.mark.slow
     def test_a_wall_drawn_the_other_way_round_is_the_same(self, model: Built) -> None:
         height = lambda XY: 100.0 + self.HIGH * (XY[:, 0] < 30)  # noqa: E731
         wall = along(30.0, lambda XY: np.full(len(XY), 100.0), y=EVERY[::-1], right=np.full(61, 100.0 + self.HIGH))

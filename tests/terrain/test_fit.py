@@ -96,6 +96,7 @@ class TestSigma:
         assert 0.9 < normalised.std() < 1.1
         assert abs(normalised.mean()) < 0.15
 
+    @pytest.mark.slow
     def test_sigma_is_that_of_the_difference_from_the_truth(self) -> None:
         xyz = sample("matern", 4.0, 8, self.NOISE, 6000)
         truth = sample("matern", 4.0, 8, 0.0, 6000)
@@ -190,6 +191,7 @@ class TestGrossErrors:
         heights, _ = directly(found, np.ascontiguousarray(roof[bad, :2]))
         assert np.abs(heights - roof[bad, 2]).max() < 5 * self.NOISE
 
+    @pytest.mark.slow
     def test_good_points_are_left_alone(self, roof: NDArray[np.float64]) -> None:
         assert len(built(terrain(roof, self.ridge())).fit.gross) <= 0.005 * len(roof)
 

@@ -128,6 +128,7 @@ def test_the_exact_reference_knows_a_roof_over_a_sloping_plane():
     assert tin_heights(slope, np.array([[0.25, 0.6], [2, 2]])) == pytest.approx([0.25, np.nan], nan_ok=True)
 
 
+@pytest.mark.slow
 def test_rock_under_a_road_agrees_with_the_exact_volume_of_the_triangulations(shared):
     """Real survey: rock surface against terrain, both as grids of 0.4 m over their TINs; within 0.5 %."""
     folder = shared / "data" / "m3_road_survey"
