@@ -187,6 +187,7 @@ def test_an_image_of_a_project_is_turned_in_its_own_angles(mountains: tuple[Path
     np.testing.assert_allclose(table.images[0].angles, found.after, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_camera_constant_of_an_image_is_a_factor_of_its_cameras(
     mountains: tuple[Path, Path], tmp_path: Path
 ) -> None:
