@@ -152,6 +152,7 @@ def test_pictures_are_drawn_and_not_replaced(scans, tmp_path: Path, photoplan: H
     assert photoplan(*words, "--overwrite").code == 0
 
 
+@pytest.mark.drawn
 @pytest.mark.slow
 def test_pictures_show_where_marks_were_sought_and_not_found(scans, tmp_path: Path, photoplan: Here) -> None:  # type: ignore[no-untyped-def]
     pytest.importorskip("matplotlib")

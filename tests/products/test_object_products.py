@@ -185,6 +185,7 @@ def test_a_plan_gives_the_same_bytes_and_another_object_is_another_product(town:
     assert {path.name: path.read_bytes() for path in (town.folder / "again").glob("*.tif")} == made
 
 
+@pytest.mark.drawn
 def test_the_quadtree_is_a_layer_of_the_plan_with_its_counts(town: Block, capsys) -> None:  # type: ignore[no-untyped-def]
     """Behr, section 6.2.2: squares that are inside stay, others are divided until they are no larger than a pixel."""
     photoplan = Here(capsys)

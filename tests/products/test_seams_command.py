@@ -39,6 +39,7 @@ def block(small: Block) -> Block:
     return small
 
 
+@pytest.mark.drawn
 def test_regions_are_what_the_mosaic_paints(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
     photoplan = Here(capsys)
     said = photoplan("seams", block.project, "--resolution", 3, "--json", "-q")
