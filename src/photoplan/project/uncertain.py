@@ -17,9 +17,11 @@ from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.project.file import parse_project
+from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.plan.accuracy import DepthErrors, IndependentError, SourceErrors
+from photoplan.project.cameras import camera_of
 from photoplan.project.ground import Ground
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.posed import posed_camera
@@ -35,7 +37,7 @@ _ANGLES = {"o": "omega", "p": "phi", "k": "kappa"}
 
 
 def source_errors(
-    project: Project, image: Image, ground: Ground, projection: Projection, in_image: float
+    project: Project, image: ImageEntry, ground: Ground, projection: Projection, in_image: float
 ) -> SourceErrors:
     """Errors of an image as the project states them.
 
@@ -53,6 +55,15 @@ def source_errors(
     InputError
         The project states no standard deviations of the image's orientation, or such of the camera that do not fit.
     """
+    if not isinstance(image, Image):
+
+        def by_entry(change: NDArray[np.float64]) -> Projection:
+            return camera_of(project, image.moved(change), ground, projection.size)
+
+        found = (
+            IndependentError(name, by_entry(_STEP * d), by_entry(-_STEP * d), _STEP) for name, d in image.deviations
+        )
+        return SourceErrors(projection, tuple(found), in_image)
     camera = project.cameras[image.camera]
 
     def at(change: NDArray[np.float64]) -> Projection:
@@ -146,13 +157,17 @@ class ScenesErrors(Mapping[int, SourceErrors]):
         out: list[object] = []
         for scene in self.address.scenes:
             project = _project_of(scene)
-            image = project.image(project.images[0].name)
-            camera = project.cameras[image.camera]
-            deviations = [(name, d.tolist()) for name, d in _deviations(project, image, camera)]
+            image = project.any_image(project.images[0].name)
+            known: list[object] = []
+            if isinstance(image, Image):
+                camera = project.cameras[image.camera]
+                known = [[(name, d.tolist()) for name, d in _deviations(project, image, camera)], camera.sigma]
+            else:
+                known = [[(name, d.tolist()) for name, d in image.deviations], None]
             objects = [part.sigma for part in project.objects]
             sigma = project.ground.sigma
             ground = fingerprint(project.resolve(sigma)).digest if isinstance(sigma, str) else sigma
-            out.append([deviations, camera.sigma, ground, *objects])
+            out.append([*known, ground, *objects])
         return [out, list(self.in_image)]
 
     @property
@@ -188,7 +203,7 @@ def _project_of(address: SceneAddress) -> Project:
 @lru_cache(maxsize=64)
 def _errors_of(address: SceneAddress, in_image: float) -> SourceErrors:
     scene, project = address.open(), _project_of(address)
-    return source_errors(project, project.image(project.images[0].name), scene.ground, scene.camera, in_image)
+    return source_errors(project, project.any_image(project.images[0].name), scene.ground, scene.camera, in_image)
 
 
 @lru_cache(maxsize=8)

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from photoplan.errors import InputError
@@ -51,6 +53,21 @@ class ImageEntry(Entry, ABC):
     def remarks(self) -> tuple[str, ...]:
         """What a user should know of its geometry, a clause each."""
         return ()
+
+    @property
+    def deviations(self) -> tuple[tuple[str, NDArray[np.float64]], ...]:
+        """Independent errors of its geometry: what each is called, and the entries' change of one standard deviation.
+
+        Raises
+        ------
+        InputError
+            Nothing is known of them.
+        """
+        raise InputError(f"image {self.name!r}: its kind of geometry states no accuracy that a raster could be made of")
+
+    def moved(self, change: NDArray[np.float64]) -> ImageEntry:
+        """It with its geometry changed by a part of one of its `deviations`."""
+        raise NotImplementedError
 
     @property
     @abstractmethod

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from photoplan.cameras.plane import Affine2D
+from photoplan.errors import InputError
 from photoplan.io.camera.model import Number, Pair
 from photoplan.io.project.image import ImageEntry, InputName, plain_file
 
@@ -60,6 +63,30 @@ class RpcImage(ImageEntry):
             known = f"± {self.covariance[0] ** 0.5:.2g}, {self.covariance[2] ** 0.5:.2g} px"
         x, y = self.shift
         return (f"polynomials are corrected by {x:+.2f}, {y:+.2f} px ({known})",)
+
+    @property
+    def deviations(self) -> tuple[tuple[str, NDArray[np.float64]], ...]:
+        """See `ImageEntry.deviations`: of shift and drift."""
+        if self.covariance is None:
+            raise InputError(
+                f"image {self.name!r}: nothing is known of the accuracy of its polynomials; `photoplan adjust` writes "
+                "their covariance, or state it in [[images]]: covariance = [VARIANCE OF COLUMN, 0, VARIANCE OF ROW]"
+            )
+        size = 2 if len(self.covariance) == 3 else 6
+        C = np.zeros((size, size))
+        C[np.tril_indices(size)] = self.covariance
+        scale = np.sqrt(np.maximum(np.diag(C), 1e-300))
+        values, axes = np.linalg.eigh((np.tril(C) + np.tril(C, -1).T) / np.outer(scale, scale))
+        if values[0] < -1e-3:
+            raise InputError(f"image {self.name!r}: covariance is none; `photoplan adjust` writes it")
+        return tuple(("polynomials", a * scale * np.sqrt(max(v, 0.0))) for v, a in zip(values, axes.T))
+
+    def moved(self, change: NDArray[np.float64]) -> RpcImage:
+        """See `ImageEntry.moved`."""
+        x, y, *rest = (
+            change + np.array([*(self.shift or (0.0, 0.0)), *(self.drift or (0.0,) * 4)])[: len(change)]
+        ).tolist()
+        return self.model_copy(update={"shift": (x, y)} | ({"drift": tuple(rest)} if rest else {}))
 
     @property
     def correction(self) -> Affine2D | None:
