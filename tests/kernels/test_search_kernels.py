@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from photoplan.kernels.semi_global import choose, sum_paths
+from photoplan.kernels.semi_global import choose, scatter, sum_paths
 from photoplan.kernels.sweep import HALF_COLUMNS, HALF_ROWS, add_costs, describe, sample_plane
 
 
@@ -54,6 +54,21 @@ def test_the_cheapest_step_and_how_far_the_next_one_is() -> None:
     choose(total, first, low, 2, steps, margin)
     assert abs(steps[0, 0] - 104.2) < 1e-4 and abs(margin[0, 0] - (1.5 - 0.04)) < 1e-4
     assert steps[0, 1] == 100 and margin[0, 1] == 0  # the first one of a run is no minimum
+
+
+def test_other_choices_scatter_as_probable_as_they_are() -> None:
+    """Two valleys, 6 steps apart; the second costs two units more."""
+    total = np.full(11, 50.0, np.float32)
+    total[2], total[8] = 3.0, 5.0
+    out = np.empty((1, 1))
+    first, low, best = np.array([0, 11]), np.array([[10]]), np.array([[12.0]])
+    scatter(total, first, low, best, 1.0, 0.01, best - 2, best + 2, out)
+    p = np.exp(-2.0)
+    assert abs(out[0, 0] - 36 * p / (1 + p)) < 1e-6
+    scatter(total, first, low, best, 1.0, 0.01, best - 2, best + 6, out)
+    assert out[0, 0] < 1e-6  # a finer level chooses from both
+    scatter(total, first, low, best, 0.4, 0.01, best - 2, best + 2, out)
+    assert out[0, 0] == 0  # five units
 
 
 def test_cells_of_a_plane_and_what_is_brighter_around_them() -> None:

@@ -113,3 +113,40 @@ def choose(total, first, low, apart, steps, margin):
                 if abs(k - best) > apart:
                     other = min(other, total[at + k])
             margin[j, i] = other - least if other < np.inf else bend
+
+
+@kernel
+def scatter(total, first, low, steps, scale, faint, kept_low, kept_high, out):
+    """How far other choices lie from the best ones, by their costs: Σ p (k − best)² over Σ p, p = exp(−ΔS / scale).
+
+    Parameters
+    ----------
+    total, first, low
+        See `sum_paths`.
+    steps : ndarray, shape (rows, columns)
+        See `choose`.
+    scale : float
+        Difference of costs that counts as one unit of the exponent.
+    faint : float
+        p from which on choices count.
+    kept_low, kept_high : ndarray, shape (rows, columns)
+        Steps from the first to the second one do not count: they are one choice, or still to be chosen from.
+    out : ndarray, shape (rows, columns)
+        Filled, steps².
+    """
+    rows, columns = low.shape
+    for j in range(rows):
+        for i in range(columns):
+            at = first[j * columns + i]
+            count = first[j * columns + i + 1] - at
+            least = total[at]
+            for k in range(1, count):
+                least = min(least, total[at + k])
+            whole, sums = 0.0, 0.0
+            for k in range(count):
+                step = low[j, i] + k
+                p = np.exp((least - total[at + k]) / scale)
+                whole += p
+                if p >= faint and (step < kept_low[j, i] or step > kept_high[j, i]):
+                    sums += p * (step - steps[j, i]) ** 2
+            out[j, i] = sums / max(whole, 1.0)

@@ -63,6 +63,8 @@ class Block:
     """See `parallax`."""
     limits: tuple[_Doubles | float, _Doubles | float] = (-np.inf, np.inf)
     """Heights between which the surface stays, metres, of all or shape (rows, columns)."""
+    trusted: NDArray[np.bool_] | None = None
+    """Posts around which pixels tell their noise, and heights how rough they are; None: all."""
     views: list[View] = field(default_factory=list)
     """Whose sights they are."""
     values: _Floats = field(default_factory=lambda: np.empty((0, 0), np.float32))
@@ -149,7 +151,7 @@ class Block:
     def _smoother(self) -> Smoother:
         inside = np.zeros(self.facets.shape, bool)
         inner = (slice(_BORDER, -_BORDER),) * 2
-        inside[inner] = (self.counted > 1)[inner]
+        inside[inner] = (self.counted > 1 if self.trusted is None else (self.counted > 1) & self.trusted)[inner]
         return Smoother(lambda rights: self._solved(*rights), self.noise, inside, self._signs)
 
     @cached_property
@@ -248,7 +250,7 @@ class Block:
         self.system, right = np.zeros((7, rows, columns)), np.zeros((rows, columns))
         self.noise = np.zeros((rows, columns))
         counted = np.zeros((rows, columns), np.uint8)
-        found, residuals = np.zeros((len(self.sights), 3)), np.empty(0)
+        found, residuals = np.zeros((len(self.sights), 3)), _NONE
         for n, (sight, g, w) in enumerate(zip(self.sights, grey, weights)):
             residuals = np.empty(g.shape, np.float32)
             before = self.system[0].copy()
@@ -257,11 +259,23 @@ class Block:
                 self.sigmas[n], _LIMIT, self.system, right, self.noise, residuals, self._factors[n], found[n],
             )  # fmt: skip
             counted += self.system[0] > before
+            found[n] = self._telling(sight, residuals, n, found[n])
         self.counted = counted
-        self._weigh(found, int((density > 0).sum()))
+        pixels = sum(float(np.count_nonzero(w)) for w in weights)
+        self._weigh(found, int((density > 0).sum()) * float(found[:, 2].sum()) / max(pixels, 1.0))
         return right
 
-    def _weigh(self, found: _Doubles, unknowns: int) -> None:
+    def _telling(self, sight: Sight, residuals: _Floats, n: int, sums: _Doubles) -> _Doubles:
+        """Sums of a view's robust factors, squared residuals and pixels: those around trusted posts."""
+        if self.trusted is None:
+            return sums
+        used = np.isfinite(residuals)
+        i, j = np.rint(sight.places[used][:, :2]).astype(int).T
+        told = self.trusted[j, i]
+        f, v = (a[used][told].astype(float) for a in (self._factors[n], residuals))
+        return np.array([f.sum(), float(f @ (v / self.sigmas[n]) ** 2), float(len(f))])
+
+    def _weigh(self, found: _Doubles, unknowns: float) -> None:
         """Standard deviations of the views' grey values, by variance components (Förstner 1979)."""
         used = found[:, 0] > 0
         share = np.where(used, found[:, 0], 0.0) / self.sigmas**2

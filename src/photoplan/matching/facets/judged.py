@@ -84,6 +84,24 @@ def fit(block: Block) -> _Doubles:
         return np.where(sums[..., 0] > 0, np.sqrt(squares / free), np.nan)
 
 
+def edge_variances(block: Block) -> _Doubles:
+    """Variances of heights beside edges, shape (rows, columns), m²; 0 elsewhere.
+
+    Where neighbours part by more parallax than lies between them, not all images see the facet that joins them (a
+    gradient of disparity above 1: Burt and Julesz 1980), so that nothing tells where on it the edge is: any of its
+    heights may be that of either post.
+    """
+    out = np.zeros(block.facets.shape)
+    for axis in (0, 1):
+        jump = np.abs(np.diff(block.heights, axis=axis))
+        jump = np.where(jump * block.scale > block.facets.ratio, jump, 0.0) ** 2 / 12
+        before, after = [slice(None)] * 2, [slice(None)] * 2
+        before[axis], after[axis] = slice(None, -1), slice(1, None)
+        for side in (tuple(before), tuple(after)):
+            out[side] = np.maximum(out[side], jump)
+    return out
+
+
 def residual_pictures(block: Block) -> list[_Floats]:
     """Mean standardised residual of each view's pixels in every grey value's cell, shape (m · rows, m · columns); NaN
     without pixels. The first cell is that of the first post less half a facet."""

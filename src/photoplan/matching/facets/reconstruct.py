@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.block import Block
 from photoplan.matching.facets.curvature import Roughness
-from photoplan.matching.facets.judged import fit, grey_places, grey_sigmas, residual_pictures
+from photoplan.matching.facets.judged import edge_variances, fit, grey_places, grey_sigmas, residual_pictures
 from photoplan.matching.facets.observe import MARGIN, Facets, Sight, View, facets_of, look
 from photoplan.matching.facets.radiometry import Transfer, first_guess
-from photoplan.matching.facets.search import Search, search
+from photoplan.matching.facets.search import Search, Searched, search
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
@@ -35,6 +35,8 @@ _TRIAL, _MOST_TRIALS = 0.5, 24
 _BEYOND = 1.5
 #: Part of the misfit of the start below which another height is taken: without texture none fits better than others.
 _BETTER = 0.8
+#: Part of the posts that a search must be sure of, so that they tell the noise of all.
+_TRUSTED = 0.1
 #: Standard deviation of grey values until it is estimated, part of their contrast.
 _NOISE = 0.1
 
@@ -111,6 +113,7 @@ def reconstruct(
         None: fewer than two images see any of it, or the start knows no height here.
     """
     block: Block | None = None
+    found: Searched | None = None
     reach = scheme.reach
     if scheme.search is not None:
         found = search(views, grid, window, scheme.ratio, scheme.base, scheme.search, start, scheme.reach)
@@ -128,10 +131,11 @@ def reconstruct(
             continue
         block.limits = _limits(start, facets, reach)
         if level == scheme.coarsest:
-            if scheme.search is None:
+            if found is None:
                 block.heights = _lifted(block, reach)
             else:
                 block.roughness = block.roughness.around(block.heights)
+                block.trusted = found.sure if found.sure.mean() > _TRUSTED else None
         block.adjust(_FIRST[level < scheme.coarsest], True)
         for estimates, iterations in _THEN[level > 0]:
             block.roughen(estimates)
@@ -139,7 +143,8 @@ def reconstruct(
         moves[level] = block.moves[-1]
     if block is None or block.facets.pitch != grid.resolution:
         return None
-    return _found(block, views, window, tuple(moves), residuals)
+    made = _found(block, views, window, tuple(moves), residuals)
+    return made if found is None else _doubting(made, found, window, scheme)
 
 
 def _opened(views: Sequence[View], level: int, facets: Facets, heights: _Doubles, before: Block | None) -> Block | None:
@@ -261,7 +266,7 @@ def _found(
             pictures[n] = picture[fine]
     return Found(
         heights=_where(count > 1, block.heights[inner]),
-        sigmas=_where(count > 1, np.sqrt(np.maximum(variance[inner], 0.0))),
+        sigmas=_where(count > 1, np.sqrt(np.maximum(variance[inner], 0.0) + edge_variances(block)[inner])),
         count=count,
         fit=_where(count > 1, fit(block)[inner]),
         grey=_where(finer(count > 0), block.grey_values(at.reshape(-1, 2)).reshape(at.shape[:2])),
@@ -271,6 +276,15 @@ def _found(
         sums=sums,
         moves=moves,
     )
+
+
+def _doubting(made: Found, found: Searched, window: Window, scheme: Scheme) -> Found:
+    """With what the choice among heights adds to the standard deviations, and facets that went away from a sure one."""
+    assert scheme.search is not None
+    inner = slice(MARGIN, MARGIN + window.height), slice(MARGIN, MARGIN + window.width)
+    away = scheme.search.planes.away(made.heights.astype(float), found.heights[inner])
+    variance = made.sigmas.astype(float) ** 2 + found.variance[inner] + np.where(found.sure[inner], away, 0.0) ** 2
+    return replace(made, sigmas=np.sqrt(variance).astype(np.float32))
 
 
 def _where(known: NDArray[np.bool_], values: NDArray[Any]) -> _Floats:

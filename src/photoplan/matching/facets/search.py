@@ -8,7 +8,7 @@ descriptions of their cells are compared. From coarse to fine each post is searc
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from photoplan.cameras.base import project
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.semi_global import choose, sum_paths
+from photoplan.kernels.semi_global import choose, scatter, sum_paths
 from photoplan.kernels.sweep import HALF_COLUMNS, HALF_ROWS, MOST_PAIRS, add_costs, describe, sample_plane
 from photoplan.matching.facets.observe import Facets, View, facets_of, pixels_between
 
@@ -32,10 +32,15 @@ _LATTICE, _EVERY = 16, 4
 _NEAREST = 0.25
 #: Steps that are searched around the least and largest of the posts around; posts around that are sure, and if not.
 _AROUND, _NEAR, _WIDE = 3, 3, 9
-#: What a step to the next plane costs along a path, and to any other one, parts of the cost's usual contrast.
-_SMALL, _LARGE = 0.15, 0.75
+#: What a step to the next plane costs along a path, and to any other one, parts of the cost's usual contrast; paths.
+_SMALL, _LARGE, _PATHS = 0.15, 0.75, 8
 #: Steps next to the best one that are no other choice, and the part of the contrast by which others must cost more.
 _APART, _SURE = 2, 0.5
+#: What a choice must cost more, parts of the contrast, to be less probable by the factor e: half the contrast is wrong
+#: in 0.5 % of the places. What is less probable than this does not count: nobody counted it.
+_PROBABLE, _FAINT = 0.094, 0.003
+#: Pixels of parallax by which heights may differ from those that were found without a doubt.
+_AWAY = 1.0
 #: Cost of a place that no two images see: that of images of different things.
 _NEUTRAL = 0.5
 
@@ -69,6 +74,10 @@ class Planes:
             return np.full(np.shape(heights), self.pixel)
         return np.asarray(self.pixel * ((self.ceiling - heights) / (self.ceiling - self.at)) ** 2)
 
+    def away(self, heights: _Doubles, found: _Doubles) -> _Doubles:
+        """By how much heights are farther from others than a pixel of parallax, metres; 0 where they are not."""
+        return np.asarray(np.maximum(np.abs(heights - found) - _AWAY * self.pixels(found), 0.0))
+
     def _step(self, level: int) -> float:
         step = _STEP * 2**level * self.pixel
         return step if np.isinf(self.ceiling) else step / (self.ceiling - self.at) ** 2
@@ -94,6 +103,15 @@ class Searched:
     """Shape (rows, columns), metres."""
     margin: _Doubles
     """By how much other heights cost more, parts of the cost's usual contrast; 0: unknown."""
+    variance: _Doubles
+    """Of the choice among heights, m²."""
+    ends: tuple[_Doubles, _Doubles]
+    """Least and largest number of the planes of the posts around."""
+
+    @property
+    def sure(self) -> NDArray[np.bool_]:
+        """Where other heights cost clearly more."""
+        return np.asarray(self.margin >= _SURE)
 
     def __call__(self, XY: _Doubles) -> _Doubles:
         """Heights at map points (n, m, 2) of a grid."""
@@ -137,12 +155,15 @@ def search(
         begun = np.where(np.isfinite(begun), begun, np.nanmean(begun))
         low, high = (np.floor(planes.numbers(begun + side * reach, level)).astype(np.int64) for side in (-1, 1))
         if found is not None:
-            near = _near(found, facets, planes, level)
+            near = _near(found, facets)
             low, high = np.clip(near[0], low, high), np.clip(near[1], low, high)
-        found = _level(views, level, base, facets, planes, low, high + 1) or found
+        before, found = found, _level(views, level, base, facets, planes, low, high + 1) or found
+        if before is not None and found is not None and found is not before:
+            found = replace(found, variance=found.variance + _nearest(before.facets, before.variance, facets))
     if found is None or found.facets.pitch != grid.resolution:
         return None
-    return Searched(found.facets, _filled(found.heights, np.clip(found.margin / _SURE, 0.0, 1.0) ** 4), found.margin)
+    heights = _filled(found.heights, np.clip(found.margin / _SURE, 0.0, 1.0) ** 4)
+    return replace(found, heights=heights, variance=found.variance + planes.away(heights, found.heights) ** 2)
 
 
 def _filled(values: _Doubles, weights: _Doubles) -> _Doubles:
@@ -157,16 +178,17 @@ def _filled(values: _Doubles, weights: _Doubles) -> _Doubles:
     return np.asarray(weights * values + (1 - weights) * finer)
 
 
-def _near(found: Searched, facets: Facets, planes: Planes, level: int) -> tuple[_Integers, _Integers]:
-    """First and last plane to be searched at finer posts."""
-    numbers = planes.numbers(found.heights, level)
-    sure = found.margin >= _SURE
+def _near(found: Searched, facets: Facets) -> tuple[_Integers, _Integers]:
+    """First and last plane to be searched at the posts of the next finer level."""
+    low, high = (2.0 * _nearest(found.facets, end, facets) + side * _AROUND for side, end in zip((-1, 1), found.ends))
+    return np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
+
+
+def _around(steps: _Doubles, sure: NDArray[np.bool_]) -> tuple[_Doubles, _Doubles]:
+    """Least and largest of the planes of the posts around each, farther around where posts are not sure."""
     ends = []
-    for smallest, side in ((True, -1), (False, 1)):
-        extreme = ndimage.minimum_filter if smallest else ndimage.maximum_filter
-        there = np.where(sure, extreme(numbers, _NEAR), extreme(numbers, _WIDE))
-        around = extreme(there, _NEAR) + side * _AROUND
-        ends.append(np.floor(_nearest(found.facets, around, facets)).astype(np.int64))
+    for extreme in (ndimage.minimum_filter, ndimage.maximum_filter):
+        ends.append(extreme(np.where(sure, extreme(steps, _NEAR), extreme(steps, _WIDE)), _NEAR))
     return ends[0], ends[1]
 
 
@@ -209,9 +231,16 @@ def _level(
     contrast = _contrast(cost, first)
     path, total = np.empty_like(cost), np.zeros_like(cost)
     sum_paths(cost, first, low, np.float32(_SMALL * contrast), np.float32(_LARGE * contrast), path, total)
-    steps, margin = np.empty((rows, columns)), np.empty((rows, columns))
+    steps, margin, variance = np.empty((3, rows, columns))
     choose(total, first, low, _APART, steps, margin)
-    return Searched(facets, planes.heights(steps, level), margin / (8 * contrast))
+    whole = _PATHS * contrast
+    nearby = _around(steps, margin >= _SURE * whole)
+    # What finer levels search is not yet chosen from.
+    kept = (nearby[0] - _AROUND / 2, nearby[1] + _AROUND / 2) if level else (steps - _APART, steps + _APART)
+    scatter(total, first, low, steps, _PROBABLE * whole, _FAINT, *kept, variance)
+    heights = planes.heights(steps, level)
+    step = _STEP * 2**level * planes.pixels(heights)
+    return Searched(facets, heights, margin / whole, variance * step**2, nearby)
 
 
 def _cells(active: NDArray[np.bool_], m: int, shape: tuple[int, int], half: tuple[int, int]) -> NDArray[np.bool_]:
