@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from tools.adjust_project import Make, write_project
 from tools.dem_file import write_dem
+from tools.facet_scene import GROUND, write_scene
 from tools.forked import QUIET, Mishap, Ran, content, forked
-from tools.small_block import texture, write_block, write_image
+from tools.small_block import X0, Y0, texture, write_block, write_image
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs fork and signals")
 
@@ -54,7 +55,19 @@ def adjust(at: Path) -> list[object]:
     return ["adjust", at / "made" / "project.toml"]
 
 
-CASES: dict[str, Words] = {each.__name__: each for each in (ortho, restore, flow, volume, shade, contours, adjust)}
+def seams(at: Path) -> list[object]:
+    return ["seams", at / "block" / "project.toml", "--resolution", 4, "-o", at / "seams.gpkg", "--workers", 1]
+
+
+def surface(at: Path) -> list[object]:
+    bounds = ["--bounds", X0 - 18, Y0 - 30, X0 + 18, Y0 + 30, "--resolution", 3]
+    report = ["--report", at / "report.html", "--points", at / "points.ply"]
+    return ["surface", at / "project.toml", *bounds, "--start", GROUND, *report, "--workers", 1]
+
+
+CASES: dict[str, Words] = {
+    each.__name__: each for each in (ortho, restore, flow, volume, shade, contours, adjust, seams, surface)
+}
 
 
 _FAST = ("flow", "contours")
@@ -62,8 +75,10 @@ _FAST = ("flow", "contours")
 
 def inputs(case: Words, folder: Path) -> Path:
     folder.mkdir()
-    if case is ortho:
+    if case in (ortho, seams):
         write_block(folder / "block")
+    elif case is surface:
+        write_scene(folder, 3)
     elif case is adjust:
         write_project(folder / "made", Make(pixel_noise=0.3))
     elif case is restore:

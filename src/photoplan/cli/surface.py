@@ -45,9 +45,12 @@ def command(project: Path, **options: Any) -> None:
     from photoplan.cli import running
     from photoplan.cli.output import show, show_json
     from photoplan.cli.telling import Telling
+    from photoplan.io.naming import together
     from photoplan.io.project.file import load_project
     from photoplan.products.surface.plan import SurfaceSettings, plan_surface
     from photoplan.products.surface.run import make_surface
+    from photoplan.report.drawing import has_matplotlib
+    from photoplan.report.maps import draw_surface
     from photoplan.report.page import open_report
     from photoplan.report.surface import surface_page
 
@@ -64,21 +67,22 @@ def command(project: Path, **options: Any) -> None:
             show_json(plan.json_fields()) if how.as_json else show(plan)
             return
         events.talk(str(plan))
-        result = make_surface(plan, folder or stated.folder / "products", how.run(events))
-        told = None if report is None else report.write(surface_page(plan, result))
+        with together():
+            result = make_surface(plan, folder or stated.folder / "products", how.run(events))
+            told = None if report is None else report.write(surface_page(plan, result))
+            picture = None
+            if how.quicklook and has_matplotlib():
+                picture = draw_surface(result.path, result.path.with_suffix(".png"))
         if how.as_json:
             show_json(result, report=told)
         else:
             for path in filter(None, (result.path, *result.others, told)):
                 show(path)
-        _tell(result, plan, how.quicklook, events)
+        _tell(result, plan, picture, events)
 
 
-def _tell(result: Any, plan: Any, draw: bool, events: Any) -> None:
-    """Figures of a surface, and its picture where pictures can be made."""
-    from photoplan.report.drawing import has_matplotlib
-    from photoplan.report.maps import draw_surface
-
+def _tell(result: Any, plan: Any, picture: Path | None, events: Any) -> None:
+    """Figures of a surface, and where its picture is."""
     known = {name: value for name, value in result.sigma0.items() if value is not None}
     mean = "unknown" if result.sigma is None else f"{result.sigma:.3g} m ({result.sigma_px:.2g} px of parallax)"
     events.talk(
@@ -90,5 +94,5 @@ def _tell(result: Any, plan: Any, draw: bool, events: Any) -> None:
     events.talk("  sigma0 of grey values: " + ", ".join(f"{name} {value:.3g}" for name, value in known.items()))
     for note in result.notes:
         events.talk(f"  {note}")
-    if draw and has_matplotlib():
-        events.talk(f"  drawn in {draw_surface(result.path, result.path.with_suffix('.png'))}")
+    if picture is not None:
+        events.talk(f"  drawn in {picture}")

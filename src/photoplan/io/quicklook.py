@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.io.checks import check_plain_file, raster_driver
 from photoplan.io.gdal import GDAL_ERRORS, first_cause, gdal_settings, not_georeferenced, open_raster
-from photoplan.io.naming import write_atomically
+from photoplan.io.naming import standing, write_atomically
 
 _PERCENT = 2.0, 98.0
 _SOFTWARE = "photoplan"
@@ -60,13 +60,15 @@ def write_quicklook(product: Path, picture: Path, *, max_side: int = 1600) -> Pa
 def read_reduced(product: Path, *, max_side: int) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
     """All bands of a product from its nearest overview, NaN where invalid, and its outer edges xmin ymin xmax ymax.
 
+    The product may still wait for its name.
+
     Raises
     ------
     InputError
         If the product cannot be read.
     """
     _check_side(max_side)
-    with _opened(product) as dataset, gdal_settings():
+    with _opened(standing(product)) as dataset, gdal_settings():
         factor = max(1.0, max(dataset.width, dataset.height) / max_side)
         shape = (_scaled(dataset.height, factor), _scaled(dataset.width, factor))
         try:
