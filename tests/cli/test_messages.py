@@ -60,6 +60,19 @@ def test_an_empty_name_is_no_path_in_any_command() -> None:
             parameter.type.convert(" ", parameter, None)
 
 
+def test_no_folder_is_made_that_is_named_as_a_file(tmp_path: Path) -> None:
+    """`mosaic --output m.tif` made a folder of this name."""
+    folders = {name: [p for p in verb.params if getattr(p.type, "new_folder", False)] for name, verb in VERBS.items()}
+    for name in ("ortho", "mosaic", "object", "run", "surface", "restore", "balance", "adjust", "view sequence"):
+        assert any("--output" in p.opts for p in folders[name]), name
+    (tmp_path / "old.tif").mkdir()
+    for parameter in (p for mine in folders.values() for p in mine):
+        with pytest.raises(click.BadParameter, match=r"'m\.TIF' is named as a file; give a folder"):
+            parameter.type.convert("m.TIF", parameter, None)
+        for fine in (tmp_path / "old.tif", tmp_path / "flight 1.2"):
+            assert parameter.type.convert(str(fine), parameter, None) == fine
+
+
 def test_the_library_names_no_option() -> None:
     """Strings, docstrings among them, outside the command line."""
     option = re.compile(r"(?<![\w-])--[a-z][a-z-]*")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,7 @@ def test_images_with_control_are_oriented_and_written(folder: Path) -> None:
     recorded(folder / "project.resect.run.json", "resect", folder / "project.toml", folder / "control.csv")
     first = result.stdout.splitlines()
     assert first[0].startswith("a  ") and "sigma0" in first[0] and "rms 0." in first[0]
+    assert re.search(r" · 95 % within 2\.[0-9] times ±$", first[0])
     assert first[1].strip().startswith(("X0 499999.", "X0 500000.")) and "±" in first[1]
     assert first[2].strip().startswith("φ 1.") and "  ω -" in first[2] and "  κ " in first[2] and "gon" in first[2]
     assert "1 images have fewer than 3 control points: c" in result.stderr

@@ -343,3 +343,25 @@ def test_three_points_on_a_cylinder_with_the_camera_do_not_lead_far_from_the_sta
     else:
         off = np.abs(found.pose.center - pose.center)
         assert (off < 5.0 * np.sqrt(np.diag(found.covariance)[:3])).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [6, 9, 14])
+def test_few_points_tell_within_how_many_standard_deviations_errors_lie(count: int) -> None:
+    """sigma0 of 6, 12 and 22 redundant observations: normalised errors follow Student's distribution."""
+    inside, squares = [], []
+    for seed in range(120):
+        rng = np.random.default_rng(seed)
+        pose = aerial_pose(rng, tilt=0.2)
+        exact = measured(frame(pose), ground_below(rng, pose, count, 200.0), rng, 0.0)
+        noise = rng.normal(0, 0.5, exact.xy.shape)
+        points = dataclasses.replace(exact, xy=exact.xy + noise, sigma=np.full(exact.xy.shape, 0.5))
+        found = resect(points, AERIAL, NoLens())
+        assert found.redundancy == 2 * count - 6
+        z = (found.pose.center - pose.center) / np.sqrt(np.diag(found.covariance)[:3])
+        inside.append(np.abs(z) < found.reach_95)
+        squares.append(z**2 * (found.redundancy - 2) / found.redundancy)
+    print(count, f"inside {np.mean(inside):.3f}", f"normalised, of Student's variance {np.sqrt(np.mean(squares)):.3f}")
+    assert found.reach_95 > 2.05
+    assert 0.92 < np.mean(inside) < 0.98
+    assert 0.88 < np.sqrt(np.mean(squares)) < 1.12

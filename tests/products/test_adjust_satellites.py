@@ -171,10 +171,11 @@ def test_splines_of_a_strip_are_written_and_read(tmp_path: Path) -> None:
 
 def test_fault_18_broken_corrections_are_refused_by_name(tmp_path: Path) -> None:
     path, _ = flown(tmp_path)
-    (tmp_path / "c.toml").write_text('format = "photoplan line correction 1"\ntime_offset_s = nan\n')
     path.write_text(path.read_text().replace('detectors = "nadir"\n', 'detectors = "nadir"\ncorrection = "c.toml"\n'))
-    said = inside("adjust", str(path))
-    assert said.code == 3 and "c.toml" in said.err and "time_offset_s" in said.err
+    for verb, entry in (("adjust", "time_offset_s = nan"), ("adjust", "boresight_deg = [0.0, 40.0, 0.0]")):
+        (tmp_path / "c.toml").write_text(f'format = "photoplan line correction 1"\n{entry}\n')
+        said = inside(verb, str(path))
+        assert said.code == 3 and "c.toml" in said.err and entry.split()[0] in said.err
 
 
 @pytest.mark.slow

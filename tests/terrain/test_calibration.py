@@ -26,7 +26,7 @@ def held_out(factor: NDArray[np.float64], noise: float, seed: int, count: int = 
     every = np.ones(count)
     block = np.arange(count) // 5
     around = Surroundings(signal_share(sigma, noise), distance, beside, rough)
-    return HeldOut(error, sigma, noise**2 * every, around, block)
+    return HeldOut(error, sigma, noise**2 * every, around, block, rng.uniform(size=count))
 
 
 def at_knots(noise: float, beside: float = 0.0) -> Surroundings:
@@ -59,7 +59,7 @@ def test_few_blocks_change_little_and_none_nothing() -> None:
     held = replace(held, error=2 * held.sigma * np.sqrt(held.around.rough))
     assert 0 < calibrate(held).coefficients[:-1].max() < np.log(2)
     none = np.empty(0)
-    assert calibrate(HeldOut(none, none, none, Surroundings(*[none] * 4), np.empty(0, np.int64))) is NONE
+    assert calibrate(HeldOut(none, none, none, Surroundings(*[none] * 4), np.empty(0, np.int64), none)) is NONE
     np.testing.assert_allclose(NONE.factor(Surroundings(*[np.ones(2)] * 3, np.array([1.0, 4.0]))), [1.0, 2.0])
 
 
@@ -67,6 +67,17 @@ def test_blocks_of_several_rounds_stay_apart() -> None:
     held = held_out(np.ones(5), 0.0, 6, count=10)
     both = joined([held, held])
     assert np.unique(both.block).tolist() == [0, 1, 2, 3] and len(both.around.rough) == 20
+
+
+def test_errors_where_the_ground_bends_are_told_apart() -> None:
+    """Three times larger in the twentieth part that bends most: the class says so, which no distance tells."""
+    held = held_out(np.ones(5), 0.0, 7)
+    most = held.bend > 0.95
+    found = calibrate(replace(held, error=np.where(most, 3.0, 1.0) * held.error))
+    weak, _, strong = found.bends
+    assert [round(c.furthest - c.nearest, 2) for c in found.bends] == [0.8, 0.15, 0.05]
+    assert strong.enough and strong.after > 2.2 * weak.after and weak.after < 1.1
+    assert max(c.after for c in found.classes) < 1.25
 
 
 def test_one_blunder_among_the_held_out_does_not_decide() -> None:

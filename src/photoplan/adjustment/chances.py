@@ -17,6 +17,11 @@ def chance_t(ratio: float, freedom: float) -> float:
     return float(2.0 * special.stdtr(freedom, -abs(ratio))) if math.isfinite(ratio) else 0.0
 
 
+def reach_t(share: float, freedom: float) -> float:
+    """Estimated standard deviations within which a `share` of the errors lies (Student's distribution); NaN: none."""
+    return float(special.stdtrit(freedom, 0.5 + share / 2.0)) if freedom > 0 else math.nan
+
+
 def chance_chi_square(square: float, freedom: float) -> float:
     """Chance of a sum of squares of `freedom` normalised errors as large."""
     return float(special.chdtrc(freedom, square))

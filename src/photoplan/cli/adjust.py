@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, ending, images_option
+from photoplan.cli.options import NEW_FOLDER, PATH, ending, images_option
 from photoplan.cli.output import show, show_json
 from photoplan.plain import shown_metres
 
@@ -29,7 +29,7 @@ _SHOWN = 20
 @click.option("--no-variance-components", is_flag=True, help="Weight groups as stated, not as their residuals show.")
 @click.option("--no-correlation", is_flag=True, help="Take errors of neighbouring image points as independent.")
 @click.option("--iterations", type=click.IntRange(1), default=40, show_default=True, help="Most of each solution.")
-@click.option("-o", "--output", type=PATH, metavar="FOLDER", help="Report [PROJECT/adjustment].")
+@click.option("-o", "--output", type=NEW_FOLDER, metavar="FOLDER", help="Report [PROJECT/adjustment].")
 @ending("Adjust and print the figures; write nothing.")
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Orientations, points and cameras from all measurements of a project at once.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, ending, images_option
+from photoplan.cli.options import NEW_FOLDER, PATH, ending, images_option
 from photoplan.cli.output import say, show, show_json
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _LISTED = 12
 @click.option("--degree", type=int, default=2, show_default=True, help="Of the trend over an image; 0: tables alone.")
 @click.option("--factor", is_flag=True, help="One factor for each image and band instead of tables, from means.")
 @click.option("--resolution", type=float, metavar="R", help="Pixels that are compared, metres [by the images' size].")
-@click.option("-o", "--output", type=PATH, metavar="FOLDER", help="[balance by the project]")
+@click.option("-o", "--output", type=NEW_FOLDER, metavar="FOLDER", help="[balance by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not draw balance.png.")
 @ending("Look at the images and stop.", workers=True, memory=True)
 def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> None:

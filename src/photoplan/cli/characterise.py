@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, ending
+from photoplan.cli.options import NEW_FOLDER, PATH, ending
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @click.argument("series", type=PATH, metavar="SERIES")
 @click.option("--only", multiple=True, metavar="NAME", help="Run this analysis; may be repeated [all possible].")
 @click.option("--report", type=PATH, metavar="FILE", help="Write an HTML report with plots.")
-@click.option("--csv", type=PATH, metavar="FOLDER", help="Write the figures as tables.")
+@click.option("--csv", type=NEW_FOLDER, metavar="FOLDER", help="Write the figures as tables.")
 @ending("Say which analyses would run and what is missing for the others.")
 def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Know a camera from image series: noise, gain, linearity, dark signal, defects, light fall-off …

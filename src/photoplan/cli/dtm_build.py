@@ -149,6 +149,9 @@ def _summary(built: BuildReport) -> list[str]:
     ]
     if f["calibration"]:
         lines.append("held-out blocks, errors over stated ±: " + ", ".join(_class(c) for c in f["calibration"]))
+        bends = [f"{_bend(c)} {c['after']:.2f}" for c in reversed(f["calibration_by_bend"]) if c["enough"]]
+        if bends:
+            lines.append("  the same by curvature of the ground: " + ", ".join(bends))
     if built.gross:
         lines.append(f"gross errors, left out: {len(built.gross)}")
         lines += [f"  {g.name}: {g.residual:+.3f} m, {abs(g.normalised):.1f} σ" for g in built.gross[:_SHOWN]]
@@ -158,6 +161,11 @@ def _summary(built: BuildReport) -> list[str]:
         lines.append(f"findings in the measurements: {len(built.findings)}")
         lines += [f"  {finding.kind}: {finding.text}" for finding in built.findings[:_SHOWN]]
     return lines + [f"  {note}" for note in built.measured.notes[:_SHOWN]]
+
+
+def _bend(c: dict[str, Any]) -> str:
+    word = "strongest" if c["to"] == 1 else "weakest" if c["from"] == 0 else "next"
+    return f"{word} {100 * (c['to'] - c['from']):.0f} %"
 
 
 def _class(c: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, ending, images_option
+from photoplan.cli.options import NEW_FOLDER, PATH, ending, images_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 _ANSWER = {"auto": None, "yes": True, "no": False}
@@ -27,7 +27,7 @@ _ANSWER = {"auto": None, "yes": True, "no": False}
               help="Whether dark and bright are exchanged against the description.")  # fmt: skip
 @click.option("--band", type=click.IntRange(1), metavar="N", help="Band to use [luminance of the first three].")
 @click.option("--least-correlation", type=click.FloatRange(0.3, 0.99), metavar="R", help="Less is no mark [0.6].")
-@click.option("--pictures", type=PATH, metavar="FOLDER", help="Receives a picture of the marks.")
+@click.option("--pictures", type=NEW_FOLDER, metavar="FOLDER", help="Receives a picture of the marks.")
 @ending("Of a project: do not write the marks into it.")
 def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Find the fiducial marks of scanned film photos, without approximate values.

@@ -13,17 +13,28 @@ _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIRECTIONS = ["camera-to-ground", "ground-to-camera"]
 
 
+#: Endings of files: a folder of such a name would be made in silence.
+_FILE = re.compile(r"\.(csv|gpkg|html|jp2|jpe?g|json|la[sz]|pdf|png|tiff?|toml|vrt)$", re.IGNORECASE)
+
+
 class _Path(click.Path):
-    """A path that is not empty: an empty one would be the folder where the command runs."""
+    """A path that is not empty, which would be the folder where the command runs; no new folder is named as a file."""
+
+    def __init__(self, *, file_okay: bool = True, new_folder: bool = False) -> None:
+        super().__init__(path_type=Path, file_okay=file_okay)
+        self.new_folder = new_folder
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if not str(value).strip():
             self.fail("the name is empty; give the name of a file or folder", param, ctx)
+        if self.new_folder and _FILE.search(str(value)) and not Path(str(value)).exists():
+            self.fail(f"{str(value)!r} is named as a file; give a folder: files in it have their own names", param, ctx)
         return super().convert(value, param, ctx)
 
 
-PATH = _Path(path_type=Path)
-FOLDER = _Path(path_type=Path, file_okay=False)
+PATH = _Path()
+FOLDER = _Path(file_okay=False)
+NEW_FOLDER = _Path(new_folder=True)
 POSITIVE = click.FloatRange(0, min_open=True)
 
 
@@ -161,7 +172,7 @@ product_options = several(
     click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto]."),
     click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes]."),
     click.option("--tile", type=int, metavar="PX", help="Side of a tile [512]."),
-    click.option("--output", type=PATH, help="Folder of the products [PROJECT's folder/products]."),
+    click.option("--output", type=NEW_FOLDER, help="Folder of the products [PROJECT's folder/products]."),
     click.option(
         "--force", is_flag=True, help="Also of orientations with a FAULT, and finer than a quarter of the GSD."
     ),

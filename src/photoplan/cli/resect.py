@@ -76,7 +76,7 @@ def _lines(image: ResectedImage) -> list[str]:
     angles = zip(image.angle_names, image.angles, image.sigma_angles)
     lines = [
         f"{image.image.name}  {used} points · redundancy {found.redundancy} · sigma0 {found.sigma0:.3g} · "
-        f"rms {found.rms:.2f} px",
+        f"rms {found.rms:.2f} px" + (f" · 95 % within {found.reach_95:.1f} times ±" if found.redundancy > 0 else ""),
         "  " + "  ".join(_with_sigma(*parameter) for parameter in center),
         "  " + "  ".join(f"{name} {value:.{digits}f} ±{sigma:.{digits}f}{sign}" for name, value, sigma in angles),
     ]

@@ -7,12 +7,12 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, executing
+from photoplan.cli.options import NEW_FOLDER, PATH, executing
 
 
 @click.command("run")
 @click.argument("plan", type=PATH)
-@click.option("--output", type=PATH, help="Folder of the products [as planned].")
+@click.option("--output", type=NEW_FOLDER, help="Folder of the products [as planned].")
 @executing
 def command(plan: Path, output: Path | None, **options: Any) -> None:
     """Execute PLAN, a GeoPackage written by `photoplan ortho PROJECT --plan PLAN`.

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH
+from photoplan.cli.options import NEW_FOLDER, PATH
 from photoplan.cli.view_look import look_options, take_look
 from photoplan.cli.view_options import camera_options, running_options, take_request, told
 
@@ -20,7 +20,7 @@ from photoplan.cli.view_options import camera_options, running_options, take_req
 @click.option("--step", type=float, help="Between stations of a line, metres.")
 @click.option("--video", type=PATH, metavar="MP4", help="A film of the pictures; needs ffmpeg.")
 @click.option("--rate", type=float, default=25.0, show_default=True, help="Pictures of the film per second.")
-@click.option("-o", "--output", type=PATH, required=True, metavar="FOLDER", help="For frame_00001.png and so on.")
+@click.option("-o", "--output", type=NEW_FOLDER, required=True, metavar="FOLDER", help="For frame_00001.png and so on.")
 @running_options
 def command(**options: Any) -> None:
     """Pictures of SOURCE along a path: with --look-at towards one point, with --azimuth in one direction, else ahead.

@@ -242,7 +242,7 @@ class ResectedImage:
         return {
             "image": self.image.name,
             **self.image_entries,
-            **pick(found, "sigma0", "redundancy", rms_px="rms"),
+            **pick(found, "sigma0", "redundancy", "reach_95", rms_px="rms"),
             "covariance_rotation": found.covariance[3:6, 3:6],
             "camera": None if self.calibrated is None else _camera_fields(self.calibrated),
             "points": [

@@ -95,7 +95,8 @@ def _image(image: ResectedImage, drawn: bool) -> str:
     ]
     parts = [
         f"<p>{int((~found.rejected).sum())} points, redundancy {found.redundancy}, sigma0 {found.sigma0:.3g}, "
-        f"rms {found.rms:.3g} px. Standard deviations hold sigma0.</p>"
+        f"rms {found.rms:.3g} px. Standard deviations hold sigma0"
+        + (f"; 95 % of the errors lie within {found.reach_95:.2g} of them.</p>" if found.redundancy > 0 else ".</p>")
     ]
     parts += [f"<p>{text(note)}</p>" for note in (*image.gross_errors, *image.notes)]
     if drawn:

@@ -20,6 +20,8 @@ _LEVEL, _CHANGE, _LINE, _POWER = 0.5, 0.25, 0.4, 0.2
 _KNEE = 16.0
 #: Half of an error is averaged noise where its standard deviation is this part of the noise of a point.
 _AVERAGED = 0.5
+#: Parts of the heights where the ground bends less than in the classes that follow.
+_BENDS = np.array([0.8, 0.95])
 #: A class is judged from so many held-out blocks.
 _ENOUGH = 8
 
@@ -60,6 +62,8 @@ class HeldOut:
     """Of what was not held out."""
     block: NDArray[np.int64]
     """What was held out together has the same number."""
+    bend: NDArray[np.float64]
+    """How much the ground bends there, 1/m."""
 
     @property
     def weight(self) -> NDArray[np.float64]:
@@ -73,17 +77,18 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
     """What was held out in several rounds."""
     first = np.cumsum([0, *(part.block.max(initial=-1) + 1 for part in parts)])
     around = (np.concatenate([getattr(part.around, f.name) for part in parts]) for f in fields(Surroundings))
-    error, sigma, noise = (np.concatenate([getattr(part, n) for part in parts]) for n in ("error", "sigma", "noise"))
+    names = ("error", "sigma", "noise", "bend")
+    error, sigma, noise, bend = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
     block = np.concatenate([part.block + k for part, k in zip(parts, first)])
-    return HeldOut(error=error, sigma=sigma, noise=noise, around=Surroundings(*around), block=block)
+    return HeldOut(error=error, sigma=sigma, noise=noise, around=Surroundings(*around), block=block, bend=bend)
 
 
 @dataclass(frozen=True)
 class ClassFigures:
-    """What was held out at some distances to data."""
+    """What was held out at some distances to data, or where the ground bends so much."""
 
     nearest: float
-    """Distances from here, in spacings."""
+    """Distances from here, in spacings; or the part of all heights where the ground bends less, 0 to 1."""
     furthest: float
     """To here."""
     count: int
@@ -108,6 +113,9 @@ class SigmaFactor:
     coefficients: NDArray[np.float64]
     """Of its logarithm: at `KNOTS`, on a line, and the power of the roughness; shape (knots + 2,)."""
     classes: tuple[ClassFigures, ...] = ()
+    """By distance."""
+    bends: tuple[ClassFigures, ...] = ()
+    """By how much the ground bends, which the factor does not know; the last one is where it bends most."""
 
     def factor(self, around: Surroundings) -> NDArray[np.float64]:
         """Of standard deviations at places, shape (n,)."""
@@ -145,14 +153,20 @@ def calibrate(held: HeldOut) -> SigmaFactor:
         return float((weight * (square + np.log(variance))).sum() + (((x - mean) / expected) ** 2).sum())
 
     found = SigmaFactor(sums @ minimize(objective, mean, method="BFGS").x)
-    return SigmaFactor(found.coefficients, _classes(held, found))
+    order = np.argsort(np.argsort(held.bend, kind="stable"), kind="stable") / len(held.bend)
+    return SigmaFactor(
+        found.coefficients,
+        _classes(held, found, held.around.distance, np.concatenate([[0.0], _LIMITS, [np.inf]])),
+        _classes(held, found, order, np.concatenate([[0.0], _BENDS, [1.0]])),
+    )
 
 
-def _classes(held: HeldOut, found: SigmaFactor) -> tuple[ClassFigures, ...]:
-    of_class = np.searchsorted(_LIMITS, held.around.distance)
-    edges = np.concatenate([[0.0], _LIMITS, [np.inf]])
+def _classes(
+    held: HeldOut, found: SigmaFactor, value: NDArray[np.float64], edges: NDArray[np.float64]
+) -> tuple[ClassFigures, ...]:
+    of_class = np.searchsorted(edges[1:-1], value, side="right")
     figures = []
-    for k in range(len(KNOTS)):
+    for k in range(len(edges) - 1):
         some = of_class == k
         before, after = (
             float(np.sqrt(np.average(held.error[some] ** 2 / variance[some], weights=held.weight[some])))

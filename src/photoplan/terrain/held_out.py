@@ -24,6 +24,8 @@ _ROUNDS, _PART, _MOST = 2, 0.1, 3000
 _LARGEST = 0.2
 #: Half length of pieces of form lines in distances between lines.
 _PIECE = 4.0
+#: Heights around a datum that tell how much the ground bends.
+_BENT = 12
 #: Data of a block that are predicted, and of a line.
 _ASKED = 24
 
@@ -73,7 +75,25 @@ def _round(found: TerrainFit, gap: float, meshes: int, rng: np.random.Generator,
         noise=noise[known],
         around=Surroundings(*predicted[:, 2:].T),
         block=number.ravel(),
+        bend=_bends(seen, at),
     )
+
+
+def _bends(seen: Observations, some: NDArray[np.int64]) -> NDArray[np.float64]:
+    """How much the ground bends at data: second derivatives of a paraboloid through the heights around, 1/m.
+
+    Their own heights have no part in it: noise would bend the ground where its errors are large.
+    """
+    known = np.flatnonzero(np.isfinite(seen.xyz).all(axis=1))
+    if len(known) <= _BENT:
+        return np.zeros(len(some))
+    near = known[cKDTree(seen.xyz[known, :2]).query(seen.xyz[some, :2], k=np.arange(2, _BENT + 2))[1]]
+    d = seen.xyz[near] - seen.xyz[some, None]
+    size = np.abs(d[..., :2]).max(axis=(1, 2))[:, None] + 1e-12 * seen.spacing
+    x, y = d[..., 0] / size, d[..., 1] / size
+    A = np.stack([np.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2], axis=-1)
+    second = (np.linalg.pinv(A, rcond=1e-6) @ d[..., 2:])[:, 3:, 0] / size**2
+    return np.sqrt((second**2 * (1.0, 2.0, 1.0)).sum(axis=1))
 
 
 def without(found: TerrainFit, held: NDArray[np.bool_], meshes: int) -> TerrainFit:

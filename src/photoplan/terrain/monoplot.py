@@ -18,7 +18,7 @@ from photoplan.surfaces.objects import without_objects
 REASONS = {
     "": "met",
     "outside": "outside the image",
-    "no ray": "the lens has no ray there",
+    "no ray": "its lens, polynomials or trajectory have no ray there",
     "up": "looks above the horizon",
     "below": "the camera is below the terrain",
     "none": "meets no terrain",

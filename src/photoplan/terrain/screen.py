@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from photoplan.adjustment.robust import MEDIAN_1D
+from photoplan.adjustment.robust import MEDIAN_1D, geman_mcclure, huber
 from photoplan.kernels.local_breaks import borders, differences, hang_together
 from photoplan.kernels.local_planes import fit_planes, local_scales, part_across
 from photoplan.terrain.observations import Observations
@@ -39,6 +39,8 @@ _ROUND, _PARTLY, _EDGES = 0.95, 0.6, 6
 _OPEN = np.radians(110.0)
 #: Every so-manieth point, and so many of these: the neighbourhood in which a cluster is small.
 _THIN, _AROUND = 4, 25
+#: Iterations of a paraboloid there, those of Huber's weights before; neighbourhoods at once.
+_BENT_ROUNDS, _BENT_HUBER, _CHUNK = 6, 2, 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,14 +203,71 @@ def supported(
 def _clusters(
     seen: Observations, near: NDArray[np.int32], slopes: NDArray[np.float64]
 ) -> tuple[tuple[NDArray[np.int64], ...], tuple[NDArray[np.int64], ...], NDArray[np.float64]]:
-    """Small groups whose border breaks: all round; in part; and by how much, of each point."""
+    """Small groups whose border breaks: all round; in part; and by how much, of each point.
+
+    Heights break off from the slopes around, which are those of planes in the middle, or of a paraboloid. On curved
+    ground the differences between neighbours are larger than a group's with the first, on rough ground groups draw the
+    second along. What breaks off all round from one of them is wrong.
+    """
     p = seen.points
     thin = np.arange(min(_THIN // 2, p - 1), p, _THIN)
     tree = cKDTree(seen.xyz[thin, :2])
     wide = thin[tree.query(seen.xyz[thin, :2], k=np.arange(1, min(_AROUND, len(thin)) + 1))[1]]
     at = tree.query(seen.xyz[:p, :2])[1]
+    clear, partly, size = _broken(seen, near, np.median(slopes[wide], axis=1)[at], wide, at)
+    bent, _, by_bent = _broken(seen, near, _bent_slopes(seen.xyz, thin, wide, at), wide, at)
+    number = np.zeros(p, np.int64)
+    for k, group in enumerate((*clear, *partly), 1):
+        number[group] = k
+    # What is known already is known as a whole: a part of it that breaks off from another slope is nothing new.
+    counts = np.bincount(number, minlength=len(clear) + len(partly) + 1)
+    for group in bent:
+        touched = np.unique(number[group])
+        touched = touched[touched > 0]
+        if (touched > len(clear)).all() and counts[touched].sum() == (number[group] > 0).sum():
+            clear = (*clear, group)
+            number[group] = -1
+            size[group] = by_bent[group]
+    return clear, tuple(group for group in partly if number[group[0]] > 0), size
+
+
+def _bent_slopes(
+    xyz: NDArray[np.float64], thin: NDArray[np.int64], wide: NDArray[np.int64], at: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Slopes at all points, shape (p, 2), of the robust paraboloid through the heights around the nearest of `thin`."""
+    found = np.empty((len(thin), 5))
+    size = np.empty(len(thin))
+    for begin in range(0, len(thin), _CHUNK):
+        some = slice(begin, begin + _CHUNK)
+        d = xyz[wide[some], :2] - xyz[thin[some], None, :2]
+        size[some] = np.abs(d).max(axis=(1, 2)) + 1e-300
+        x, y = np.moveaxis(d / size[some, None, None], 2, 0)
+        A = np.stack([np.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2], axis=2)
+        z = xyz[wide[some], 2] - np.median(xyz[wide[some], 2], axis=1)[:, None]
+        weight = np.ones_like(z)
+        for turn in range(_BENT_ROUNDS):
+            transposed = np.swapaxes(A * weight[..., None], 1, 2)
+            c = np.linalg.solve(transposed @ A + 1e-6 * np.eye(6), transposed @ z[..., None])
+            e = np.abs(z - (A @ c)[..., 0])
+            e /= np.median(e, axis=1)[:, None] / MEDIAN_1D + 1e-300
+            weight = huber(e, 1.0) if turn < _BENT_HUBER else geman_mcclure(e, 2.0)
+        found[some] = c[:, 1:, 0]
+    d = (xyz[: len(at), :2] - xyz[thin[at], :2]) / size[at, None]
+    sx, sy, xx, xy, yy = (found[at] / size[at, None]).T
+    return np.column_stack([sx + xx * d[:, 0] + xy * d[:, 1], sy + xy * d[:, 0] + yy * d[:, 1]])
+
+
+def _broken(
+    seen: Observations,
+    near: NDArray[np.int32],
+    slopes: NDArray[np.float64],
+    wide: NDArray[np.int64],
+    at: NDArray[np.int64],
+) -> tuple[tuple[NDArray[np.int64], ...], tuple[NDArray[np.int64], ...], NDArray[np.float64]]:
+    """Groups that break off from the slopes (p, 2) around all points."""
+    p = seen.points
     off, middle = np.empty(near.shape), np.empty(p)
-    differences(seen.xyz, near, np.median(slopes[wide], axis=1)[at], off, middle)
+    differences(seen.xyz, near, slopes, off, middle)
     scale = np.median(np.nan_to_num(middle)[wide], axis=1)[at] / MEDIAN_1D
     scale = np.maximum(scale, finest(seen))
     label, border = np.empty(p, np.int64), np.empty((p, 6))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.chances import reach_t
 from photoplan.cameras.base import Camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
@@ -99,6 +100,14 @@ class Resected:
     def rms(self) -> float:
         """Root mean square of the residuals of one coordinate over the points that take part, pixels."""
         return float(np.sqrt((self.residuals[~self.rejected] ** 2).mean()))
+
+    @property
+    def reach_95(self) -> float:
+        """Standard deviations within which 95 % of the errors lie: more than 1.96, since few points tell sigma0 badly.
+
+        NaN without redundancy.
+        """
+        return reach_t(0.95, self.redundancy)
 
 
 #: The camera in ground coordinates that a pose makes: with earth curvature and refraction.

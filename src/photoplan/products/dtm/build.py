@@ -294,13 +294,14 @@ def _totals(built: Built, measured: MeasuredTerrain, findings: Sequence[Finding]
         "sigma": built.sigma if np.isfinite(built.sigma) else None,
         "spread": float(z.std()) if len(z) else None,
         "calibration": [_class(c, fit.seen.spacing) for c in fit.calibration.classes if c.count],
+        "calibration_by_bend": [_class(c, 1.0) for c in fit.calibration.bends if c.count],
         "gross": gross,
         "findings": len(findings),
     }
 
 
 def _class(found: ClassFigures, spacing: float) -> dict[str, Any]:
-    """What was held out at some distances to data (metres), as plain values; `to` None: and further."""
+    """What was held out in a class, as plain values: distances in metres (`to` None: and further), or parts of 1."""
     to = found.furthest * spacing
     return {
         "from": round(found.nearest * spacing, 4),

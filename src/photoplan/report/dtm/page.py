@@ -124,25 +124,38 @@ def _fit(facts: BuildFacts) -> list[str]:
             "it after the same plane is taken away (line).",
         ),
         *([f"<p><strong>{text(facts.covariance.warning)}</strong></p>"] if facts.covariance.warning else []),
-        *_held_out(facts.calibration),
+        *_held_out(facts),
     ]
 
 
-def _held_out(classes: Sequence[ClassFigures]) -> list[str]:
+def _held_out(facts: BuildFacts) -> list[str]:
     """What blocks that were held out say of the standard deviations."""
-    rows: list[list[str | Cell]] = []
-    for c in classes:
-        where = f"{c.nearest:.3g} to {c.furthest:.3g} m" if np.isfinite(c.furthest) else f"over {c.nearest:.3g} m"
-        after = f"{c.after:.2f}" if c.enough else "too few blocks"
-        words = (_number(c.count), _number(c.blocks), f"{c.before:.2f}", after)
-        rows.append([where, *(Cell(word, number=True) for word in words)])
-    if not rows:
+    if not facts.calibration:
         return []
+    parts = [f"{100 * (c.furthest - c.nearest):.0f} %" for c in facts.bends]
+    words = ("weakest", *("next" for _ in parts[2:]), "strongest")
+    bends = [(f"{word} {part}", c) for word, part, c in zip(words, parts, facts.bends)]
     return [
         "<p>Blocks of heights were held out and predicted from all others. Their errors, divided by the standard "
         "deviations, have this spread (1: standard deviations are right; more: they are too small):</p>",
-        table(["distance to data", "heights", "blocks", "as predicted", "as stated in the model"], rows),
+        _classes("distance to data", [(_distances(c), c) for c in facts.calibration]),
+        "<p>The same by curvature of the ground. Nothing is corrected by it: at edges and crests without lines, "
+        "standard deviations may be too small.</p>",
+        _classes("curvature", bends),
     ]
+
+
+def _distances(c: ClassFigures) -> str:
+    return f"{c.nearest:.3g} to {c.furthest:.3g} m" if np.isfinite(c.furthest) else f"over {c.nearest:.3g} m"
+
+
+def _classes(what: str, named: Sequence[tuple[str, ClassFigures]]) -> str:
+    rows: list[list[str | Cell]] = []
+    for where, c in named:
+        after = f"{c.after:.2f}" if c.enough else "too few blocks"
+        words = (_number(c.count), _number(c.blocks), f"{c.before:.2f}", after)
+        rows.append([where, *(Cell(word, number=True) for word in words)])
+    return table([what, "heights", "blocks", "as predicted", "as stated in the model"], rows)
 
 
 def _effect(facts: BuildFacts) -> list[str]:

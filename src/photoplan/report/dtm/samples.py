@@ -134,6 +134,8 @@ class BuildFacts:
     covariance: CovarianceTest
     calibration: tuple[ClassFigures, ...]
     """What standard deviations are worth by distance to data; distances in metres."""
+    bends: tuple[ClassFigures, ...]
+    """The same by how much the ground bends."""
     effects: tuple[FilterEffect, ...]
     gross: tuple[PlottedError, ...]
     suspects: tuple[PlottedError, ...] = ()
@@ -181,6 +183,7 @@ def build_facts(
             for c in fit.calibration.classes
             if c.count
         ),
+        bends=tuple(c for c in fit.calibration.bends if c.count),
         effects=_effects(built, measured, surface),
         gross=_errors(built, measured, surface, fit.gross, fit.residuals[fit.gross]),
         suspects=_errors(built, measured, surface, fit.suspects[:, 0].astype(np.int64), fit.suspects[:, 2:]),

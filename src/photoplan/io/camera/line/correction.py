@@ -28,11 +28,15 @@ class _SplineEntries(Entry):
     sigma: tuple[_Row, ...] | None = None
 
 
+#: What is larger is no error of a mount but another mount, which belongs into the strip.
+_Turn = Annotated[Number, Field(ge=-10.0, le=10.0)]
+
+
 class CorrectionFile(Entry):
     """A whole file."""
 
     format: Literal["photoplan line correction 1"]
-    boresight_deg: Triple = (0.0, 0.0, 0.0)
+    boresight_deg: tuple[_Turn, _Turn, _Turn] = (0.0, 0.0, 0.0)
     lever_arm_m: Triple = (0.0, 0.0, 0.0)
     time_offset_s: Number = 0.0
     covariance: Annotated[tuple[Number, ...], Field(max_length=28)] | None = None
