@@ -4,9 +4,9 @@
 
 One real aerial frame, enlarged 6 and 12 times; cubic, three bands, uncompressed, no overviews, one thread where the
 program lets itself be told. Whole processes are measured, from start to end. Runs of the programs alternate, medians
-are compared. Whatever is missing (a program, the data) is named and its rows are left out. Terrain models from
-measured points (terrain.py), orientation (orientation.py), the rate of filters (filter.py), mosaics (mosaics.py; otb.py
-beside OTB) and views (views.py) follow.
+are compared. Whatever is missing (a program, the data) is named and its rows are left out. A satellite image
+(satellite.py), terrain models from measured points (terrain.py), orientation (orientation.py), the rate of filters
+(filter.py), mosaics (mosaics.py; otb.py beside OTB) and views (views.py) follow.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from owners import report_owners
 from planning import report_planning
 from prepare import DATA, LARGE, SMALL, WORK, Source, prepare
 from programs import Bounds, Missing, Program, gdalwarp, orthority, photoplan
+from satellite import report_satellite
 from terrain import report_terrain
 from views import report_views
 
@@ -212,6 +213,7 @@ def main() -> int:
             results["sizes"].append(compare_at(source, entries))
             report(results["sizes"][-1])
     WORK.mkdir(exist_ok=True)
+    results["satellite"] = report_satellite(1 if options.quick else options.repeat)
     results["owners"] = report_owners()
     results["oblique"] = report_oblique(options.repeat)
     results["filter"] = report_filter(options.quick)
