@@ -111,7 +111,8 @@ class Scene:
             found += (f"{self.reader.path.name}: {step.describe()}",)
         balanced = self.reader.step(BalanceStep)
         if balanced is not None:
-            found += (f"{self.reader.path.name}: colours by {balanced.path.name}",)
+            # The same for all images of a block: many of them make one note.
+            found += (f"colours by the balance files in {balanced.path.parent.name}",)
         return found
 
     @property

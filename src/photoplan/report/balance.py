@@ -90,7 +90,7 @@ def _maps(fig: Any, row: Any, pairs: Pairs) -> None:
         picture = axes.imshow(raster, cmap="viridis", vmin=0, vmax=max(most, 1e-9), interpolation="nearest")
         axes.set(xticks=[], yticks=[], title=f"Differences {word}")
         axes.grid(False)
-        fig.colorbar(picture, ax=axes, fraction=0.04)
+        fig.colorbar(picture, ax=axes, fraction=0.04, label="grey values")
 
 
 def _trend(fig: Any, axes: Any, report: BalanceReport, found: Balanced, k: int) -> None:
