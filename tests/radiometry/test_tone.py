@@ -51,6 +51,20 @@ def test_pixels_do_not_depend_on_the_window() -> None:
     assert whole[0, 7, 11] == np.rint(TONE.table(pixels[0, 7, 11] / trend))
 
 
+def test_the_kernel_is_the_formula() -> None:
+    """Random tables of unequal steps, trends of any powers, pixels before and beyond the table, NaN."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        grey = np.cumsum(rng.uniform(0.5, 60, rng.integers(2, 9))) - 30
+        terms = tuple((int(i), int(j), float(c)) for i, j, c in zip(*rng.integers(0, 5, (2, 4)), rng.normal(0, 1, 4)))
+        tone = Tone(tuple(grey.tolist()), tuple(np.cumsum(rng.uniform(0, 60, len(grey))).tolist()), terms)
+        pixels = rng.uniform(-90, 400, (1, 30, 40)).astype(np.float32)
+        pixels[0, 3, 5] = np.nan
+        y, x = np.mgrid[:30, :40]
+        expected = tone.table(pixels[0] / tone.trend(x, y, SIZE))
+        np.testing.assert_allclose(toned(pixels, Window(0, 0, *SIZE), SIZE, [tone])[0], expected, rtol=2e-6, atol=1e-4)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.float32])
 def test_integers_are_rounded_and_kept_in_their_range(dtype: type) -> None:
     steep = Tone((0.0, 100.0), (-50.0, 450.0 if dtype == np.uint8 else 90_000.0))

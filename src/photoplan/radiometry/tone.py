@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.kernels.tone import tone_pixels
 
 _Floats = NDArray[np.float64]
 
@@ -86,11 +87,7 @@ def surface(x: ArrayLike, y: ArrayLike, size: tuple[int, int], powers: Sequence[
     half = np.hypot(*size) / 2
     u = (np.asarray(x, float) - (size[0] - 1) / 2) / half
     v = (np.asarray(y, float) - (size[1] - 1) / 2) / half
-    edge = np.array(size) / 2 / half
-    found = []
-    for i, j in powers:
-        means = [0.0 if power % 2 else e**power / (power + 1) for power, e in zip((i, j), edge.tolist())]
-        found.append(u**i * v**j - means[0] * means[1])
+    found = [u**i * v**j - _mean((i, j), size) for i, j in powers]
     return np.stack(found, axis=-1) if found else np.empty((*np.broadcast_shapes(u.shape, v.shape), 0))
 
 
@@ -116,13 +113,27 @@ def toned(pixels: NDArray[Any], window: Window, size: tuple[int, int], tones: Se
             out[band] = table[pixels[band].astype(np.int64) - limits.min]
             continue
         grey = pixels[band].astype(np.float64)
-        if tone.terms:
-            x, y = (
-                start + np.arange(count) for start, count in ((window.col, window.width), (window.row, window.height))
-            )
-            grey /= tone.trend(x[None, :], y[:, None], size)
-        out[band] = fitted(tone.table(grey), pixels.dtype)
+        corner, factors = (window.col, window.row), _factors(tone.terms, size)
+        tone_pixels(grey, corner, size, factors, LEAST, np.array(tone.grey), np.array(tone.becomes))
+        out[band] = fitted(grey, pixels.dtype)
     return out
+
+
+def _factors(terms: Sequence[tuple[int, int, float]], size: tuple[int, int]) -> _Floats:
+    """Of uⁱ vʲ in a trend, whose mean over the image is 1."""
+    out = np.zeros((1 + max((i for i, _, _ in terms), default=0), 1 + max((j for _, j, _ in terms), default=0)))
+    out[0, 0] = 1.0
+    for i, j, c in terms:
+        out[i, j] += c
+        out[0, 0] -= c * _mean((i, j), size)
+    return out
+
+
+def _mean(powers: tuple[int, int], size: tuple[int, int]) -> float:
+    """Mean of uⁱ vʲ over the image."""
+    edge = np.array(size) / np.hypot(*size)
+    one, other = (0.0 if k % 2 else e**k / (k + 1) for k, e in zip(powers, edge.tolist()))
+    return float(one * other)
 
 
 def fitted(values: _Floats, dtype: np.dtype[Any]) -> NDArray[Any]:
