@@ -33,7 +33,7 @@ def test_the_covariance_of_a_shift_is_carried_to_the_ground(tmp_path: Path) -> N
     C = np.array([[4.0, 0.8], [0.8, 1.0]])
     found, T = accuracy_of(known(tmp_path, f"covariance = [{C[0, 0]}, {C[1, 0]}, {C[1, 1]}]"))
     row, col = found.shape[1] // 2, found.shape[2] // 2
-    X, Y = T * (col + 0.5, row + 0.5)
+    X, Y = T @ (col + 0.5, row + 0.5)
     camera = RpcCamera(small(), GeodeticGround(CRS, "ellipsoidal"), SIZE)
     inverse = np.linalg.inv(camera.derivatives(np.array([[X, Y, 300.0]]))[0, :, :2])
     ground = inverse @ C @ inverse.T

@@ -150,9 +150,8 @@ def test_fault_23_ground_beyond_the_polynomials_is_not_made_up(tmp_path: Path) -
     assert told.code == 3 and "height" in told.err, told.err
 
 
-@pytest.mark.parametrize(
-    "dtype", ["uint16", *(pytest.param(name, marks=pytest.mark.slow) for name in ("float32", "int16"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["uint16", "float32", "int16"])
 def test_fault_24_types_are_kept(tmp_path: Path, dtype: str) -> None:
     low, high = (-1234, 3210) if dtype == "int16" else (17, 51234)
     values = np.full((2, SIZE[1], SIZE[0]), low, dtype)
