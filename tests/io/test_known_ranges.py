@@ -169,6 +169,16 @@ def test_without_a_place_nothing_is_kept(terrain: Path, reads: list[Window], mon
     assert no_folder.read_text() == ""
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes in folders")
+def test_a_pipe_in_its_place_is_not_waited_for(terrain: Path, reads: list[Window]) -> None:
+    first = ranges(terrain)
+    path = kept(terrain)
+    path.unlink()
+    os.mkfifo(path)
+    np.testing.assert_array_equal(ranges(terrain), first)
+    assert path.is_file() and len(reads) == 40
+
+
 def test_small_terrain_is_not_kept(terrain: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(known_ranges, "WORTH_KEEPING", COLUMNS * ROWS + 1)
     ranges(terrain)

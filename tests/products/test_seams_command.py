@@ -90,6 +90,9 @@ def test_dry_run_existing_files_and_single_images(block: Block, capsys: pytest.C
     assert said.code == 2 and "exists already" in said.err and path.read_bytes() == before
     said = photoplan("seams", block.project, "--images", NAMES[0], "-o", block.folder / "one.gpkg")
     assert said.code == 3 and "two at least" in said.err
+    there = sorted(block.folder.rglob("*"))
+    said = photoplan("seams", block.project, "-o", block.folder / "seams.tif", "--dry-run")
+    assert said.code == 2 and ".gpkg" in said.err and sorted(block.folder.rglob("*")) == there
 
 
 def regions_of(path: Path) -> dict[str, bytes]:

@@ -74,3 +74,5 @@ def test_without_sky_there_is_none(ridge: Path, tmp_path: Path) -> None:
     assert len(found.points) == 0
     said = inside("view", "skyline", ridge, "--from", 0, 0, "--azimuth", 0, "-o", tmp_path / "none.csv")
     assert said.code == 2 and "exists already" in said.err
+    said = inside("view", "skyline", "no.tif", "--from", 0, 0, "--azimuth", 0, "-o", tmp_path / "line.txt")
+    assert said.code == 2 and ".gpkg" in said.err

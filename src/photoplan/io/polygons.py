@@ -133,6 +133,18 @@ def label_polygons(labels: NDArray[np.int32], grid: MapGrid) -> dict[int, Any]:
     return {value: shapely.MultiPolygon(found) for value, found in sorted(parts.items())}
 
 
+def check_vectors(path: Path) -> None:
+    """Refuse a name that `write_features` would not write, before anything is computed for it.
+
+    Raises
+    ------
+    UsageError
+        The name does not end with `.gpkg`.
+    """
+    if path.suffix.lower() != ".gpkg":
+        raise UsageError(f"{path}: vectors are written as GeoPackage; give a name that ends with .gpkg")
+
+
 def write_features(
     path: Path, kind: str, shapes: Sequence[Any], columns: Mapping[str, NDArray[Any]], crs: str, layer: str
 ) -> None:
@@ -155,6 +167,5 @@ def write_features(
     ResourceError
         The disk is full.
     """
-    if path.suffix.lower() != ".gpkg":
-        raise UsageError(f"{path}: vectors are written as GeoPackage; give a name that ends with .gpkg")
+    check_vectors(path)
     write_geopackage(path, [VectorLayer(layer, kind, shapes, columns)], crs)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
 from photoplan.io.orientation.table import angle_in_radians
-from photoplan.io.polygons import read_features, write_features
+from photoplan.io.polygons import check_vectors, read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.project.image import ImageEntry
@@ -115,8 +115,8 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
     for path in (request.output, request.vectors):
         if path is not None:
             check_output(path, inputs, overwrite=request.overwrite)
-    if request.vectors is not None and request.vectors.suffix.lower() != ".gpkg":
-        raise UsageError(f"{request.vectors}: vectors are written as GeoPackage; give a name that ends with .gpkg")
+    if request.vectors is not None:
+        check_vectors(request.vectors)
     terrain = project.terrain and project.terrain.file
     ground_files = [terrain, *(objects.file for objects in project.objects)]
     used = [*inputs[:2], *(file and project.resolve(file) for file in ground_files)]

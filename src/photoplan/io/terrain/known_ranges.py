@@ -86,7 +86,8 @@ class KnownRanges:
         record, head = _record(layout), _MAGIC + key
         content = b""
         with suppress(OSError):
-            content = self.path.read_bytes()
+            if self.path.is_file():  # a pipe would be waited for
+                content = self.path.read_bytes()
         begun = content[: len(head)] == head
         body = content[len(head) :] if begun else b""
         size = record.itemsize

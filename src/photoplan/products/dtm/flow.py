@@ -18,7 +18,7 @@ from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.naming import together, when_named
-from photoplan.io.polygons import label_polygons, write_features
+from photoplan.io.polygons import check_vectors, label_polygons, write_features
 from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.plain import pick
@@ -116,8 +116,8 @@ def dtm_flow(request: FlowRequest, events: Events = SILENT) -> FlowReport:
             check_output(path, inputs, overwrite=request.overwrite)
     if request.catchments is not None and request.catchments.resolve() == request.output.resolve():
         raise UsageError(f"{request.output}: raster and catchments are the same file; give them two names")
-    if request.catchments is not None and request.catchments.suffix.lower() != ".gpkg":
-        raise UsageError(f"{request.catchments}: polygons are written as GeoPackage; give a name that ends with .gpkg")
+    if request.catchments is not None:
+        check_vectors(request.catchments)
     if not (math.isfinite(request.snap) and request.snap >= 0):
         raise UsageError(f"snap {request.snap} m; zero or a positive number of metres is needed")
     terrain = open_terrain(request.model, request.crs)

@@ -21,7 +21,7 @@ from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.io.disk import make_folder
 from photoplan.io.naming import together, when_named
-from photoplan.io.polygons import label_polygons
+from photoplan.io.polygons import check_vectors, label_polygons
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.regions import read_regions, write_regions
@@ -111,6 +111,7 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     names = project.select(request.images or None)
     files = [*input_files(project), *([request.keep] if request.keep else [])]
     check_output(request.path, files, overwrite=request.overwrite)
+    check_vectors(request.path)
     found = survey(project, names, request.resolution, events)
     notes = tuple(f"left out, sees no terrain: {line}" for line in found.blind)
     reading = _Reading(found)

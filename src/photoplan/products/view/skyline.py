@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from photoplan.io.polygons import write_features
+from photoplan.io.polygons import check_vectors, write_features
 from photoplan.io.product import check_output
 from photoplan.io.run_record import recording
 from photoplan.io.tables import write_table
@@ -88,6 +88,8 @@ def skyline(request: SkylineRequest) -> Skyline:
     for each in outputs:
         if each is not None:
             check_output(each, [name for name in inputs if name is not None], overwrite=request.overwrite)
+    if request.output.suffix.lower() != ".csv":
+        check_vectors(request.output)
     with recording("view skyline", request, inputs) as record:
         ground = open_view_ground(view.source, view.crs, view.water)
         camera = view_camera(camera_request(view), ground, view.force)
