@@ -52,7 +52,13 @@ def test_a_drift_makes_it_worse_towards_the_border(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("covariance", "told"), [("", "adjust"), ("covariance = [1.0, 3.0, 1.0]", "covariance")], ids=["unknown", "none"]
+    ("covariance", "told"),
+    [
+        ("", "adjust"),
+        ("covariance = [1.0, 3.0, 1.0]", "covariance is none"),
+        ("covariance = [1e300, 0.0, 1e300]", "± 1e+150 px"),
+    ],
+    ids=["unknown", "none", "absurd"],
 )
 def test_what_is_not_known_is_said(tmp_path: Path, covariance: str, told: str) -> None:
     words = ("--resolution", PIXEL, "--no-quicklook", "--accuracy")

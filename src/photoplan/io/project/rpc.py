@@ -16,6 +16,9 @@ from photoplan.io.project.image import ImageEntry, InputName, plain_file
 #: What `rpc` says if the image file holds them itself.
 TAGS = "tags"
 
+#: Standard deviations of shift (pixels) and drift (pixels per pixel) beyond which nothing is known of an image.
+_MOST_DEVIATION = (1e6, 1e6, 1.0, 1.0, 1.0, 1.0)
+
 
 class RpcImage(ImageEntry):
     """One image whose geometry a file of rational polynomials states, or the image file itself."""
@@ -76,6 +79,12 @@ class RpcImage(ImageEntry):
         C = np.zeros((size, size))
         C[np.tril_indices(size)] = self.covariance
         scale = np.sqrt(np.maximum(np.diag(C), 1e-300))
+        odd = scale > np.array(_MOST_DEVIATION)[:size]
+        if odd.any():
+            raise InputError(
+                f"image {self.name!r}: covariance says ± {scale[odd][0]:.3g} {'px' if odd[:2].any() else 'px per px'}: "
+                "that is no accuracy; is it that of its polynomials?"
+            )
         values, axes = np.linalg.eigh((np.tril(C) + np.tril(C, -1).T) / np.outer(scale, scale))
         if values[0] < -1e-3:
             raise InputError(f"image {self.name!r}: covariance is none; `photoplan adjust` writes it")
