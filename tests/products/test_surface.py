@@ -70,7 +70,7 @@ def judge(scene: Scene, folder: Path) -> Judged:
 
 @pytest.fixture(scope="module")
 def made(scene: Scene) -> Path:
-    clouds = [word for kind in CLOUDS for word in ("--points", scene.path.parent / f"points{kind}")]
+    clouds = [word for kind in CLOUDS for word in ("--points", scene.path.parent / "clouds" / f"points{kind}")]
     report = scene.path.parent / "report.html"
     with drawn():
         said = surface(scene, "--start", GROUND, "--json", "--residuals", *clouds, "--report", report)
@@ -111,7 +111,7 @@ def test_residuals_of_a_surface_that_fits(made: Path) -> None:
 
 @pytest.mark.parametrize("kind", CLOUDS)
 def test_points_of_a_surface(made: Path, kind: str) -> None:
-    path = made.parent / f"points{kind}"
+    path = made.parent / "clouds" / f"points{kind}"
     if kind == ".ply":
         head, _, body = path.read_bytes().partition(b"end_header\n")
         assert b"element vertex 000000001025\n" in head and b"property float sigma" in head

@@ -23,7 +23,7 @@ from photoplan.products.view.camera import CameraRequest, view_camera
 from photoplan.products.view.ground import open_view_ground
 from photoplan.products.view.job import seen_surface
 from photoplan.products.view.make import ViewRequest
-from photoplan.products.view.photo_skyline import PhotoSkylineRequest
+from photoplan.products.view.photo_skyline import PhotoSkylineRequest, doubt, turned
 from photoplan.products.view.skyline import Skyline, SkylineRequest, skyline
 from photoplan.surfaces.skyline import skyline_of
 from photoplan.targets.view import FrameBundle
@@ -98,6 +98,16 @@ def test_the_edge_is_found_to_a_part_of_a_pixel(mountains: tuple[Path, Path], tm
     column, row = (round(v) for v in found.points[240, :2])
     red, blue = picture[[0, 2], row - 2 : row + 3, column].astype(int)
     assert (np.abs(red - blue) > 60).any()  # both are coloured lines over a grey photograph
+
+
+def test_a_turn_beyond_the_rows_that_were_searched_is_doubted(mountains: tuple[Path, Path]) -> None:
+    target = view_camera(TRUE, open_view_ground(mountains[0]), force=True).target
+    XYZ = np.array([[501_500.0, 5_303_000.0, 900.0], [502_800.0, 5_303_500.0, 1100.0]])
+    now = turned(target, np.array([np.radians(5.0), 0.0, 0.0]))
+    rows = np.median(np.abs(now.to_view(XYZ)[:, 1] - target.to_view(XYZ)[:, 1]))
+    assert rows > 20
+    assert doubt(target, now, XYZ, round(rows + 2)) is None
+    assert "this standpoint" in (doubt(target, now, XYZ, round(rows - 2)) or "")
 
 
 def test_the_camera_is_turned_back_and_written(mountains: tuple[Path, Path], tmp_path: Path) -> None:

@@ -246,6 +246,12 @@ def test_the_word_panorama_looks_all_around_from_the_north(small: Block, tmp_pat
     a, b, c = (rasterio.open(tmp_path / f"{name}.png").read() for name in "abc")
     np.testing.assert_array_equal(a, b)
     assert (a != c).any()
+    said = inside("view", "panorama", small.terrain, "--from", X0, Y0, "--look-at", X0, Y0, "--dry-run")
+    assert said.code == 2 and "sphere" in said.err
+    for word in ("picture", "panorama"):
+        more = () if word == "panorama" else ("--size", 90, 20)
+        said = inside("view", word, small.project, "--camera", "one", *more, "--dry-run")
+        assert said.code == 2 and "an image is seen with its own camera" in said.err
 
 
 def test_an_input_that_changes_is_noticed(small: Block, tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def command(matrix: Path | None, output: Path, overwrite: bool, **options: Any) 
 
     With a photograph it is compared with the edge of the sky there, and the camera may be turned until both agree.
     """
-    from photoplan.cli.output import show, show_json
+    from photoplan.cli.output import say, show, show_json
     from photoplan.errors import UsageError
     from photoplan.products.view.photo_skyline import PhotoSkylineRequest
     from photoplan.products.view.skyline import SkylineRequest, skyline
@@ -59,6 +59,8 @@ def command(matrix: Path | None, output: Path, overwrite: bool, **options: Any) 
         show(f"{len(found.points)} of {found.columns} columns, {away.min():.0f} to {away.max():.0f} m away")
     for line in [] if found.match is None else told(found):
         show(line)
+    if found.match is not None and found.match.doubt is not None:
+        say(found.match.doubt)
 
 
 def told(found: Any) -> list[str]:

@@ -33,6 +33,8 @@ from photoplan.targets.base import Target
 
 #: Cameras are moved by so many standard deviations: far above rounding, and small where an angle is badly known.
 _STEP = 1 / 16
+#: Metres (or units of an angle or a camera's parameter) beyond which a standard deviation says nothing.
+_MOST_DEVIATION = 1e6
 _ANGLES = {"o": "omega", "p": "phi", "k": "kappa"}
 
 
@@ -86,6 +88,10 @@ def _deviations(project: Project, image: Image, camera: CameraEntry) -> Iterator
         )
     of_camera = camera.sigma or {}
     sigma = np.array([*image.sigma_center, *image.sigma_angles, *of_camera.values()])
+    if sigma.max() > _MOST_DEVIATION:
+        raise InputError(
+            f"image {image.name!r}: a standard deviation of {sigma.max():.3g} in orientation or camera is no accuracy"
+        )
     angles = (_ANGLES[letter] for letter in project.orientation.rotation)
     names = ["X0", "Y0", "Z0", *angles, *(f"camera {name}" for name in of_camera)]
     given = np.array(image.correlation or (), float)
@@ -273,6 +279,8 @@ def height_errors(project: Project) -> HeightErrors:
             "nothing is known of the accuracy of the terrain's heights: state sigma = METRES in [terrain], or a raster "
             "of standard deviations, or take a terrain model of `photoplan dtm build`, which holds them"
         )
+    if isinstance(project.ground.sigma, float) and project.ground.sigma > _MOST_DEVIATION:
+        raise InputError(f"[terrain]: sigma of {project.ground.sigma:.3g} m is no accuracy of heights")
     return found
 
 

@@ -129,7 +129,8 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
         raise UsageError(f"points {', '.join(map(str, plan.settings.points))}: one file twice; give each its own name")
     for path in written:
         check_output(path, [], overwrite=run.overwrite)
-    make_folder(folder)
+    for place in (folder, *(path.parent for path in plan.settings.points)):
+        make_folder(place)
     address = plan.address
     job = SurfaceJob(address, plan.grid, plan.scheme, plan.settings.start, plan.settings.residuals)
     inputs = tuple(str(Path(path).resolve()) for path, _ in address.digests)

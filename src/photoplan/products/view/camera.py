@@ -32,6 +32,13 @@ PANORAMAS = ("cylinder", "sphere")
 USUAL_REFRACTION = 0.13
 #: Sides of pictures, pixels.
 _LARGEST = 200_000
+#: What the camera of an image has of its own.
+_OF_STANDPOINT = (
+    *("height", "altitude", "look_at", "azimuth", "pitch", "roll", "field_of_view", "size", "pixel_aspect"),
+    "panorama",
+)
+#: Steepest middle of a panorama on a cylinder, radians: rows are tangents of it.
+_STEEPEST = math.radians(89.0)
 
 
 @dataclass(frozen=True)
@@ -78,6 +85,9 @@ class CameraRequest:
     def __post_init__(self) -> None:
         if (self.image is None) == (self.position is None):
             raise UsageError("a view needs one `camera`: an image of the project, or a standpoint `position` X Y")
+        own = [f.name for f in fields(self) if f.name in _OF_STANDPOINT and getattr(self, f.name) != f.default]
+        if self.image is not None and own:
+            raise UsageError(f"`{own[0]}` belongs to a standpoint `position`; an image is seen with its own camera")
         if self.aside is not None and self.image is None:
             raise UsageError("`aside` belongs to the camera of an image; a standpoint is moved by its `position`")
         numbers = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -284,6 +294,11 @@ def _bundle(
     if request.panorama:
         if request.roll:
             raise UsageError("a panorama has no `roll`")
+        if request.panorama == "cylinder" and abs(pitch) > _STEEPEST:
+            raise UsageError(
+                f"a cylinder does not reach what lies {math.degrees(abs(pitch)):.4g}° above or below; look less "
+                "steeply, or take the panorama `sphere`"
+            )
         scale = width / math.radians(request.field_of_view or 360.0)
         rise = pitch if request.panorama == "sphere" else math.tan(pitch)
         north = axes @ (0.0, 1.0, 0.0)

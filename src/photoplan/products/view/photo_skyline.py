@@ -101,6 +101,8 @@ class PhotoMatch:
     """The turn; None: none was asked for."""
     turn: _Floats | None = None
     """All of it, by `orientation.skyline.UNKNOWNS`, (3,) or (4,)."""
+    doubt: str | None = None
+    """What speaks against the turn; None: nothing."""
 
     @property
     def figures(self) -> dict[str, Any]:
@@ -154,7 +156,18 @@ def against_photo(
             break
         edge = _edge(request, reader, find(now, 0), search)
     match = _matched(request, reader, control, now, find(now, 0), search)
-    return first, replace(match, fit=found, turn=turn)
+    return first, replace(match, fit=found, turn=turn, doubt=doubt(target, now, match.line.XYZ, search))
+
+
+def doubt(stated: ViewTarget, now: ViewTarget, XYZ: _Floats, search: int) -> str | None:
+    """Of a camera whose skyline XYZ (n, 3) went round by round to an edge beyond `search` rows; None: it did not."""
+    rows = np.abs(now.to_view(XYZ)[:, 1] - stated.to_view(XYZ)[:, 1])
+    if not np.nanmedian(rows) > search:
+        return None
+    return (
+        f"the turn moves the skyline by {np.nanmedian(rows):.0f} rows, though its edge was looked for within {search}: "
+        "is it this standpoint, and does the photograph show this skyline?"
+    )
 
 
 def _turn(target: ViewTarget, turn: _Floats, line: Seen, edge: _Floats) -> SkylineFit:

@@ -74,9 +74,10 @@ def refined_camera(camera: ViewCamera, match: PhotoMatch, ground: ViewGround, pa
     if of_image and len(match.turn) > 3:
         factor = math.exp(match.turn[3])
         constant = factor, factor * math.sqrt(match.fit.covariance[3, 3])
-    text = _camera_text(camera.request, after)
     if of_image:
         text = _orientation_text(camera, ground, after, path, constant)
+    else:
+        text = _camera_text(camera.request, after)
     told = (tuple(float(v) for v in row[:count]) for row in (before, after, sigma))
     b, a, s = told
     return RefinedCamera(names[:count], b, a, s, unit, match.fit.used, match.fit.correlated, text, constant)

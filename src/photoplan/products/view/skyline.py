@@ -66,7 +66,7 @@ class Skyline:
         if self.before is not None and self.match is not None:
             out |= {"photo": self.before.figures, "control": self.match.control}
         if self.refined is not None and self.match is not None:
-            out |= {"refined": self.refined, "photo_refined": self.match.figures}
+            out |= {"refined": self.refined, "photo_refined": self.match.figures, "doubt": self.match.doubt}
         return out
 
 
