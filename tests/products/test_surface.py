@@ -180,6 +180,7 @@ def test_what_cannot_be_is_refused_by_name(scene: Scene, made: Path) -> None:
         (["--images", "i1"], 2, "two images at least"),
         (["--start", "nowhere.tif"], 2, "is no height and no file"),
         (["--reach", -1], 2, "positive number"),
+        (["--reach", 9000], 2, "height above the ground"),
         (["--name", "../x"], 2, "without folder"),
         (["--name", "x\ny"], 2, "without folder"),
         (["--name", "x" * 300], 2, "without folder"),

@@ -35,6 +35,8 @@ MOST_RATIO = 6
 _FINEST = 1.0
 #: How far the start may be wrong if nobody states it, part of the flying height.
 _WRONG = 0.1
+#: And if somebody does: a start between camera and ground is farther from the ground than from the camera.
+_MOST_WRONG = 3.0
 #: Pixels of parallax by which the coarsest level may begin wrong, and pixels along the shorter side of an image there.
 _CATCH, _LEAST = 1.0, 16
 #: How far the start of satellites may be wrong if nobody states it, pixels of parallax.
@@ -184,7 +186,13 @@ def plan_surface(
     base = max(0, math.ceil(math.log2(settings.resolution / gsd / MOST_RATIO)))
     ratio = max(1, round(settings.resolution / gsd / 2**base))
     height_error = _height_of_a_pixel(looked, gsd)
-    reach = settings.reach or _usual_reach(looked, height_error)
+    flying = _flying_height(looked)
+    if 0 < _MOST_WRONG * flying < (settings.reach or 0.0):
+        raise UsageError(
+            f"reach {settings.reach:g} m is more than {_MOST_WRONG:g} times the images' height above the ground, "
+            f"{flying:.3g} m"
+        )
+    reach = settings.reach or _WRONG * flying or _SOME * height_error
     coarsest = _coarsest(reach, looked, height_error, base)
     scheme = Scheme(ratio, coarsest, base, reach)
     wanted = reach > _RELIEF * height_error if settings.search is None else settings.search
@@ -295,14 +303,14 @@ def _slope(one: Looked, XY: np.ndarray) -> np.ndarray:
     return np.asarray(-np.linalg.solve(J[:, :2], J[:, 2]))
 
 
-def _usual_reach(looked: Sequence[Looked], height_error: float) -> float:
-    """A tenth of the flying height; of satellites, which are too far away for that, some pixels of parallax."""
+def _flying_height(looked: Sequence[Looked]) -> float:
+    """Median height of the images above the ground, metres; 0 for satellites, which are too far away for that."""
     heights = []
     for one in looked:
         low, high = one.look.footprint.height_range
         vantage = one.scene.camera.vantage
         heights.append(float(vantage.point[2]) - (low + high) / 2 if vantage.central else 0.0)
-    return _WRONG * float(np.median(heights)) or _SOME * height_error
+    return float(np.median(heights))
 
 
 def _search(looked: Sequence[Looked], pixel: float, reach: float, coarsest: int) -> Search:
