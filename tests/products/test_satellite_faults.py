@@ -94,6 +94,17 @@ def test_fault_09_a_virtual_raster_named_as_the_image(tmp_path: Path) -> None:
     assert "a.tif" in refused("ortho", project, "--resolution", PIXEL)
 
 
+def test_fault_14_a_scale_that_is_a_thousand_times_too_small(tmp_path: Path) -> None:
+    """Pixels would be needles, and their mean size on the ground would say nothing of it."""
+    project = written(tmp_path)
+    lines = (tmp_path / "rpc.txt").read_text().split("\n")
+    scale = next(float(line.split()[1]) for line in lines if line.startswith("LONG_SCALE"))
+    lines = [f"LONG_SCALE: {scale / 1000!r}" if line.startswith("LONG_SCALE") else line for line in lines]
+    (tmp_path / "rpc.txt").write_text("\n".join(lines))
+    said = inside("check", project)
+    assert said.code == 3 and "times longer than wide" in said.out
+
+
 def test_fault_14_longitude_and_latitude_exchanged(tmp_path: Path) -> None:
     """Nothing of the image is where the project is: said by name, and nothing is made."""
     project = written(tmp_path)

@@ -25,6 +25,9 @@ from photoplan.project.scene import map_order, open_scene
 #: Terrain displacements of curvature above this deserve a strict model, pixels.
 _CURVATURE_MATTERS = 0.3
 
+#: Pixels that are so many times longer than wide on the ground are none of a scanner.
+_LONGEST = 50.0
+
 
 @dataclass(frozen=True)
 class ImageCheck:
@@ -170,6 +173,9 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
     if tremor is not None:
         notes = (*notes, tremor.told(float(np.nanmean(seen.outline[:, 2]))))
     relief, curvature = _sensitivity(camera, seen)
+    longer = _longer(camera, seen)
+    if longer > _LONGEST:
+        fault = fault or f"its pixels are {longer:.0f} times longer than wide on the ground: is a scale wrong?"
     xmin, ymin, xmax, ymax = seen.bounds
     return ImageCheck(
         image=name,
@@ -183,6 +189,17 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
         fault=fault,
         notes=notes,
     )
+
+
+def _longer(camera: Camera, seen: Footprint) -> float:
+    """How many times longer than wide pixels are on the ground, at the median; 1 for central cameras."""
+    points = seen.outline[np.isfinite(seen.outline).all(axis=1)]
+    if camera.vantage.central or not len(points):
+        return 1.0
+    J = camera.derivatives(points)[..., :2]
+    J = J[np.isfinite(J).all(axis=(1, 2))]
+    wide = np.linalg.svd(J, compute_uv=False) if len(J) else np.ones((1, 2))
+    return float(np.median(wide[:, 0] / np.maximum(wide[:, 1], 1e-300)))
 
 
 def _sensitivity(camera: Camera, seen: Footprint) -> tuple[float, float]:
