@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tools.build_terrain import built, directly, line, scattered, terrain
 from tools.build_terrain import unit_of as unit_at
 from tools.random_field import random_field
+from tools.rough_terrain import dunes, sampled
 from tools.thinned import thinned
 
 from photoplan.surfaces.measured import MeasuredLine
@@ -41,7 +42,7 @@ def estimated(xyz: NDArray[np.float64], family: str) -> Covariance:
     leaves = quadtree(seen.xyz[:, :2], layout, 32)
     neighbours = Neighbours.of(seen.xyz[:, :2], seen.points, leaves.order)
     members = _members(unit_of(seen.xyz[:, :2], layout), layout.columns * layout.rows)
-    return estimate_all(seen, neighbours, members, settings)
+    return estimate_all(seen, neighbours, members, settings)[0]
 
 
 _FIELDS = [("matern", 3.0, 0.1, 1, 3000)]
@@ -199,3 +200,14 @@ class TestGrossErrors:
         xyz, _ = self.spoiled(roof)
         found = built(terrain(xyz, self.ridge()), gross=0.0).fit
         assert len(found.gross) == 0 and np.isfinite(found.residuals[:, 2]).mean() > 0.99
+
+
+def test_crests_that_few_blocks_meet_still_choose_a_rough_function() -> None:
+    """Leaves all over the area are asked too; smooth hills stay smooth."""
+    crests = built(terrain(sampled(dunes(4), scattered(200.0, 1600, 1), 0.1, 1)), adapt=100.0).fit
+    assert crests.whole.name == "matern"
+
+    def hills(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(2.0 * np.sin(xy[:, 0] / 9) * np.cos(xy[:, 1] / 7))
+
+    assert built(terrain(sampled(hills, scattered(60.0, 900, 1), 0.1, 1)), adapt=100.0).fit.whole.name == "gaussian"

@@ -156,8 +156,10 @@ class _PointBlocks:
 
 def estimate_all(
     seen: Observations, neighbours: Neighbours, members: Iterable[NDArray[np.int64]], settings: BuildSettings
-) -> Covariance:
+) -> tuple[Covariance, ...]:
     """The covariance function of the whole area, from blocks of some of its units; of the family that predicts best.
+
+    Where that is the smoothest of several, the next one follows: a few blocks may not meet the crests of an area.
 
     Parameters
     ----------
@@ -181,7 +183,8 @@ def estimate_all(
         found.append((scores, _covariance(family, logs)))
         if _clearly_better(found[best][0] - scores):
             best = len(found) - 1
-    return replace(found[best][1], ground=_ground(found, found[best][1].noise))
+    few = found[best : best + (2 if best == 0 else 1)]
+    return tuple(replace(one, ground=_ground(found, one.noise)) for _, one in few)
 
 
 def _ground(found: list[tuple[NDArray[np.float64], Covariance]], noise: float) -> float:

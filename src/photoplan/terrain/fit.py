@@ -29,6 +29,9 @@ _ROUNDS = 12
 #: Spacings at which data count a quarter for the roughness; points of a leaf from which it is judged whether roughness
 #: differs; the usual roughness counts as so many data.
 _ROUGH, _LEAST_OF_LEAF, _WEIGHTS = 3.0, 6, (1.0, 100.0)
+#: So many leaves say whether the ground is rougher than blocks of points say: by so much lower a mean of their scores,
+#: if those of such a part of them are lower; by the first functions of the ladder.
+_LEAVES, _GAIN, _SHARE, _STEPS = 128, 0.5, 0.4, 3
 #: With fewer points no one is a gross error.
 _FEWEST = 8
 #: While the stochastic model is estimated, the standard deviation of what looks like a gross error is so many times it.
@@ -112,21 +115,28 @@ def fit(
     if told is not trusted:
         near = Neighbours.of(told.xyz[:, :2], told.points, np.arange(told.points))
         subjects = _members(unit_of(told.xyz[:, :2], layout), count)
-    (whole,) = run(lambda subjects: estimate_all(told, near, subjects, settings), [subjects])
-    units = list(run(lambda u: estimate_unit(told, near, subjects[u], whole, settings), range(count)))
-    mass = np.array([unit.noise for unit in units])
-    found = TerrainFit(
+    first = TerrainFit(
         seen=seen,
         layout=layout,
         leaves=leaves,
         neighbours=neighbours,
+        whole=Covariance(0, 1.0, 1.0, 0.0),
+        units=(),
+        noise=np.empty(0),
+        shares=np.empty((len(leaves.half), len(LADDER))),
+        residuals=np.full((seen.points, 3), np.nan),
+        ground=np.zeros(count),
+        members=tuple(members),
+    )
+    (whole,) = run(lambda s: _of_leaves(first, trusted, estimate_all(told, near, s, settings)), [subjects])
+    units = list(run(lambda u: estimate_unit(told, near, subjects[u], whole, settings), range(count)))
+    mass = np.array([unit.noise for unit in units])
+    found = replace(
+        first,
         whole=whole,
         units=tuple(units),
         noise=trusted.noise(mass[unit_of_point]),
-        shares=np.empty((len(leaves.half), len(LADDER))),
-        residuals=np.full((seen.points, 3), np.nan),
         ground=whole.ground * mass**2,
-        members=tuple(members),
     )
     for u, shares in enumerate(run(lambda u: choose(found, leaves.of_unit(u)), range(count))):
         found.shares[leaves.of_unit(u)] = shares
@@ -190,19 +200,53 @@ def lines_of(
     return near_lines(found.seen, low, high)
 
 
+def _of_leaves(first: TerrainFit, trusted: Observations, candidates: tuple[Covariance, ...]) -> Covariance:
+    """Which of the functions, the smoothest first, predicts the points of leaves all over the area better.
+
+    Blocks of points are few, and leaves choose among lengths: crests are met, and seen as what they are.
+    """
+    leaves = first.leaves
+    some = np.flatnonzero(leaves.count > 0)
+    some = some[:: max(1, -(-len(some) // _LEAVES))]
+    scores = []
+    for one in candidates if len(candidates) > 1 and len(some) else ():
+        found = replace(
+            first, units=(one,) * len(first.ground), noise=trusted.noise(np.full(len(first.seen.xyz), one.noise))
+        )
+        score = np.concatenate(
+            [_scores(found, some[leaves.unit[some] == u], _STEPS) for u in np.unique(leaves.unit[some])]
+        )
+        least = score.min(axis=1)
+        with np.errstate(invalid="ignore"):  # no function has a solution
+            scores.append(least - 2 * np.log(np.exp((least[:, None] - score) / 2).mean(axis=1)))
+    if not scores:
+        return candidates[0]
+    with np.errstate(invalid="ignore"):
+        gain = scores[0] - scores[1]
+    gain = gain[np.isfinite(gain)]
+    return candidates[int(len(gain) > 0 and gain.mean() > _GAIN and (gain > 0).mean() > _SHARE)]
+
+
 def choose(found: TerrainFit, some: NDArray[np.int64]) -> NDArray[np.float64]:
     """Weights of the ladder's functions in the patches of some leaves, shape (patches, len(LADDER))."""
-    ids = found.neighbours.query(found.leaves.middle[some])
-    scores = np.zeros((len(some), len(LADDER)))
-    patches = patches_at(found.leaves, some)
-    lines = lines_of(found, patches, ids)
-    score_models(found.seen.xyz, found.noise, ids, patches, found.seen.points, *lines, found.models(some), scores)
-    scores[:, 1:][(scores == 0).all(axis=1)] = np.inf  # without points, the unit's own function
+    scores = _scores(found, some)
     scores -= np.where(np.isfinite(scores), scores, np.inf).min(axis=1, keepdims=True)
     weight = np.exp(-scores / 2)
     weight = np.where(np.isfinite(weight), weight, 0.0)
     weight[weight.sum(axis=1) == 0] = 1.0
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+
+def _scores(found: TerrainFit, some: NDArray[np.int64], steps: int = len(LADDER)) -> NDArray[np.float64]:
+    """How badly the ladder's functions predict the points of some leaves, shape (leaves, steps)."""
+    ids = found.neighbours.query(found.leaves.middle[some])
+    scores = np.zeros((len(some), steps))
+    patches = patches_at(found.leaves, some)
+    models = np.ascontiguousarray(found.models(some)[:, :steps])
+    lines = lines_of(found, patches, ids)
+    score_models(found.seen.xyz, found.noise, ids, patches, found.seen.points, *lines, models, scores)
+    scores[:, 1:][(scores == 0).all(axis=1)] = np.inf  # without points, the unit's own function
+    return scores
 
 
 def _test_all(found: TerrainFit, leaves: list[NDArray[np.int64]], run: Map) -> None:
