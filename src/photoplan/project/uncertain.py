@@ -14,17 +14,14 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Projection
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.camera.model import CameraEntry
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.project.file import parse_project
-from photoplan.io.project.image import ImageEntry
+from photoplan.io.project.image import Deviation, ImageEntry
 from photoplan.io.project.model import Project
-from photoplan.io.project.posed import Image
 from photoplan.plan.accuracy import DepthErrors, IndependentError, SourceErrors
 from photoplan.project.cameras import camera_of
 from photoplan.project.ground import Ground
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.posed import posed_camera
 from photoplan.project.scene import SceneAddress
 from photoplan.project.scenes import ScenesAddress, surface_of
 from photoplan.surfaces.height_errors import HeightErrors, RasterHeightErrors, StatedHeightErrors
@@ -33,9 +30,8 @@ from photoplan.targets.base import Target
 
 #: Cameras are moved by so many standard deviations: far above rounding, and small where an angle is badly known.
 _STEP = 1 / 16
-#: Metres (or units of an angle or a camera's parameter) beyond which a standard deviation says nothing.
+#: Metres beyond which a standard deviation of heights says nothing.
 _MOST_DEVIATION = 1e6
-_ANGLES = {"o": "omega", "p": "phi", "k": "kappa"}
 
 
 def source_errors(
@@ -57,88 +53,17 @@ def source_errors(
     InputError
         The project states no standard deviations of the image's orientation, or such of the camera that do not fit.
     """
-    if not isinstance(image, Image):
-
-        def by_entry(change: NDArray[np.float64]) -> Projection:
-            return camera_of(project, image.moved(change), ground, projection.size)
-
-        found = (
-            IndependentError(name, by_entry(_STEP * d), by_entry(-_STEP * d), _STEP) for name, d in image.deviations
-        )
-        return SourceErrors(projection, tuple(found), in_image)
-    camera = project.cameras[image.camera]
 
     def at(change: NDArray[np.float64]) -> Projection:
-        moved, entry = _moved(image, camera, change)
-        changed = project.model_copy(update={"cameras": {**project.cameras, image.camera: entry}})
-        return posed_camera(changed, moved, ground, projection.size)
+        moved, cameras = image.moved(change, project.cameras)
+        return camera_of(project.model_copy(update={"cameras": cameras}), moved, ground, projection.size)
 
-    causes = (
-        IndependentError(name, at(_STEP * d), at(-_STEP * d), _STEP) for name, d in _deviations(project, image, camera)
-    )
+    causes = (IndependentError(name, at(_STEP * d), at(-_STEP * d), _STEP) for name, d in _deviations(project, image))
     return SourceErrors(projection, tuple(causes), in_image)
 
 
-def _deviations(project: Project, image: Image, camera: CameraEntry) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Independent errors of centre, angles and camera, each one standard deviation large, with their names."""
-    if image.sigma_center is None or image.sigma_angles is None:
-        raise InputError(
-            f"image {image.name!r}: nothing is known of the accuracy of its orientation; `photoplan adjust` and "
-            "`resect` write sigma_center and sigma_angles, or state them in [[images]]"
-        )
-    of_camera = camera.sigma or {}
-    sigma = np.array([*image.sigma_center, *image.sigma_angles, *of_camera.values()])
-    if sigma.max() > _MOST_DEVIATION:
-        raise InputError(
-            f"image {image.name!r}: a standard deviation of {sigma.max():.3g} in orientation or camera is no accuracy"
-        )
-    angles = (_ANGLES[letter] for letter in project.orientation.rotation)
-    names = ["X0", "Y0", "Z0", *angles, *(f"camera {name}" for name in of_camera)]
-    given = np.array(image.correlation or (), float)
-    joined = {0: 0, 15: 6, len(sigma) * (len(sigma) - 1) // 2: len(sigma)}.get(len(given))
-    if joined is None:
-        raise InputError(
-            f"image {image.name!r}: correlation has {len(given)} numbers; 15 for centre and angles, or "
-            f"{len(sigma) * (len(sigma) - 1) // 2} for them and the {len(of_camera)} parameters of its camera"
-        )
-    R = np.eye(len(sigma))
-    R[:joined, :joined][np.tril_indices(joined, -1)] = given
-    values, axes = np.linalg.eigh(np.tril(R) + np.tril(R, -1).T)
-    if joined and values[0] < -1e-3:
-        raise InputError(f"image {image.name!r}: correlation is that of no covariance; `photoplan adjust` writes it")
-    together = "orientation" if joined <= 6 else "orientation and camera"
-    for value, axis in zip(values, axes.T):
-        k = int(np.argmax(np.abs(axis)))
-        yield (together if k < joined else names[k]), axis * np.sqrt(max(value, 0.0)) * sigma
-
-
-def _moved(image: Image, camera: CameraEntry, change: NDArray[np.float64]) -> tuple[Image, CameraEntry]:
-    """An image and its camera with other centre, angles and camera parameters."""
-    center, angles = (np.array(part) for part in image.pose_numbers)
-    update = {"center": tuple(center + change[:3]), "angles": tuple(angles + change[3:6])}
-    lens = {}
-    entries: dict[str, object] = {}
-    by_name = dict(zip(camera.sigma or {}, change[6:].tolist()))
-    for name, d in by_name.items():
-        if name == "c" and camera.camera_constant_mm is not None:
-            entries["camera_constant_mm"] = camera.camera_constant_mm + d
-        elif name == "c" and camera.pixels is not None:
-            fx, fy = camera.pixels.focal
-            entries["focal_px"] = (fx + d, fy * (fx + d) / fx)
-        elif name in type(camera.lens).model_fields and isinstance(getattr(camera.lens, name), float):
-            lens[name] = getattr(camera.lens, name) + d
-        elif name not in ("x0", "y0"):
-            raise InputError(
-                f"camera {image.camera!r}: sigma of {name!r}; allowed are c, x0, y0 and what its lens states"
-            )
-    d_point = np.array([by_name.get("x0", 0.0), by_name.get("y0", 0.0)])
-    if d_point.any() and camera.states_pixels and camera.pixels is not None:
-        entries["principal_point_px"] = tuple(camera.pixels.point + d_point)
-    elif d_point.any():
-        entries["principal_point_mm"] = tuple((camera.principal_point_mm or (0.0, 0.0)) + d_point)
-    if lens:
-        entries["lens"] = camera.lens.model_copy(update=lens)
-    return image.model_copy(update=update), camera.model_copy(update=entries)
+def _deviations(project: Project, image: ImageEntry) -> tuple[Deviation, ...]:
+    return image.deviations(project.cameras, project.orientation.rotation)
 
 
 @dataclass(frozen=True)
@@ -164,16 +89,13 @@ class ScenesErrors(Mapping[int, SourceErrors]):
         for scene in self.address.scenes:
             project = _project_of(scene)
             image = project.any_image(project.images[0].name)
-            known: list[object] = []
-            if isinstance(image, Image):
-                camera = project.cameras[image.camera]
-                known = [[(name, d.tolist()) for name, d in _deviations(project, image, camera)], camera.sigma]
-            else:
-                known = [[(name, d.tolist()) for name, d in image.deviations], None]
+            camera = image.described_by
+            known = [(name, d.tolist()) for name, d in _deviations(project, image)]
+            of_camera = None if camera is None else project.cameras[camera].sigma
             objects = [part.sigma for part in project.objects]
             sigma = project.ground.sigma
             ground = fingerprint(project.resolve(sigma)).digest if isinstance(sigma, str) else sigma
-            out.append([*known, ground, *objects])
+            out.append([known, of_camera, ground, *objects])
         return [out, list(self.in_image)]
 
     @property

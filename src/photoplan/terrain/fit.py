@@ -5,6 +5,7 @@ The area is cut into squares that hold few points each: every one is the core of
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -115,35 +116,36 @@ def fit(
     if told is not trusted:
         near = Neighbours.of(told.xyz[:, :2], told.points, np.arange(told.points))
         subjects = _members(unit_of(told.xyz[:, :2], layout), count)
-    first = TerrainFit(
-        seen=seen,
-        layout=layout,
-        leaves=leaves,
-        neighbours=neighbours,
-        whole=Covariance(0, 1.0, 1.0, 0.0),
-        units=(),
-        noise=np.empty(0),
-        shares=np.empty((len(leaves.half), len(LADDER))),
-        residuals=np.full((seen.points, 3), np.nan),
-        ground=np.zeros(count),
-        members=tuple(members),
-    )
-    (whole,) = run(lambda s: _of_leaves(first, trusted, estimate_all(told, near, s, settings)), [subjects])
-    units = list(run(lambda u: estimate_unit(told, near, subjects[u], whole, settings), range(count)))
-    mass = np.array([unit.noise for unit in units])
-    found = replace(
-        first,
-        whole=whole,
-        units=tuple(units),
-        noise=trusted.noise(mass[unit_of_point]),
-        ground=whole.ground * mass**2,
-    )
+
+    def untested(whole: Covariance, units: Sequence[Covariance]) -> TerrainFit:
+        mass = np.array([unit.noise for unit in units])
+        return TerrainFit(
+            seen=seen,
+            layout=layout,
+            leaves=leaves,
+            neighbours=neighbours,
+            whole=whole,
+            units=tuple(units),
+            noise=trusted.noise(mass[unit_of_point]),
+            shares=np.empty((len(leaves.half), len(LADDER))),
+            residuals=np.full((seen.points, 3), np.nan),
+            ground=whole.ground * mass**2,
+            members=tuple(members),
+        )
+
+    def of_all(some: Iterable[NDArray[np.int64]]) -> Covariance:
+        candidates = estimate_all(told, near, some, settings)
+        return _by_leaves([untested(one, [one] * count) for one in candidates])
+
+    (whole,) = run(of_all, [subjects])
+    found = untested(whole, list(run(lambda u: estimate_unit(told, near, subjects[u], whole, settings), range(count))))
     for u, shares in enumerate(run(lambda u: choose(found, leaves.of_unit(u)), range(count))):
         found.shares[leaves.of_unit(u)] = shares
     _test_all(found, [leaves.of_unit(u) for u in range(count)], run)
     if around is not None and screened is not None:
         events.begin("gross errors", unit="units")
-        suspects = _judge(found, around, screened, seen.noise(mass[unit_of_point]), settings.gross, run)
+        mass = np.array([unit.noise for unit in found.units])[unit_of_point]
+        suspects = _judge(found, around, screened, seen.noise(mass), settings.gross, run)
         _flag(found, around, screened, settings.gross, run)
         found = replace(found, suspects=_whole_groups(found, screened, suspects, settings.gross, run))
     return replace(found, usual=_usual(found))
@@ -200,31 +202,28 @@ def lines_of(
     return near_lines(found.seen, low, high)
 
 
-def _of_leaves(first: TerrainFit, trusted: Observations, candidates: tuple[Covariance, ...]) -> Covariance:
-    """Which of the functions, the smoothest first, predicts the points of leaves all over the area better.
+def _by_leaves(fits: list[TerrainFit]) -> Covariance:
+    """Function of the whole area by which leaves all over it are predicted better; fits, the smoothest function first.
 
     Blocks of points are few, and leaves choose among lengths: crests are met, and seen as what they are.
     """
-    leaves = first.leaves
+    leaves = fits[0].leaves
     some = np.flatnonzero(leaves.count > 0)
     some = some[:: max(1, -(-len(some) // _LEAVES))]
+    if len(fits) < 2 or not len(some):
+        return fits[0].whole
     scores = []
-    for one in candidates if len(candidates) > 1 and len(some) else ():
-        found = replace(
-            first, units=(one,) * len(first.ground), noise=trusted.noise(np.full(len(first.seen.xyz), one.noise))
-        )
+    for found in fits:
         score = np.concatenate(
             [_scores(found, some[leaves.unit[some] == u], _STEPS) for u in np.unique(leaves.unit[some])]
         )
         least = score.min(axis=1)
         with np.errstate(invalid="ignore"):  # no function has a solution
             scores.append(least - 2 * np.log(np.exp((least[:, None] - score) / 2).mean(axis=1)))
-    if not scores:
-        return candidates[0]
     with np.errstate(invalid="ignore"):
         gain = scores[0] - scores[1]
     gain = gain[np.isfinite(gain)]
-    return candidates[int(len(gain) > 0 and gain.mean() > _GAIN and (gain > 0).mean() > _SHARE)]
+    return fits[int(len(gain) > 0 and gain.mean() > _GAIN and (gain > 0).mean() > _SHARE)].whole
 
 
 def choose(found: TerrainFit, some: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from photoplan.terrain.covariance import Neighbours
 from photoplan.terrain.fit import TerrainFit, unit_of
 from photoplan.terrain.leaves import quadtree
 from photoplan.terrain.observations import Observations, lines_apart
+from photoplan.terrain.paraboloids import paraboloids
 from photoplan.terrain.predict import raw_at
 
 #: Half sides of blocks in spacings, as far as the model has such gaps.
@@ -89,10 +90,8 @@ def _bends(seen: Observations, some: NDArray[np.int64]) -> NDArray[np.float64]:
         return np.zeros(len(some))
     near = known[cKDTree(seen.xyz[known, :2]).query(seen.xyz[some, :2], k=np.arange(2, _BENT + 2))[1]]
     d = seen.xyz[near] - seen.xyz[some, None]
-    size = np.abs(d[..., :2]).max(axis=(1, 2))[:, None] + 1e-12 * seen.spacing
-    x, y = d[..., 0] / size, d[..., 1] / size
-    A = np.stack([np.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2], axis=-1)
-    second = (np.linalg.pinv(A, rcond=1e-6) @ d[..., 2:])[:, 3:, 0] / size**2
+    A, size = paraboloids(d[..., :2])
+    second = (np.linalg.pinv(A, rcond=1e-6) @ d[..., 2:])[:, 3:, 0] / size[:, None] ** 2
     return np.sqrt((second**2 * (1.0, 2.0, 1.0)).sum(axis=1))
 
 

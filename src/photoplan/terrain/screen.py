@@ -15,6 +15,7 @@ from photoplan.adjustment.robust import MEDIAN_1D, geman_mcclure, huber
 from photoplan.kernels.local_breaks import borders, differences, hang_together
 from photoplan.kernels.local_planes import fit_planes, local_scales, part_across
 from photoplan.terrain.observations import Observations
+from photoplan.terrain.paraboloids import paraboloids
 
 #: Neighbours of a plane, those of lines beside them, and those whose misfits tell what is usual here.
 _NEAR, _LINES, _WIDE = 14, 6, 32
@@ -239,10 +240,7 @@ def _bent_slopes(
     size = np.empty(len(thin))
     for begin in range(0, len(thin), _CHUNK):
         some = slice(begin, begin + _CHUNK)
-        d = xyz[wide[some], :2] - xyz[thin[some], None, :2]
-        size[some] = np.abs(d).max(axis=(1, 2)) + 1e-300
-        x, y = np.moveaxis(d / size[some, None, None], 2, 0)
-        A = np.stack([np.ones_like(x), x, y, x**2 / 2, x * y, y**2 / 2], axis=2)
+        A, size[some] = paraboloids(xyz[wide[some], :2] - xyz[thin[some], None, :2])
         z = xyz[wide[some], 2] - np.median(xyz[wide[some], 2], axis=1)[:, None]
         weight = np.ones_like(z)
         for turn in range(_BENT_ROUNDS):

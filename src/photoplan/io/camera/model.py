@@ -308,3 +308,34 @@ class CameraEntry(Entry, ABC):
         if self.camera_constant_mm is None:
             raise InputError("the lens is described in millimetres; give camera_constant_mm")
         return self.camera_constant_mm
+
+    def moved(self, change: Mapping[str, float], name: str) -> Self:
+        """It, called `name`, with what its `sigma` lists changed.
+
+        Raises
+        ------
+        InputError
+            One of the names is none of its.
+        """
+        lens: dict[str, float] = {}
+        entries: dict[str, object] = {}
+        for key, d in change.items():
+            if key == "c" and self.camera_constant_mm is not None:
+                entries["camera_constant_mm"] = self.camera_constant_mm + d
+            elif key == "c" and self.pixels is not None:
+                fx, fy = self.pixels.focal
+                entries["focal_px"] = (fx + d, fy * (fx + d) / fx)
+            elif key in type(self.lens).model_fields and isinstance(getattr(self.lens, key), float):
+                lens[key] = getattr(self.lens, key) + d
+            elif key not in ("x0", "y0"):
+                raise InputError(f"camera {name!r}: sigma of {key!r}; allowed are c, x0, y0 and what its lens states")
+        dx, dy = change.get("x0", 0.0), change.get("y0", 0.0)
+        if (dx or dy) and self.states_pixels and self.pixels is not None:
+            x, y = self.pixels.point
+            entries["principal_point_px"] = (x + dx, y + dy)
+        elif dx or dy:
+            x, y = self.principal_point_mm or (0.0, 0.0)
+            entries["principal_point_mm"] = (x + dx, y + dy)
+        if lens:
+            entries["lens"] = self.lens.model_copy(update=lens)
+        return self.model_copy(update=entries)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import Entry, Name, Pixels, Restore
+from photoplan.io.camera.model import CameraEntry, Entry, Name, Pixels, Restore
 from photoplan.io.names import check_input_name
+
+Deviation = tuple[str, NDArray[np.float64]]
+"""An error's name, and what it changes of the numbers that state a geometry."""
 
 InputName = Annotated[str, Field(max_length=4000)]
 
@@ -54,9 +57,15 @@ class ImageEntry(Entry, ABC):
         """What a user should know of its geometry, a clause each."""
         return ()
 
-    @property
-    def deviations(self) -> tuple[tuple[str, NDArray[np.float64]], ...]:
-        """Independent errors of its geometry: what each is called, and the entries' change of one standard deviation.
+    def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
+        """Independent errors of its geometry, each one standard deviation large.
+
+        Parameters
+        ----------
+        cameras : mapping
+            The project's descriptions of cameras: errors of its own are errors of its geometry too.
+        rotation : str
+            Sequence of angles, by their letters.
 
         Raises
         ------
@@ -65,8 +74,10 @@ class ImageEntry(Entry, ABC):
         """
         raise InputError(f"image {self.name!r}: its kind of geometry states no accuracy that a raster could be made of")
 
-    def moved(self, change: NDArray[np.float64]) -> ImageEntry:
-        """It with its geometry changed by a part of one of its `deviations`."""
+    def moved(
+        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
+    ) -> tuple[ImageEntry, Mapping[str, CameraEntry]]:
+        """It and the cameras with its geometry changed by a part of one of its `deviations`."""
         raise NotImplementedError
 
     @property

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import Fiducials, Name, NotNegative, Triple
-from photoplan.io.project.image import ImageEntry
+from photoplan.io.camera.model import CameraEntry, Fiducials, Name, NotNegative, Triple
+from photoplan.io.project.image import Deviation, ImageEntry
+
+#: Metres (or units of an angle or a camera's parameter) beyond which a standard deviation says nothing.
+_MOST_DEVIATION = 1e6
+_ANGLES = {"o": "omega", "p": "phi", "k": "kappa"}
 
 Correlation = tuple[Annotated[float, Strict(), Field(ge=-1, le=1)], ...]
 
@@ -49,6 +56,55 @@ class Image(ImageEntry):
     def described_by(self) -> str:
         """Its camera."""
         return self.camera
+
+    def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
+        """See `ImageEntry.deviations`: of centre, angles and camera."""
+        if self.sigma_center is None or self.sigma_angles is None:
+            raise InputError(
+                f"image {self.name!r}: nothing is known of the accuracy of its orientation; `photoplan adjust` and "
+                "`resect` write sigma_center and sigma_angles, or state them in [[images]]"
+            )
+        of_camera = cameras[self.camera].sigma or {}
+        sigma = np.array([*self.sigma_center, *self.sigma_angles, *of_camera.values()])
+        if sigma.max() > _MOST_DEVIATION:
+            raise InputError(
+                f"image {self.name!r}: a standard deviation of {sigma.max():.3g} in orientation or camera is no "
+                "accuracy"
+            )
+        names = ["X0", "Y0", "Z0", *(_ANGLES[letter] for letter in rotation), *(f"camera {name}" for name in of_camera)]
+        R, joined = self._correlations(len(of_camera))
+        values, axes = np.linalg.eigh(R)
+        if joined and values[0] < -1e-3:
+            raise InputError(f"image {self.name!r}: correlation is that of no covariance; `photoplan adjust` writes it")
+        together = "orientation" if joined <= 6 else "orientation and camera"
+        largest = np.abs(axes).argmax(axis=0)
+        return tuple(
+            (together if k < joined else names[k], axis * np.sqrt(max(value, 0.0)) * sigma)
+            for k, value, axis in zip(largest.tolist(), values, axes.T)
+        )
+
+    def _correlations(self, of_camera: int) -> tuple[NDArray[np.float64], int]:
+        """Correlation matrix of centre, angles and so many parameters of the camera; how many first ones it states."""
+        size, given = 6 + of_camera, np.array(self.correlation or (), float)
+        joined = {0: 0, 15: 6, size * (size - 1) // 2: size}.get(len(given))
+        if joined is None:
+            raise InputError(
+                f"image {self.name!r}: correlation has {len(given)} numbers; 15 for centre and angles, or "
+                f"{size * (size - 1) // 2} for them and the {of_camera} parameters of its camera"
+            )
+        R = np.eye(size)
+        R[:joined, :joined][np.tril_indices(joined, -1)] = given
+        return np.tril(R) + np.tril(R, -1).T, joined
+
+    def moved(
+        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
+    ) -> tuple[Image, Mapping[str, CameraEntry]]:
+        """See `ImageEntry.moved`."""
+        camera = cameras[self.camera]
+        center, angles = (np.array(part) for part in self.pose_numbers)
+        update = {"center": tuple(center + change[:3]), "angles": tuple(angles + change[3:6])}
+        by_name = dict(zip(camera.sigma or {}, change[6:].tolist()))
+        return self.model_copy(update=update), {**cameras, self.camera: camera.moved(by_name, self.camera)}
 
     @property
     def pose_numbers(self) -> tuple[Triple, Triple]:

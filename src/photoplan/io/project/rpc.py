@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated
 
 import numpy as np
@@ -10,8 +11,8 @@ from pydantic import Field, field_validator
 
 from photoplan.cameras.plane import Affine2D
 from photoplan.errors import InputError
-from photoplan.io.camera.model import Number, Pair
-from photoplan.io.project.image import ImageEntry, InputName, plain_file
+from photoplan.io.camera.model import CameraEntry, Number, Pair
+from photoplan.io.project.image import Deviation, ImageEntry, InputName, plain_file
 
 #: What `rpc` says if the image file holds them itself.
 TAGS = "tags"
@@ -67,8 +68,7 @@ class RpcImage(ImageEntry):
         x, y = self.shift
         return (f"polynomials are corrected by {x:+.2f}, {y:+.2f} px ({known})",)
 
-    @property
-    def deviations(self) -> tuple[tuple[str, NDArray[np.float64]], ...]:
+    def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
         """See `ImageEntry.deviations`: of shift and drift."""
         if self.covariance is None:
             raise InputError(
@@ -90,12 +90,14 @@ class RpcImage(ImageEntry):
             raise InputError(f"image {self.name!r}: covariance is none; `photoplan adjust` writes it")
         return tuple(("polynomials", a * scale * np.sqrt(max(v, 0.0))) for v, a in zip(values, axes.T))
 
-    def moved(self, change: NDArray[np.float64]) -> RpcImage:
+    def moved(
+        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
+    ) -> tuple[RpcImage, Mapping[str, CameraEntry]]:
         """See `ImageEntry.moved`."""
         x, y, *rest = (
             change + np.array([*(self.shift or (0.0, 0.0)), *(self.drift or (0.0,) * 4)])[: len(change)]
         ).tolist()
-        return self.model_copy(update={"shift": (x, y)} | ({"drift": tuple(rest)} if rest else {}))
+        return self.model_copy(update={"shift": (x, y)} | ({"drift": tuple(rest)} if rest else {})), cameras
 
     @property
     def correction(self) -> Affine2D | None:
