@@ -143,6 +143,9 @@ def test_shared_options_are_one_in_all_verbs() -> None:
         found = [p for c in VERBS.values() for p in c.params if isinstance(p, click.Option) and name in p.opts]
         assert len(found) > 2
         assert len({(tuple(p.opts), p.nargs, p.multiple, p.is_flag, p.name) for p in found}) == 1, name
+    for name, verb in VERBS.items():
+        for option in (p for p in verb.params if "--output" in p.opts):
+            assert option.opts == ["-o", "--output"], name
     without_talk = {name for name, command in VERBS.items() if "-q" not in options_of(command)}
     assert without_talk == set()
 

@@ -172,7 +172,7 @@ product_options = several(
     click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto]."),
     click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes]."),
     click.option("--tile", type=int, metavar="PX", help="Side of a tile [512]."),
-    click.option("--output", type=NEW_FOLDER, help="Folder of the products [PROJECT's folder/products]."),
+    click.option("-o", "--output", type=NEW_FOLDER, help="Folder of the products [PROJECT's folder/products]."),
     click.option(
         "--force", is_flag=True, help="Also of orientations with a FAULT, and finer than a quarter of the GSD."
     ),

@@ -92,7 +92,7 @@ def _refuse_measuring(given: str) -> None:
 @click.command("restore")
 @click.argument("images", nargs=-1, required=True, type=PATH, metavar="IMAGE…")
 @filter_options
-@click.option("--output", type=NEW_FOLDER, metavar="FOLDER",
+@click.option("-o", "--output", type=NEW_FOLDER, metavar="FOLDER",
               help="Folder of the results [restored, beside the first image].")  # fmt: skip
 @click.option("--band", "bands", multiple=True, type=click.IntRange(1), metavar="N",
               help="Restore this band; may be repeated [all]. Others stay as they are.")  # fmt: skip

@@ -12,7 +12,7 @@ from photoplan.cli.options import NEW_FOLDER, PATH, executing
 
 @click.command("run")
 @click.argument("plan", type=PATH)
-@click.option("--output", type=NEW_FOLDER, help="Folder of the products [as planned].")
+@click.option("-o", "--output", type=NEW_FOLDER, help="Folder of the products [as planned].")
 @executing
 def command(plan: Path, output: Path | None, **options: Any) -> None:
     """Execute PLAN, a GeoPackage written by `photoplan ortho PROJECT --plan PLAN`.

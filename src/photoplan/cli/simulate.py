@@ -25,7 +25,7 @@ _OF_PROJECTS = ("images", "texture", "grain", "truth", "resolution", "bounds")
 @click.option("--resolution", type=float, metavar="R", help="Also the scene's true orthophoto, ground pixel in metres.")
 @bounds_option
 @click.option("--model", type=PATH, metavar="FILE", help="Describes the camera [changes nothing].")
-@click.option("--output", type=PATH, metavar="PATH",
+@click.option("-o", "--output", type=PATH, metavar="PATH",
               help="TIFF to write [SCENE_simulated.tif]; a project's folder [its folder/rendered].")  # fmt: skip
 @click.option("--frames", type=int, metavar="N", help="Images to form; numbered files [1].")
 @click.option("--seed", type=int, metavar="N", help="Of all that is random [the model's, else 0].")

@@ -30,7 +30,7 @@ from photoplan.cli.options import NEW_FOLDER, PATH, bounds_option, dry_run_optio
 @click.option("--residuals", is_flag=True, help="Also the residuals of every image: NAME_residuals.tif.")
 @click.option("--report", type=PATH, metavar="HTML", help="Accuracy by classes, images and levels, with plots.")
 @click.option("--name", default="surface", metavar="NAME", help="Of the files [surface].")
-@click.option("--output", type=NEW_FOLDER, help="Folder of the files [PROJECT's folder/products].")
+@click.option("-o", "--output", type=NEW_FOLDER, help="Folder of the files [PROJECT's folder/products].")
 @click.option("--force", is_flag=True, help="Also of orientations with a FAULT.")
 @dry_run_option("Print the plan, and stop.")
 @executing
