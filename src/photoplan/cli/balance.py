@@ -26,7 +26,7 @@ _LISTED = 12
 @click.option("--resolution", type=float, metavar="R", help="Pixels that are compared, metres [by the images' size].")
 @click.option("-o", "--output", type=NEW_FOLDER, metavar="FOLDER", help="[balance by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not draw balance.png.")
-@ending("Look at the images and stop.", workers=True, memory=True)
+@ending("Look at the images and stop.", workers=True, executor=True, memory=True)
 def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> None:
     """Find tables by which the images of PROJECT agree in colour where they overlap.
 

@@ -131,10 +131,10 @@ def dry_run_option(what: str) -> Callable[..., Any]:
 
 
 def ending(
-    dry_run: str = "", *, workers: bool = False, memory: bool = False, overwrite: bool = True
+    dry_run: str = "", *, workers: bool = False, executor: bool = False, memory: bool = False, overwrite: bool = True
 ) -> Callable[..., Any]:
     """What the options of nearly every verb end with; `dry_run` says what happens instead."""
-    first = [workers_option] * workers + [memory_option] * memory
+    first = [workers_option] * workers + [executor_option] * executor + [memory_option] * memory
     first += [dry_run_option(dry_run)] * bool(dry_run) + [overwrite_option] * overwrite
     return several(*first, json_option, quiet_option)
 

@@ -17,7 +17,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--keep", type=PATH, metavar="FILE", help="Regions with their images that stay as they are.")
 @click.option("-o", "--output", type=PATH, metavar="FILE", help="[products/seams.gpkg by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not draw the regions.")
-@ending("Look at the images and stop.", workers=True, memory=True)
+@ending("Look at the images and stop.", workers=True, executor=True, memory=True)
 def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> None:
     """Find seams between the images of PROJECT where they are least seen.
 

@@ -130,7 +130,7 @@ class Work(Generic[T]):
     tiles: Sequence[Task]
     """Tiles that can hold something."""
     count: int
-    """All tiles; those that `tiles` leaves out are empty."""
+    """All tiles; those that `tiles` leaves out are empty. 0: there are none, `tiles` are items of a step."""
     sinks: Sequence[Sink]
     complete: Callable[[Tally], T]
     """Called when all tiles are there or have failed, with the sinks still open; in a thread of its own."""
@@ -263,7 +263,7 @@ class Runner(Generic[T]):
         if tally.resumed:
             self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
             self._events.done(tally.resumed)
-        if work.sinks:
+        if work.count:
             empty = np.ones(work.count, bool)
             for tile in work.tiles:
                 empty[tile.index] = False

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
-from photoplan.engine.executors import Workers, threads
+from photoplan.engine.cluster import Question
+from photoplan.engine.executors import Workers, open_workers
 from photoplan.engine.run import Made, Runner, Tally, Work
 from photoplan.errors import TilesFailed
 from photoplan.events import SILENT, Events
@@ -26,7 +28,7 @@ class Store(Protocol):
         ...
 
     def append(self, index: int, result: Any, /) -> None:
-        """Keep a result; called by workers."""
+        """Keep a result."""
         ...
 
     def __getitem__(self, index: int, /) -> Any:
@@ -51,28 +53,74 @@ class Item:
     pixels: int = 0
 
 
+@dataclass(frozen=True)
+class _Job:
+    """A function of the values of items, as workers get it."""
+
+    function: Callable[[Any], Any]
+
+    def __call__(self, item: Item) -> Made:
+        """Its result as the only layer of what is made."""
+        return Made(((self.function(item.value), None),))
+
+
+@dataclass(frozen=True, eq=False)
+class _Keeping:
+    """The sink of a step: a store, into which whatever is made of results goes."""
+
+    store: Store
+    kept: Callable[[Any], Any]
+    finished: frozenset[int] = frozenset()
+
+    def __enter__(self) -> _Keeping:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def append(self, index: int, pixels: Any, valid: Any, record: Any, /) -> None:
+        """Keep a result."""
+        self.store.append(index, self.kept(pixels))
+
+    def append_empty(self, index: int, record: Any = None, /) -> None:
+        """Steps have no empty items."""
+        raise NotImplementedError
+
+    def record(self, index: int) -> dict[str, Any]:
+        """Results have no figures."""
+        return {}
+
+
 class Steps:
     """A `map` by workers, for the steps of one product; the same calls in a later run find the results in the store.
 
     Parameters
     ----------
     workers : Workers
-        Threads: functions and items are handed over as they are.
+        To threads functions and items are handed over as they are; for processes and clusters they pickle.
     store : Store, optional
         Keeps results; None: they end with the process.
     root : str
         What results depend on beside the store's key.
+    scratch : Path, optional
+        Where results of a cluster may lie on their way.
     """
 
     def __init__(
-        self, name: str, workers: Workers, events: Events = SILENT, store: Store | None = None, root: str = ""
+        self,
+        name: str,
+        workers: Workers,
+        events: Events = SILENT,
+        store: Store | None = None,
+        root: str = "",
+        scratch: Path | None = None,
     ) -> None:
         self._name, self._workers, self._events, self._store, self._root = name, workers, events, store, root
-        self._calls = 0
+        self._scratch, self._calls = scratch, 0
 
     def under(self, root: str) -> Steps:
         """The same for calls whose results depend on more: on what `root` is a digest of."""
-        return Steps(self._name, self._workers, self._events, self._store, root)
+        return Steps(self._name, self._workers, self._events, self._store, root, self._scratch)
 
     def __call__(
         self,
@@ -80,6 +128,7 @@ class Steps:
         items: Iterable[Any],
         names: Sequence[object] | None = None,
         pixels: Callable[[Any], int] = lambda item: 0,
+        kept: Callable[[Any], Any] = lambda result: result,
     ) -> Iterator[Any]:
         """Results of a function of all items, in their order.
 
@@ -90,6 +139,8 @@ class Steps:
             and of the item.
         pixels : callable
             Those of an item, for the rate that is told.
+        kept : callable
+            What the store keeps of a result, found here and not by workers: of arrays where they are, for instance.
 
         Raises
         ------
@@ -104,13 +155,16 @@ class Steps:
         finished = store.finished
         tasks = [Item(k, value, pixels(value)) for k, value in zip(at, values, strict=True) if k not in finished]
         self._events.done(len(values) - len(tasks))
-
-        def job(task: Item) -> Made:
-            store.append(task.index, function(task.value))
-            return Made(())
-
-        # Whoever computes a result keeps it: there is no sink, and what was kept before is no task.
-        work: Work[None] = Work(name=self._name, job=job, tiles=tasks, count=0, sinks=(), complete=self._check)
+        # What was kept before is no task.
+        work: Work[None] = Work(
+            name=self._name,
+            job=_Job(function),
+            tiles=tasks,
+            count=0,
+            sinks=(_Keeping(store, kept),),
+            complete=self._check,
+            scratch=self._scratch,
+        )
         Runner[None](self._workers, None, self._events).run([work])
         return (store[index] for index in at)
 
@@ -123,9 +177,24 @@ class Steps:
 
 
 @contextmanager
-def steps(name: str, workers: int, events: Events = SILENT, store: Store | None = None) -> Iterator[Steps]:
-    """Steps by threads of this process, which end with the context."""
+def steps(
+    name: str,
+    workers: int,
+    events: Events = SILENT,
+    store: Store | None = None,
+    *,
+    executor: str = "threads",
+    question: Question | None = None,
+    scratch: Path | None = None,
+) -> Iterator[Steps]:
+    """Steps by workers that end with the context: threads of this process, or what `executor_factory` knows.
+
+    Parameters
+    ----------
+    question : Question, optional
+        What workers of a cluster are asked before any step.
+    """
     if store is not None and store.finished:
         events.talk(f"{name}: {len(store.finished)} results of an earlier run are kept")
-    with threads(workers) as pool:
-        yield Steps(name, pool, events, store)
+    with open_workers(executor, workers, question or Question(dict), events) as pool:
+        yield Steps(name, pool, events, store, scratch=scratch)

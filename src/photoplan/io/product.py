@@ -19,6 +19,7 @@ from photoplan.geometry.grid import Placement, Window
 from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.gdal import GDAL_ERRORS, first_cause, open_raster
 from photoplan.io.image_form import ImageForm, dress
+from photoplan.io.kept_tiles import KeptTiles
 from photoplan.io.lock import FileLock, lock_of
 from photoplan.io.naming import give_name, is_unfinished, standing, when_named
 from photoplan.io.plain_tiff import write_plain_tiff
@@ -40,7 +41,6 @@ class ProductFacts:
     path: Path
     """The file."""
     bytes: int
-    """Its size."""
     tiles: int
     """Tiles of the product."""
     empty_tiles: int
@@ -49,6 +49,8 @@ class ProductFacts:
     """Share of valid pixels, 0 to 1."""
     moved_values: int
     """Valid values that equalled nodata and became its neighbour."""
+    kept: str = ""
+    """What the run record keeps of its tiles, see `KeptTiles`; empty if nothing is asked for."""
 
 
 def check_output(path: Path, inputs: Sequence[Path | str] = (), *, overwrite: bool = False) -> None:
@@ -141,6 +143,8 @@ class ProductFile:
     valid; its description is the tag PHOTOPLAN_VIEW."""
     form: ImageForm | None = None
     """Of an image whose copy the product is: its names and colours of bands and its metadata are taken over."""
+    tiles: KeptTiles | None = None
+    """What decides each tile: those of the file that is replaced are taken over where it is the same."""
     _log: TileLog | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -178,6 +182,8 @@ class ProductFile:
             self._remove_parts()
             key = f"{self.run_key} {self.placement} {self._coder}"
             self._log = TileLog(self.log_path, key)
+            if self.tiles is not None and self.path.is_file():
+                self.tiles.take_over(self.path, self._windows, self._coder, self._log)
         except BaseException:
             self._lock.release()
             raise
@@ -379,6 +385,7 @@ class ProductFile:
             empty_tiles=sum(log.place(i)[1] == 0 for i in log.finished),
             valid_share=sum(count for _, count in notes) / self.placement.window.size,
             moved_values=sum(moved for moved, _ in notes),
+            kept="" if self.tiles is None else self.tiles.told(log),
         )
 
     def _unwritten(self, cause: str) -> ResourceError:

@@ -49,6 +49,15 @@ def log_of(path: Path) -> Path:
     return path.with_name(f".{path.name}.tiles")
 
 
+def checksum_of(payload: bytes | memoryview, figures: Mapping[str, Any] | None) -> int:
+    """What a log keeps of a tile to know it again."""
+    return zlib.crc32(payload, zlib.crc32(_text(figures)))
+
+
+def _text(figures: Mapping[str, Any] | None) -> bytes:
+    return json.dumps(figures).encode() if figures else b""
+
+
 class TileLog:
     """Finished tiles by their index; a context manager that closes the file and leaves it in place.
 
@@ -109,6 +118,10 @@ class TileLog:
         place = self._places[index]
         return place.position, place.length
 
+    def checksum(self, index: int) -> int:
+        """Of a tile's payload and figures, see `checksum_of`."""
+        return self._places[index].checksum
+
     def notes(self, index: int) -> tuple[int, int]:
         """The two whole numbers that were kept with a tile."""
         return self._places[index].notes
@@ -132,9 +145,8 @@ class TileLog:
 
         A tile that is there already is replaced.
         """
-        payload = memoryview(payload).cast("B")
-        text = json.dumps(figures).encode() if figures else b""
-        length, checksum = len(payload), zlib.crc32(payload, zlib.crc32(text))
+        payload, text = memoryview(payload).cast("B"), _text(figures)
+        length, checksum = len(payload), checksum_of(payload, figures)
         head = _RECORD.pack(_TILE, index, *notes, len(text), length, checksum)
         head += _CHECK.pack(zlib.crc32(head)) + text
         with self._lock:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from photoplan.engine.cluster import Question
 from photoplan.engine.execute import MOST_SOURCE_BYTES
 from photoplan.engine.executors import Workers, executor_factory
 from photoplan.engine.run import tiles_in_flight
 from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
-from photoplan.io.run_record import run_times
+from photoplan.io.run_record import run_times, versions
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 320 * 2**20
@@ -86,6 +87,11 @@ def _identity(path: Path) -> object:
         return state.st_dev, state.st_ino
     except OSError:
         return path.resolve()
+
+
+def question(files: Iterable[Path], folder: Path) -> Question:
+    """What workers of a cluster are asked: whether they see the files, and the folder of the product."""
+    return Question(versions, tuple(str(path.resolve()) for path in files), str(folder.resolve()))
 
 
 def clock(workers: Workers) -> Callable[[], dict[str, Any]]:

@@ -93,14 +93,34 @@ class Layer:
         return (i, j, m, n), values[:, j - col : j - col + n]
 
 
+@dataclass(frozen=True, eq=False)
+class Features:
+    """An image on pixels of one size, see `Layer`."""
+
+    row: int
+    col: int
+    values: _Floats
+    """(height, width, depth)."""
+
+    def kept(self, store: Store) -> Layer:
+        """The same in a store."""
+        height, width, depth = self.values.shape
+        return Layer(store.keep(self.values), (self.row, self.col, height, width), depth)
+
+
 def layers_of(image: Shown, store: Store) -> tuple[Layer, ...]:
     """An image on its own pixels, on those twice as large and so on till it has one."""
+    return tuple(each.kept(store) for each in features_of(image))
+
+
+def features_of(image: Shown) -> tuple[Features, ...]:
+    """The same before it is kept."""
     found = []
     while True:
         height, width = image.valid.shape
         place = np.where(image.valid, _from_middle(image.valid), np.nan)
         values = np.concatenate([_detail(image), place[..., None]], axis=-1).astype(np.float32)
-        found.append(Layer(store.keep(values), (image.row, image.col, height, width), values.shape[2]))
+        found.append(Features(image.row, image.col, values))
         if max(height, width) < 3:
             return tuple(found)
         image = image.halved()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +27,14 @@ from photoplan.targets.map import MapTarget
 _KERNEL, _TOLERANCE = "bilinear", 0.1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Reference:
-    """A raster on the map."""
+    """A raster on the map; small, and pickles: it is opened when it is asked for pixels."""
 
     path: Path
-    source: Source
+    crs: str
+    bounds: tuple[float, float, float, float]
+    """CRS and bounds of the map."""
     pixel: float
     """Side of its pixels, units of its CRS."""
 
@@ -39,7 +42,7 @@ class Reference:
         """What it holds for a window of the map, (bands, height, width), and where; None: nothing."""
         rule = AnchorRule.of(_KERNEL, _TOLERANCE)
         plan = ProductPlan("reference", ("reference",), MapTarget(grid), rule, Tiles.every(grid.window, 512))
-        made = render(plan, Tile(0, window), (self.source,), LevelSurface(0.0), _KERNEL)
+        made = render(plan, Tile(0, window), (_source(self),), LevelSurface(0.0), _KERNEL)
         if made.values is None or made.valid is None:
             return None
         return made.values.astype(np.float32), made.valid
@@ -62,6 +65,15 @@ def open_reference(path: Path, grid: MapGrid, bands: int, dtype: np.dtype[Any]) 
     placement = placement_of(reader.info)
     if placement.transform is None or placement.crs is None:
         raise InputError(f"{path}: no georeference or no CRS; a reference is a raster on the map")
-    carry = None if same_crs(placement.crs, grid.crs) else crs_step(grid.crs, placement.crs, grid.bounds)
     a, b = placement.coefficients[:2]
-    return Reference(path, Source(MapProjection(placement, carry), reader), float(np.hypot(a, b)))
+    return Reference(path, grid.crs, grid.bounds, float(np.hypot(a, b)))
+
+
+@lru_cache(maxsize=4)
+def _source(reference: Reference) -> Source:
+    reader = RasterReader(reference.path)
+    placement = placement_of(reader.info)
+    assert placement.crs is not None
+    apart = not same_crs(placement.crs, reference.crs)
+    carry = crs_step(reference.crs, placement.crs, reference.bounds) if apart else None
+    return Source(MapProjection(placement, carry), reader)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.engine.executors import executor_factory
 from photoplan.engine.run import tiles_in_flight
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
@@ -52,6 +53,8 @@ class BalanceRequest:
     """Side of the pixels that are compared, metres."""
     output: Path | None = None
     workers: int = 1
+    executor: str = "threads"
+    """Who looks at the images: ``threads``, ``processes`` or a Dask scheduler's address."""
     memory: int | None = None
     """Bytes the run should stay under; None: no bound but the tiles under way."""
     overwrite: bool = False
@@ -151,7 +154,7 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
 def _made(request: BalanceRequest, found: Survey, fixed: str | None, notes: list[str], events: Events) -> BalanceReport:
     """Tables of the images of a survey."""
     reference = _reference(request, found, notes)
-    cells = sample(found, reference, request.workers, events)
+    cells = sample(found, reference, request.workers, request.executor, events, request.folder)
     if reference is not None and not np.isfinite(cells.reference).any():
         raise GeometryError(f"{reference.path}: shows nothing of the ground that the images show")
     made, pairs = _adjusted(request, cells, found, fixed, events, notes)
@@ -171,7 +174,7 @@ def _keep(request: BalanceRequest, project: Project, report: BalanceReport, time
             request.table,
             key=run_key("balance", settings, inputs),
             inputs=inputs,
-            run={"workers": request.workers, "memory": request.memory, **times},
+            run={"workers": request.workers, "executor": request.executor, "memory": request.memory, **times},
             kind="balance",
             product=report,
             settings=settings,
@@ -225,6 +228,7 @@ def _plain(project: Project) -> Project:
 
 def _check(request: BalanceRequest, project: Project, names: Sequence[str]) -> str | None:
     """Name of the reference image, and everything that can be refused before any work."""
+    executor_factory(request.executor, request.workers)
     if len(names) < 2:
         raise UsageError(f"{len(names)} image; two at least are compared")
     if request.reference is not None and request.factor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ from photoplan.products.balance.reference import Reference
 from photoplan.products.orthophoto.look import Looked, look_at, two_figures
 from photoplan.products.orthophoto.mosaic import refuse_mixed
 from photoplan.products.orthophoto.shown import shown
+from photoplan.products.run import question
+from photoplan.project.scene import Scene, SceneAddress
 from photoplan.radiometry.cells import BLOCK, SIDE, Cells, cells_of
 from photoplan.surfaces.objects import painted_surface
 
@@ -94,45 +97,58 @@ def survey(project: Project, names: Sequence[str], resolution: float | None, eve
     return Survey(tuple(looked), tuple(blind), grid, Tiles.shared(taken))
 
 
-def sample(found: Survey, reference: Reference | None, workers: int, events: Events) -> Cells:
-    """What all images show, cell by cell; tiles are looked at one by one and forgotten."""
-    tiles = list(found.tiles)
-    events.begin("comparing", len(tiles), "tiles")
-    with steps("balance", workers, events) as run:
-        return Cells.joined(list(run(_Sampling(found, reference).cells, tiles, pixels=lambda tile: tile.pixels)))
+def sample(found: Survey, reference: Reference | None, workers: int, executor: str, events: Events, at: Path) -> Cells:
+    """What all images show, cell by cell; tiles are looked at one by one and forgotten. `at`: folder of the product."""
+    seen = [_Seen(tile, tuple(found.looked[row].scene.address for row in tile.sources)) for tile in found.tiles]
+    job = _Sampling(found.grid, found.tiles.side, found.looked[0].scene.reader.bands, reference)
+    events.begin("comparing", len(seen), "tiles")
+    files = [file for one in found.looked for file in one.scene.files]
+    asked = question(files if reference is None else [*files, reference.path], at)
+    with steps("balance", workers, events, executor=executor, question=asked, scratch=at / ".balance.parcels") as run:
+        return Cells.joined(run(job, seen, pixels=lambda each: each.tile.pixels))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
+class _Seen:
+    """A tile as a worker gets it, and the images that see a part of it."""
+
+    tile: Tile
+    scenes: tuple[SceneAddress, ...]
+
+
+@dataclass(frozen=True)
 class _Sampling:
     """From a tile to its cells."""
 
-    survey: Survey
+    grid: MapGrid
+    side: int
+    bands: int
     reference: Reference | None
 
-    def cells(self, tile: Tile) -> Cells:
+    def __call__(self, seen: _Seen) -> Cells:
         """Cells of a tile, with all images that see a part of it."""
+        tile, scenes = seen.tile, {row: address.open() for row, address in zip(seen.tile.sources, seen.scenes)}
         window, values, valid, rows = tile.window, [], [], []
-        for row in tile.sources:
-            made = shown(self.survey.looked[row], self.survey.grid, window, self.survey.tiles.side)
+        for row, scene in scenes.items():
+            made = shown(scene, self.grid, window, self.side)
             if made.values is not None and made.valid is not None:
                 values.append(made.values.astype(np.float32))
                 valid.append(made.valid)
                 rows.append(row)
         if not rows:
-            bands = self.survey.looked[0].scene.reader.bands
-            values, valid = [np.zeros((bands, 1, 1), np.float32)], [np.zeros((1, 1), bool)]
-        known = None if self.reference is None or not rows else self.reference.pixels(self.survey.grid, window)
+            values, valid = [np.zeros((self.bands, 1, 1), np.float32)], [np.zeros((1, 1), bool)]
+        known = None if self.reference is None or not rows else self.reference.pixels(self.grid, window)
         number = tile.index * _CELLS**2
         cells = cells_of(np.stack(values), np.stack(valid), np.array(rows or [0], np.int64), number, known)
         corner = np.array([window.col, window.row])
-        return self._placed(replace(cells, place=cells.place + corner, uv=cells.uv + corner.astype(np.float32)))
+        return self._placed(replace(cells, place=cells.place + corner, uv=cells.uv + corner.astype(np.float32)), scenes)
 
-    def _placed(self, cells: Cells) -> Cells:
+    def _placed(self, cells: Cells, scenes: dict[int, Scene]) -> Cells:
         """Cells with their places in the images instead of the map; those that have none are left out."""
         uv = np.full_like(cells.uv, np.nan)
-        XY = self.survey.grid.to_map(cells.uv)
+        XY = self.grid.to_map(cells.uv)
         for image in np.unique(cells.image).tolist():
-            rows, scene = cells.image == image, self.survey.looked[image].scene
+            rows, scene = cells.image == image, scenes[image]
             heights = scene.surface.heights(XY[rows])
             uv[rows] = into_image(scene.camera, np.concatenate([XY[rows], heights[..., None]], axis=-1))
         return replace(cells, uv=uv).some(np.flatnonzero(np.isfinite(uv).all(axis=(1, 2))))

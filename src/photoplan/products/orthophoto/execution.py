@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,17 +12,17 @@ import numpy as np
 
 from photoplan import __version__
 from photoplan.cameras.base import tremor_of
-from photoplan.engine.cluster import Question
 from photoplan.engine.execute import OutputName, RenderJob
 from photoplan.engine.executors import Workers, open_workers
 from photoplan.engine.run import Kept, Runner, Tally, Work
 from photoplan.errors import TilesFailed
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm, bands_of
+from photoplan.io.kept_tiles import KeptTiles
 from photoplan.io.naming import standing, together, when_named
-from photoplan.io.product import ProductFile, is_product
+from photoplan.io.product import ProductFacts, ProductFile, is_product
 from photoplan.io.quicklook import refuse_foreign_overview, write_overview
-from photoplan.io.run_record import input_entry, versions, write_run_record
+from photoplan.io.run_record import input_entry, record_path, write_run_record
 from photoplan.io.virtual import refuse_foreign_virtual
 from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.accuracy import BANDS, radial_error
@@ -35,10 +35,11 @@ from photoplan.products.orthophoto.finished import (
     seams_path,
     stale_files,
 )
+from photoplan.products.orthophoto.keys import known_errors, tile_keys
 from photoplan.products.orthophoto.look import Look
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, known_errors, painting
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, painting
 from photoplan.products.orthophoto.stack import stack_index, write_stack
-from photoplan.products.run import Run, clock, refuse_inputs
+from photoplan.products.run import Run, clock, question, refuse_inputs
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files
 from photoplan.project.scenes import Scenes, ScenesAddress
@@ -98,8 +99,8 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     if kept:
         run.events.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
     run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))
-    question = Question(versions, tuple(str(path.resolve()) for path in _pixel_files(plan)), str(folder.resolve()))
-    with open_workers(run.executor, run.workers, question, run.events) as workers:
+    asked = question(_pixel_files(plan), folder)
+    with open_workers(run.executor, run.workers, asked, run.events) as workers:
         works = (_work(plan, p, folder, run, kept.get(p.plan.name), workers) for p in plan.products)
         results = Runner[ProductResult](workers, run.in_flight(workers.threads), run.events).run(works)
     if picture is not None:
@@ -129,6 +130,9 @@ def _work(
     if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
         run.events.talk("compiling the resampling kernels for this kind of image, once (up to a minute)")
     paths = outputs(folder, product, settings)
+    kept_tiles = None
+    if settings.choice is not None:
+        kept_tiles = KeptTiles(record_path(paths["picture"]), tile_keys(address, product.plan, settings))
     open_file = partial(
         ProductFile,
         placement=product.grid.placement,
@@ -138,6 +142,7 @@ def _work(
         overwrite=run.overwrite,
         inputs=[path for path, _ in address.digests],
         threads=run.workers,
+        tiles=kept_tiles,
     )
     forms: dict[OutputName, dict[str, Any]] = {
         "picture": {
@@ -191,7 +196,8 @@ def _complete(
     """Give the files of a product their names, and its record; with failed tiles they get none."""
     file = files["picture"]
     with together():
-        facts, *_ = [None] if tally.failed else [each.complete(_tags(plan, product)) for each in files.values()]
+        made = [] if tally.failed else [each.complete(_tags(plan, product)) for each in files.values()]
+        facts = made[0] if made else None
         painted: dict[str, float] | None = None
         if "sources" in files and facts is not None:
             # A product without regions does not need the libraries of vector data.
@@ -228,12 +234,19 @@ def _complete(
                 values_moved_off_nodata=facts.moved_values,
                 bytes=facts.bytes,
                 **_record(plan, product, address.open(), result),
+                **_kept(made),
             )
         if facts is not None:
             # Of the orthophoto that this one replaces.
             for path in filter(is_product, stale_files(file.path.parent, product, plan.settings)):
                 when_named(path.unlink)
     return result
+
+
+def _kept(made: Sequence[ProductFacts]) -> dict[str, Any]:
+    """What a record keeps of tiles, by file; nothing where nothing is kept."""
+    found = {each.path.name: each.kept for each in made if each.kept}
+    return {"tiles": found} if found else {}
 
 
 def _accuracy(counts: list[int]) -> dict[str, float]:

@@ -14,6 +14,7 @@ from photoplan.io.project.model import Project
 from photoplan.io.regions import Regions, read_regions
 from photoplan.plan.footprint import covered_tiles
 from photoplan.plan.tiles import Tiles
+from photoplan.products.orthophoto.keys import keyed
 from photoplan.products.orthophoto.look import Looked, look_at, with_resolution
 from photoplan.products.orthophoto.plan import (
     OrthoPlan,
@@ -21,7 +22,6 @@ from photoplan.products.orthophoto.plan import (
     check_storable,
     chosen_settings,
     grid_of,
-    keyed,
     product_plan,
     refuse_blind,
 )

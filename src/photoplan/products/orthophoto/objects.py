@@ -16,6 +16,7 @@ from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Objects, Project
 from photoplan.plan.footprint import View, covered_tiles
 from photoplan.plan.tiles import Tiles
+from photoplan.products.orthophoto.keys import keyed
 from photoplan.products.orthophoto.look import Looked, extent_text, look_at, with_resolution
 from photoplan.products.orthophoto.mosaic import refuse_mixed, with_preferred
 from photoplan.products.orthophoto.plan import (
@@ -24,7 +25,6 @@ from photoplan.products.orthophoto.plan import (
     check_storable,
     chosen_settings,
     grid_of,
-    keyed,
     product_plan,
     refuse_blind,
 )

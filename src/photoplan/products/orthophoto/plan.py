@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -11,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan import __version__
 from photoplan.engine.direct import Direct
 from photoplan.engine.execute import Painted, joined
 from photoplan.engine.execute import render as render_tile
@@ -21,7 +18,6 @@ from photoplan.geometry.grid import MapGrid, refuse_absurd
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
-from photoplan.plan.accuracy import in_image
 from photoplan.plan.choice import BestImage, Drawn
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.feather import feather_of
@@ -29,11 +25,11 @@ from photoplan.plan.footprint import Footprint, covered_tiles
 from photoplan.plan.owner import InSight
 from photoplan.plan.product import ProductPlan
 from photoplan.plan.tiles import Tile, Tiles
+from photoplan.products.orthophoto.keys import keyed
 from photoplan.products.orthophoto.look import Look, extent_text, look_at, with_resolution
 from photoplan.products.orthophoto.settings import Choice, OrthoSettings
 from photoplan.project.scene import Scene
 from photoplan.project.scenes import ScenesAddress
-from photoplan.project.uncertain import ScenesErrors
 from photoplan.surfaces.objects import SingleObject, painted_surface
 from photoplan.targets.map import MapTarget
 
@@ -257,63 +253,6 @@ def check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettin
         raise UsageError(
             f"{name}: {scene.reader.bands} bands of {scene.reader.dtype}; compression jpeg takes one or three of uint8"
         )
-
-
-def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: SingleObject | None = None) -> str:
-    """Key of a product of a project, or of what it shows of a single object.
-
-    Raises
-    ------
-    InputError
-        A file is missing, or nothing is known of errors that are asked for.
-    """
-    address = ScenesAddress.of(project, plan.sources, part)
-    facts = address.facts if not settings.accuracy else [address.facts, known_errors(address, plan, settings).facts]
-    drawn = None
-    if settings.choice is not None and isinstance(plan.owners, BestImage) and plan.owners.drawn is not None:
-        drawn = plan.owners.drawn.digest(settings.choice.feather)
-    return product_key(facts, plan, settings, drawn)
-
-
-def known_errors(address: ScenesAddress, plan: ProductPlan, settings: OrthoSettings) -> ScenesErrors:
-    """What is known of the errors of a product's images and of its ground."""
-    sigma = in_image(settings.kernel, plan.rule.tolerance)
-    return ScenesErrors(address, (sigma,) * len(address.scenes))
-
-
-def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions: str | None = None) -> str:
-    """Hash of what decides a product's pixels, and of nothing else.
-
-    Another key means that finished tiles are of no use.
-
-    Parameters
-    ----------
-    scenes : plain value
-        What moves a pixel of its images, see `SceneAddress.facts`.
-    plan, settings
-    regions : str, optional
-        Digest of the file of drawn regions.
-    """
-    assert isinstance(plan.target, MapTarget)
-    grid = plan.target.grid
-    facts = {
-        "version": __version__,
-        "scene": scenes,
-        "grid": [grid.left, grid.top, grid.resolution, grid.width, grid.height, grid.crs],
-        "rule": [plan.rule.tolerance, plan.rule.radius, plan.tiles.side],
-        "kernel": settings.kernel,
-        "nodata": settings.nodata,
-        "hidden": settings.hidden,
-        "method": [settings.method, settings.fill],
-        "choice": None if settings.choice is None else _facts(settings.choice, regions),
-        **({} if plan.clip is None else {"clip": plan.clip.digest(0.0)}),
-    }
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-
-
-def _facts(choice: Choice, regions: str | None) -> dict[str, Any]:
-    """What of a choice decides pixels: of files what they say, not their names."""
-    return {**asdict(choice), "name": "", "seams": regions, "sheets": None}
 
 
 def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:

@@ -27,9 +27,10 @@ from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint
 from photoplan.plan.product import compile_tile
 from photoplan.plan.tiles import Tiles
+from photoplan.products.orthophoto.keys import keyed
 from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.mosaic import drawn_regions
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, keyed, product_plan
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, product_plan
 from photoplan.products.orthophoto.quadtree import PlanSquares
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import input_files

@@ -8,21 +8,21 @@ from photoplan.plan.compile import AnchorRule
 from photoplan.plan.owner import InSight
 from photoplan.plan.product import ProductPlan
 from photoplan.plan.tiles import Tile, Tiles
-from photoplan.products.orthophoto.look import Looked
+from photoplan.project.scene import Scene
 from photoplan.targets.map import MapTarget
 
 _KERNEL, _TOLERANCE = "bilinear", 0.5
 
 
-def shown(one: Looked, grid: MapGrid, window: Window, side: int) -> Painted:
+def shown(scene: Scene, grid: MapGrid, window: Window, side: int) -> Painted:
     """What an image shows of a window of a map whose tiles have a side; nothing where anything hides the ground."""
     rule = AnchorRule.of(_KERNEL, _TOLERANCE)
     plan = ProductPlan(
-        name=one.name,
-        sources=(one.name,),
+        name="shown",
+        sources=("image",),
         target=MapTarget(grid),
         rule=rule,
         tiles=Tiles.every(grid.window, side),
         owners=InSight(),
     )
-    return render(plan, Tile(0, window, (0,)), one.scene.sources, one.scene.surface, _KERNEL)
+    return render(plan, Tile(0, window, (0,)), scene.sources, scene.surface, _KERNEL)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.engine.execute import MOST_SOURCE_BYTES
+from photoplan.engine.executors import executor_factory, threads
 from photoplan.engine.run import tiles_in_flight
 from photoplan.engine.steps import Steps, steps
 from photoplan.errors import GeometryError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import make_folder
 from photoplan.io.naming import together, when_named
 from photoplan.io.polygons import check_vectors, label_polygons
@@ -29,10 +29,10 @@ from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
 from photoplan.products.balance.sample import Survey, survey
 from photoplan.products.orthophoto.shown import shown
-from photoplan.products.run import BASE_MEMORY
-from photoplan.project.scene import input_files
+from photoplan.products.run import BASE_MEMORY, question
+from photoplan.project.scene import SceneAddress, input_files
 from photoplan.radiometry.seams import find_seams, without_overlap
-from photoplan.radiometry.shown import Layer, Shown, Store, layers_of
+from photoplan.radiometry.shown import Features, Layer, Shown, Store, features_of
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
 
@@ -57,6 +57,9 @@ class SeamsRequest:
     """Regions that somebody has drawn: they stay, where their image sees the ground."""
     output: Path | None = None
     workers: int = 1
+    executor: str = "threads"
+    """Who looks at the images: ``threads``, ``processes`` or a Dask scheduler's address. Seams between them are found
+    by threads of this process."""
     memory: int | None = None
     """Bytes the run should stay under; None: no bound but the images and parts under way."""
     overwrite: bool = False
@@ -112,12 +115,12 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     files = [*input_files(project), *([request.keep] if request.keep else [])]
     check_output(request.path, files, overwrite=request.overwrite)
     check_vectors(request.path)
+    executor_factory(request.executor, request.workers)
     found = survey(project, names, request.resolution, events)
     notes = tuple(f"left out, sees no terrain: {line}" for line in found.blind)
-    reading = _Reading(found)
-    workers = tiles_in_flight(
-        request.workers, request.memory, BASE_MEMORY + _MAP * found.grid.window.size, reading.bytes
-    )
+    images = _images(found)
+    kept = BASE_MEMORY + _MAP * found.grid.window.size
+    workers = tiles_in_flight(request.workers, request.memory, kept, _image_bytes(found, images))
     if request.dry_run:
         return SeamsReport(found, notes)
     make_folder(request.path.parent)
@@ -125,20 +128,37 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     inputs = [input_entry(file) for file in files]
     key = run_key("seams", settings, inputs)
     with together(), ResultLog.beside(request.path, key, locked=False) as log:
-        with steps(request.path.name, workers, events, log) as each:
-            events.begin("reading", len(found.looked), "images")
-            images = list(each(partial(reading.image, store=log), range(len(found.looked))))
-            notes += _odd(found, images, log)
-            labels, differences = _seams(request, found, images, log, each, events, notes)
+        layers = _read(replace(request, workers=workers), found, images, log, events)
+        notes += _odd(found, layers, log)
+        with threads(workers) as pool:
+            run = Steps(request.path.name, pool, events, log, root="seams")
+            labels, differences = _seams(request, found, layers, log, run, events, notes)
         polygons = label_polygons(labels.astype(np.int32), found.grid)
         shapes = {row: _multi(shape) for row, shape in sorted(polygons.items())}
         write_regions(request.path, found.names, shapes, found.grid.crs)
         named = {found.names[row - 1]: shape for row, shape in shapes.items()}
         report = SeamsReport(found, notes, request.path, named, differences)
-        run = {"workers": request.workers, "memory": request.memory, **times()}
-        write_run_record(request.path, key=key, inputs=inputs, run=run, kind="seams", product=report, settings=settings)
+        ran = {"workers": request.workers, "executor": request.executor, "memory": request.memory, **times()}
+        write_run_record(request.path, key=key, inputs=inputs, run=ran, kind="seams", product=report, settings=settings)
         when_named(log.remove)
     return report
+
+
+def _read(
+    request: SeamsRequest, found: Survey, images: Sequence[_Image], log: ResultLog, events: Events
+) -> list[tuple[Layer, ...] | float | None]:
+    """What all images show, in the log."""
+
+    def kept(made: tuple[Features, ...] | float | None) -> tuple[Layer, ...] | float | None:
+        return tuple(each.kept(log) for each in made) if isinstance(made, tuple) else made
+
+    events.begin("reading", len(found.looked), "images")
+    asked = question((file for one in found.looked for file in one.scene.files), request.path.parent)
+    scratch = request.path.with_name(f".{request.path.name}.parcels")
+    with steps(
+        request.path.name, request.workers, events, log, executor=request.executor, question=asked, scratch=scratch
+    ) as run:
+        return list(run(_Map(found.grid, found.tiles.side), images, kept=kept))
 
 
 def _seams(
@@ -176,40 +196,37 @@ def _odd(found: Survey, images: Sequence[tuple[Layer, ...] | float | None], stor
     return tuple(notes)
 
 
-class _Reading:
-    """From an image to what it shows."""
+@dataclass(frozen=True)
+class _Image:
+    """An image as a worker gets it, and what of the map it may show."""
 
-    def __init__(self, found: Survey) -> None:
-        self._survey = found
-        self._windows: dict[int, list[Window]] = {}
-        for tile in found.tiles:
-            for row in tile.sources:
-                self._windows.setdefault(row, []).append(tile.window)
+    scene: SceneAddress
+    windows: tuple[Window, ...]
 
     @property
-    def bytes(self) -> int:
-        """What one image at a time takes at most, beside what all take."""
-        widths, heights = np.array([self._place(mine)[2:] for mine in self._windows.values()]).T
-        return 3 * MOST_SOURCE_BYTES + _PIXEL * self._survey.looked[0].scene.reader.bands * int(
-            (widths * heights).max()
-        )
+    def box(self) -> tuple[int, int, int, int]:
+        """Left, top, width and height of the box around its windows."""
+        left, top = min(w.col for w in self.windows), min(w.row for w in self.windows)
+        return left, top, max(w.stop[0] for w in self.windows) - left, max(w.stop[1] for w in self.windows) - top
 
-    @staticmethod
-    def _place(windows: Sequence[Window]) -> tuple[int, int, int, int]:
-        """Left, top, width and height of the box around windows."""
-        left, top = min(w.col for w in windows), min(w.row for w in windows)
-        return left, top, max(w.stop[0] for w in windows) - left, max(w.stop[1] for w in windows) - top
 
-    def image(self, row: int, store: Store) -> tuple[Layer, ...] | float | None:
-        """All that it shows, tile by tile, put together."""
-        one, mine = self._survey.looked[row], self._windows.get(row)
-        if not mine:
+@dataclass(frozen=True)
+class _Map:
+    """From an image to what it shows of a map."""
+
+    grid: MapGrid
+    side: int
+    """Of the map's tiles, pixels."""
+
+    def __call__(self, one: _Image) -> tuple[Features, ...] | float | None:
+        """All that it shows, tile by tile, put together; one grey value if it has no other; None: it shows nothing."""
+        if not one.windows:
             return None
-        left, top, width, height = self._place(mine)
-        values = np.zeros((one.scene.reader.bands, height, width), np.float32)
+        scene, (left, top, width, height) = one.scene.open(), one.box
+        values = np.zeros((scene.reader.bands, height, width), np.float32)
         valid = np.zeros(values.shape[1:], np.bool_)
-        for window in mine:
-            made = shown(one, self._survey.grid, window, self._survey.tiles.side)
+        for window in one.windows:
+            made = shown(scene, self.grid, window, self.side)
             if made.values is not None and made.valid is not None:
                 at = np.s_[window.row - top : window.stop[1] - top, window.col - left : window.stop[0] - left]
                 values[(slice(None), *at)], valid[at] = made.values, made.valid
@@ -220,7 +237,21 @@ class _Reading:
             return float(grey[0, 0])
         rows, cols = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
         at = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-        return layers_of(Shown(top + int(rows[0]), left + int(cols[0]), values[:, *at], valid[at]), store)
+        return features_of(Shown(top + int(rows[0]), left + int(cols[0]), values[:, *at], valid[at]))
+
+
+def _images(found: Survey) -> list[_Image]:
+    windows: list[list[Window]] = [[] for _ in found.looked]
+    for tile in found.tiles:
+        for row in tile.sources:
+            windows[row].append(tile.window)
+    return [_Image(one.scene.address, tuple(mine)) for one, mine in zip(found.looked, windows)]
+
+
+def _image_bytes(found: Survey, images: Sequence[_Image]) -> int:
+    """What one image at a time takes at most, beside what all take."""
+    pixels = max((one.box[2] * one.box[3] for one in images if one.windows), default=0)
+    return 3 * MOST_SOURCE_BYTES + _PIXEL * found.looked[0].scene.reader.bands * pixels
 
 
 def _weight(found: Survey) -> NDArray[np.float32]:
