@@ -5,8 +5,8 @@
 One real aerial frame, enlarged 6 and 12 times; cubic, three bands, uncompressed, no overviews, one thread where the
 program lets itself be told. Whole processes are measured, from start to end. Runs of the programs alternate, medians
 are compared. Whatever is missing (a program, the data) is named and its rows are left out. A satellite image
-(satellite.py), terrain models from measured points (terrain.py), orientation (orientation.py), the rate of filters
-(filter.py), mosaics (mosaics.py; otb.py beside OTB) and views (views.py) follow.
+(satellite.py), a strip of a line camera (strips.py), terrain models from measured points (terrain.py), orientation
+(orientation.py), the rate of filters (filter.py), mosaics (mosaics.py; otb.py beside OTB) and views (views.py) follow.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from planning import report_planning
 from prepare import DATA, LARGE, SMALL, WORK, Source, prepare
 from programs import Bounds, Missing, Program, gdalwarp, orthority, photoplan
 from satellite import report_satellite
+from strips import report_strips
 from terrain import report_terrain
 from views import report_views
 
@@ -214,6 +215,7 @@ def main() -> int:
             report(results["sizes"][-1])
     WORK.mkdir(exist_ok=True)
     results["satellite"] = report_satellite(1 if options.quick else options.repeat)
+    results["strips"] = report_strips(options.quick)
     results["owners"] = report_owners()
     results["oblique"] = report_oblique(options.repeat)
     results["filter"] = report_filter(options.quick)

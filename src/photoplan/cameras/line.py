@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Vantage
 from photoplan.cameras.line_look import LineLook
-from photoplan.cameras.line_sight import LineSight, to_sphere
+from photoplan.cameras.line_sight import FOUND, LineSight, to_sphere
 from photoplan.cameras.line_track import LineTrack
 from photoplan.cameras.line_tremor import LineTremor, Moments, smoothed
 from photoplan.errors import InputError, UsageError
@@ -166,12 +166,12 @@ class LineCamera:
         inside = (y >= -0.5) & (y <= self.size[1] - 0.5)
         return np.asarray(inside & ~self.track.is_oriented(y))
 
-    def seen_from(self, P: _Floats) -> _Floats:
-        """Positions (n, 2) of points (n, 3) in the axes of the body."""
+    def seen_from(self, P: _Floats, close: float = FOUND) -> _Floats:
+        """Positions (n, 2) of points (n, 3) in the axes of the body; on smooth flights to `close` lines."""
         room = self._room
         tremor = self.breaks
         if tremor is None:
-            out = self.sight.found(P, self._start(P), *room)
+            out = self.sight.found(P, self._start(P), *room, close)
         else:
             out = np.full((len(P), 2), np.nan)
             point, rows = tremor.first(P)

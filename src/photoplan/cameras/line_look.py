@@ -77,6 +77,11 @@ class LineLook:
         unit = self._unit(np.clip(column, *_span(self.columns)))
         return np.asarray(chebyshev.chebval(unit, self._slopes).T)
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last column over which the curve goes on."""
+        return _span(self.columns)
+
     @cached_property
     def axes(self) -> _Floats:
         """Unit vectors along the line, from the first to the last column, and across it, (2, 2)."""

@@ -12,7 +12,7 @@ from photoplan.cameras.line_track import LineTrack
 
 _Floats = NDArray[np.float64]
 #: A moment is found when it changes by less than this, lines; or by less than the second and not less than before.
-_FOUND, _ROUNDED = 1e-10, 1e-6
+FOUND, _ROUNDED = 1e-10, 1e-6
 #: Steps over which the slope is taken anew, lines.
 _SMOOTH = 1e-3
 _ITERATIONS = 40
@@ -47,7 +47,7 @@ class LineSight:
         column = self.look.column(tangents @ e)
         return (tangents - self.look.tangents(column)) @ n, column
 
-    def found(self, P: _Floats, start: _Floats, low: float, high: float, close: float = _FOUND) -> _Floats:
+    def found(self, P: _Floats, start: _Floats, low: float, high: float, close: float = FOUND) -> _Floats:
         """Positions (n, 2) of points (n, 3) by the secant method, from rows (n,) on; NaN outside `low` to `high`."""
         out = np.full((len(P), 2), np.nan)
         todo = np.flatnonzero(np.isfinite(P).all(axis=1) & np.isfinite(start))
@@ -127,7 +127,7 @@ class LineSight:
             low[todo], below[todo] = np.where(left, now, a), np.where(left, miss, np.where(side[todo] < 0, fa / 2, fa))
             high[todo], above[todo] = np.where(left, b, now), np.where(left, np.where(side[todo] > 0, fb / 2, fb), miss)
             side[todo] = np.where(left, 1.0, -1.0)
-            todo = todo[(step > _FOUND) & (high[todo] - low[todo] > _FOUND)]
+            todo = todo[(step > FOUND) & (high[todo] - low[todo] > FOUND)]
             if not len(todo):
                 break
         return out

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.line_sight import LineSight, to_sphere
+from photoplan.cameras.line_straight import StraightFlight
 from photoplan.cameras.line_track import LineTrack
 from photoplan.geometry.body import BodyGround
-from photoplan.geometry.motion import Course
+from photoplan.geometry.motion import Course, rotations
 
 if TYPE_CHECKING:
     from photoplan.cameras.line import LineCamera
@@ -30,16 +31,14 @@ _LEAST = 0.05
 _BLOCK = 64
 #: The lowest ground, metres: from there shifts are largest.
 _LOWEST = -500.0
-#: Shifts are looked for to this, lines; and at columns as near as this to those that are asked for.
-_CLOSE, _NEAR = 1e-5, 0.05
+#: Shifts are looked for at columns as near as this to those that are asked for, in so many steps at most.
+_NEAR, _TURNS = 0.05, 4
 #: Lines at which it is told how often ground is seen.
 _TOLD = 300
-#: Rows by which the smooth part may bend between the points that enclose a piece of ground.
-_AROUND = 16.0
+#: Rows by which the smooth part may bend between the points that enclose a piece of ground, and to which it is found.
+_AROUND, _ROUGHLY = 16.0, 0.5
 #: Parts begin and end at multiples of so many lines, so that pieces of ground beside each other have the same.
 _SHARED = 256
-#: Rows between which points are looked for whose row is known but for the shift.
-_ANY = (-1e6, 1e6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +64,11 @@ class LineTremor:
 
     def part(self, XYZ: _Floats) -> StraightPart | None:
         """See `Tremor`."""
-        seen = self.smooth.seen_from(self.smooth.ground(XYZ).reshape(-1, 3))
-        seen = seen[np.isfinite(seen[:, 0])]
+        seen = self.smooth.seen_from(self.smooth.ground(XYZ).reshape(-1, 3), _ROUGHLY)[:, 1]
+        seen = seen[np.isfinite(seen)]
         if not len(seen):
             return None
-        rows = self._rows(float(seen[:, 1].min()) - _AROUND, float(seen[:, 1].max()) + _AROUND)
+        rows = self._rows(float(seen.min()) - _AROUND, float(seen.max()) + _AROUND)
         # Lines whose orientation is not known are not looked at; between the lines their neighbours count, too.
         begin, end = self.rough.track.oriented
         first, last = max(rows[0], int(np.floor(begin))), min(rows[1], int(np.ceil(end)))
@@ -155,46 +154,52 @@ class StraightPart:
     depend on it: what is left of the trajectory is linear in the height.
     """
 
-    smooth: LineCamera
+    smooth: StraightFlight
     rough: LineCamera
     rows: tuple[int, int]
 
     def shifts(self, columns: _Floats, rows: _Floats, heights: Sequence[float]) -> _Floats:
         """See `TremorPart`."""
-        sight, ground, size = self.smooth.sight, self.rough.ground, (len(rows), len(columns), 2)
-        wanted, y = np.tile(columns, size[0]), np.repeat(rows, size[1])
-        # First as the straight flight is turned at the same moment: all but what it flies on until it sees the point.
-        S, d = self.rough.sight.rays(np.column_stack([wanted, y]))
-        real, near = 2 * wanted - sight.across(S + d, y)[1], y
-        known = self.rough.track.is_oriented(y) | (y < 0.0) | (y > self.rough.size[1] - 1.0)
+        rough, ground = self.rough, self.rough.ground
+        S, R = rough.track(rows)
+        known = rough.track.is_oriented(rows) | (rows < 0.0) | (rows > rough.size[1] - 1.0)
         sea = np.linalg.norm(S, axis=1) - ground.height(S)
+        wanted = np.broadcast_to(columns, (len(rows), len(columns)))
+        S, real = np.repeat(S, len(columns), axis=0), wanted
         out = []
         for height in heights:
-            lift = self._lift(height)
-            for _ in range(3):
-                S, d = self.rough.sight.rays(np.column_stack([real, y]))
-                P = S + to_sphere(S, d, sea + lift)[:, None] * d
-                seen = sight.found(P, near, *_ANY, _CLOSE)
-                miss, near = wanted - seen[:, 0], seen[:, 1]
-                shift = np.column_stack([real, y]) - seen
+            radius = np.repeat(sea + self._lift(height), len(columns))
+            for _ in range(_TURNS):
+                tangents = rough.look.tangents(real.ravel()).reshape(*real.shape, 2)
+                d = tangents @ np.swapaxes(R[:, :, :2], 1, 2) + R[:, None, :, 2]
+                d = (d / np.linalg.norm(d, axis=2, keepdims=True)).reshape(-1, 3)
+                seen = self.smooth.seen(S + to_sphere(S, d, radius)[:, None] * d).reshape(*real.shape, 2)
+                miss = wanted - seen[..., 0]
+                shift = np.stack([real - seen[..., 0], rows[:, None] - seen[..., 1]], axis=-1)
                 real = real + miss
                 if not (np.abs(miss) > _NEAR).any():
                     break
-            out.append(np.where(known[:, None], shift, np.nan).reshape(size))
+            out.append(np.where(known[:, None, None], shift, np.nan))
         return np.stack(out)
 
     def _lift(self, height: float) -> float:
         """Height above the ellipsoid of a height on the ground of the project, in the middle."""
-        middle = np.array([[(self.rough.size[0] - 1) / 2, (self.rows[0] + self.rows[1]) / 2]])
-        point = self.smooth.rays(middle, height)[0]
-        lift = float(self.rough.ground.height(self.rough.ground(point))[0])
+        flight, ground = self.smooth, self.rough.ground
+        S, d = flight.place[None], flight.R @ np.array([*flight.look.tangents(self._middle)[0], 1.0])
+        d = d[None] / np.linalg.norm(d)
+        below = S + to_sphere(S, d, np.linalg.norm(S, axis=1) - ground.height(S) + height)[:, None] * d
+        lift = float(ground.height(ground(np.column_stack([ground.to_map(below)[:, :2], [height]])))[0])
         return lift if np.isfinite(lift) else height
+
+    @property
+    def _middle(self) -> _Floats:
+        """Column in the middle of the line, (1,)."""
+        return np.array([(self.rough.size[0] - 1) / 2])
 
 
 @lru_cache(maxsize=64)
 def _straight_part(tremor: LineTremor, first: int, last: int) -> StraightPart:
-    track = _straight_track(tremor.rough.track, first, last)
-    return StraightPart(replace(tremor.rough, track=track), tremor.rough, (first, last))
+    return StraightPart(_straightened(tremor.rough, first, last), tremor.rough, (first, last))
 
 
 def smoothed(camera: LineCamera) -> LineTremor | None:
@@ -209,18 +214,20 @@ def smoothed(camera: LineCamera) -> LineTremor | None:
     return LineTremor(smooth, camera, largest) if largest[1:-1].max() > _LEAST else None
 
 
-def _straight_track(track: LineTrack, first: int, last: int) -> LineTrack:
+def _straightened(camera: LineCamera, first: int, last: int) -> StraightFlight:
     """Positions at an even speed and one attitude, as the lines from `first` to `last` have on average."""
-    start, poses = track.poses
-    rows = np.arange(first, last + 1.0)
+    start, poses = camera.track.poses
     some = poses[first - start : last + 1 - start]
-    middle, q = some[:, :3].mean(axis=0), some[:, 3:].mean(axis=0)
-    away = rows - rows.mean()
-    speed = away @ (some[:, :3] - middle) / (away @ away)
-    return _by_rows(
-        track,
-        lambda row: middle + (row - rows.mean())[:, None] * speed,
-        lambda row: np.broadcast_to(q, (len(row), 4)).copy(),
+    place, q = some[:, :3].mean(axis=0), some[:, 3:].mean(axis=0)
+    away = np.arange(first, last + 1.0) - (first + last) / 2
+    return StraightFlight(
+        look=camera.look,
+        ground=camera.ground,
+        lines=camera.track.lines,
+        middle=(first + last) / 2,
+        place=place,
+        speed=away @ (some[:, :3] - place) / (away @ away),
+        R=rotations(q[None])[0],
     )
 
 

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.area import BEFORE, axis_weights
+from photoplan.kernels.area import BEFORE, axis_weights, look_up
 from photoplan.kernels.border import LEAST_WEIGHT, store, weight_of
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.place import ALL, AVERAGE, EMPTY, INTERIOR
-from photoplan.kernels.rows import column_of, shift_across
+from photoplan.kernels.rows import column_of, shift_across, shift_of_row
 from photoplan.kernels.sampling import gather_apart
+from photoplan.kernels.weights import TABLE_STEPS
 
 MOST_TILT = 0.8
 """Rows that are left beside a place are balanced by weights that change by this part from row to row at most."""
@@ -54,17 +55,17 @@ def _mean_of_rows(
 
     Where rows end before the place (at ragged borders) the others still show a ramp where it is.
 
-    lines = (frame, nodes, place in the nodes); spot = (ideal x, y, widening along x, along y). The mean of each band is
+    lines = (frame, cells, place in the cells); spot = (ideal x, y, widening along x, along y). The mean of each band is
     in the last of `work`, if there is any usable weight.
     """
-    frame, nodes, place = lines
+    frame, cells, place = lines
     wx, wy, base, steep, means = work
     _, height, width, lanes = source.shape
     half, bands = rule[0].shape[1] // 2, means.shape[0]
     top, bottom, in_y, all_y = _weights(rule, half, (spot[1], spot[3]), height, wy)
     usable, total, last, first, s1, s2 = 0.0, 0.0, 1.0, True, 0.0, 0.0
     for row in range(top, bottom):
-        x = spot[0] + shift_across(frame, nodes, np.float64(row), place)
+        x = spot[0] + shift_across(frame, cells, np.float64(row), place)
         if not abs(x) < 1e9:
             continue
         down = np.float64(wy[BEFORE + row - top])
@@ -105,29 +106,121 @@ def _mean_of_rows(
 
 
 @inner
+def _row_weights(rule: tuple[Any, ...], at: Any, wide: float, weights: NDArray[np.float32]) -> tuple[Any, Any, Any]:
+    """First pixel relative to a run, number, and sum of the weights around a place along a row, wherever it ends."""
+    coefficients, taps, table, _ = rule
+    half, total = np.float32(0.5), np.float32(0.0)
+    if not wide > 1.0:
+        whole = np.floor(at + (half if taps == 1 else np.float32(0.0)))
+        g = at - whole - half
+        for i in range(taps):
+            weight = coefficients[coefficients.shape[0] - 1, i]
+            for power in range(coefficients.shape[0] - 2, -1, -1):
+                weight = weight * g + coefficients[power, i]
+            weights[i] = weight
+            total += weight
+        return np.int64(whole) - max(taps // 2 - 1, 0), taps, total
+    reach, rate = np.float32(((table.shape[0] - 2) // TABLE_STEPS) * wide), np.float32(TABLE_STEPS / wide)
+    begin, end = np.int64(np.ceil(at - reach)), np.int64(np.floor(at + reach))
+    for i in range(end - begin + 1):
+        weights[i] = look_up(table, abs(np.float32(begin + i) - at) * rate)
+        total += weights[i]
+    return begin, end - begin + 1, total
+
+
+@inner
+def _whole_mean(
+    image: tuple[Any, ...],
+    lines: tuple[Any, ...],
+    spot: tuple[Any, ...],
+    rule: tuple[Any, ...],
+    work: tuple[Any, ...],
+) -> bool:
+    """Mean as of `_mean_of_rows`, where all pixels are inside and usable; False where that is not so.
+
+    spot = (first column of the run, x from there on, whole y, fraction, widening along x, along y).
+    """
+    (source, solid), (frame, cells, place) = image, lines
+    left, x, y, part, wide_x, wide_y = spot
+    wx, wy, base, _, means = work
+    _, height, width, lanes = source.shape
+    taps = rule[1]
+    top, many, in_y = _row_weights(rule, part, wide_y, wy)
+    top += y
+    first = np.int64(top - frame[1])
+    if top < 0 or top + many > height:
+        return False
+    same = frame[3] == 1.0 and first >= 0 and first + many <= cells.shape[0]
+    for row in range(top, top + many):
+        if same:
+            at = x + shift_of_row(cells, first + row - top, place)
+        else:
+            at = x + shift_across(frame, cells, np.float64(row), place)
+        if not abs(at) < np.float32(1e7):
+            return False
+        begin, count, total = _row_weights(rule, at, wide_x, wx)
+        begin += left
+        if begin < 0 or begin + count > width:
+            return False
+        if solid.size > 0:
+            # Patches of taps × taps pixels; at the lower end those above.
+            for col in range(begin, begin + count, taps):
+                if solid[min(row, top + many - taps), min(col, begin + count - taps)] == 0:
+                    return False
+        share = wy[row - top] / total
+        for band in range(means.shape[0]):
+            line, lane = source[band // lanes, row], np.uint64(band % lanes)
+            # Relative to one of the pixels, so that a constant image stays constant to the last bit.
+            if row == top:
+                base[band], means[band] = np.float64(line[begin, lane]), 0.0
+            level, value = np.float32(base[band]), np.float32(0.0)
+            for i in range(np.uint64(count)):
+                value += wx[i] * (np.float32(line[np.uint64(begin) + i, lane]) - level)
+            means[band] += np.float64(share * value)
+    for band in range(means.shape[0]):
+        means[band] = base[band] + means[band] / np.float64(in_y)
+    return True
+
+
+@inner
 def _find_taps(
     lines: tuple[Any, ...],
-    spot: tuple[float, int],
+    spot: tuple[Any, ...],
     image: tuple[Any, ...],
     taps: int,
     found: tuple[Any, ...],
 ) -> bool:
-    """First column and fraction of the taps in each row from spot[1] on; False if some may be outside or invalid."""
-    frame, nodes, place = lines
-    width, height, solid = image
-    columns, across = found
-    before, shift = max(taps // 2 - 1, 0), 0.5 if taps == 1 else 0.0
-    good = spot[1] >= 0 and spot[1] + taps <= height
+    """First element and fraction of the taps in each row; False if some may be outside or invalid.
+
+    lines: see `_mean_of_rows`; spot = (first column of the run, x from there on, first row); image = (width, height,
+    lanes, `solid_patches`).
+    """
+    frame, cells, place = lines
+    left, x, top = spot
+    width, height, lanes, solid = image
+    places, across = found
+    if top < 0 or top + taps > height:
+        return False
+    before, half = max(taps // 2 - 1, 0), np.float32(0.5)
+    shift = half if taps == 1 else np.float32(0.0)
+    first = np.int64(top - frame[1])
+    # Rows of the image are those of the cells, but for reduced images.
+    same = frame[3] == 1.0 and first >= 0 and first + taps <= cells.shape[0]
+    good = True
     for r in range(taps):
-        x = spot[0] + shift_across(frame, nodes, np.float64(spot[1] + r), place)
-        whole = np.floor(x + shift)
-        col = whole - before
-        inside = col >= 0 and col + taps <= width
-        columns[r] = np.int64(col) if inside else 0
-        across[r] = x - whole - 0.5
-        good = good and inside
-        if good and solid.size > 0:
-            good = solid[spot[1], columns[r]] != 0
+        if same:
+            at = x + shift_of_row(cells, first + r, place)
+        else:
+            at = x + shift_across(frame, cells, np.float64(top + r), place)
+        if not abs(at) < np.float32(1e7):
+            return False
+        whole = np.floor(at + shift)
+        col = left + np.int64(whole) - before
+        good = good and col >= 0 and col + taps <= width
+        if solid.size > 0 and good:
+            good = solid[top, col] != 0
+        places[r] = ((top + r) * width + col) * lanes
+        across[r] = at - whole - half
     return good
 
 
@@ -162,13 +255,14 @@ def apart_runs(
     relief, offset = ground
     corner, first, part, kind, fill, ideal = block
     out, out_valid = result
-    frame, nodes = anchors[4], anchors[5]
+    frame, cells = anchors[4], anchors[5]
     coefficients, taps = rule[0], rule[1]
     groups, height, width, lanes = source.shape
     wx, wy = np.zeros(width + 3 * BEFORE, np.float32), np.zeros(height + 3 * BEFORE, np.float32)
     work = (wx, wy, np.zeros(out.shape[0]), np.zeros(out.shape[0]), np.zeros(out.shape[0]))
-    columns, across, places = np.zeros(6, np.int64), np.zeros(6, np.float32), np.zeros(6, np.int64)
+    across, places, moved = np.zeros(6, np.float32), np.zeros(6, np.int64), np.zeros(6, np.int64)
     buffer, before = np.zeros(4, source.dtype), max(taps // 2 - 1, 0)
+    level, size = np.float32(frame[5]), (width, height, lanes, solid)
     for k in range(runs.shape[0]):
         row, col = runs[k, 1] - offset[1], runs[k, 3] - offset[0]
         for i in range(runs[k, 4] - runs[k, 3]):
@@ -178,23 +272,28 @@ def apart_runs(
                     out[band, row, col + i] = 0
                 continue
             x, down = corner[k, 0] + np.float64(ideal[k, i]), corner[k, 1] + first[k, 1, i]
-            at, along = column_of(frame, nodes, x)
-            lines = (frame, nodes, (at, along, np.float64(relief[row, col + i]) - frame[5]))
-            if mine != AVERAGE and _find_taps(lines, (x, down), (width, height, solid), taps, (columns, across)):
+            at, along = column_of(frame, cells, x)
+            lines = (frame, cells, (at, along, relief[row, col + i] - level))
+            spot = (corner[k, 0], ideal[k, i], down)
+            if mine != AVERAGE and _find_taps(lines, spot, size, taps, (places, across)):
                 for group in range(groups):
                     for r in range(taps):
-                        places[r] = (((group * height + down + r) * width) + columns[r]) * lanes
-                    gather_apart(source, places, across, part[k, 1, i], coefficients, tags[0], tags[1], buffer, 0)
+                        moved[r] = places[r] + group * height * width * lanes
+                    gather_apart(source, moved, across, part[k, 1, i], coefficients, tags[0], tags[1], buffer, 0)
                     for lane in range(min(lanes, out.shape[0] - group * lanes)):
                         out[group * lanes + lane, row, col + i] = buffer[lane]
                 out_valid[row, col + i] = True
                 continue
             y = np.float64(down + before) + np.float64(part[k, 1, i]) + 0.5
             wide = (1.0, 1.0)
+            good = False
             if mine == AVERAGE:
                 wide = (np.float64(scales[k, 0, i]), np.float64(scales[k, 1, i]))
-            usable, total = _mean_of_rows(source, mask, lines, (x, y, wide[0], wide[1]), rule, work)
-            good = usable > 0.0 and usable >= LEAST_WEIGHT * total
+                around = (corner[k, 0], ideal[k, i], down + before, part[k, 1, i] + np.float32(0.5), wide[0], wide[1])
+                good = _whole_mean((source, solid), lines, around, rule, work)
+            if not good:
+                usable, total = _mean_of_rows(source, mask, lines, (x, y, wide[0], wide[1]), rule, work)
+                good = usable > 0.0 and usable >= LEAST_WEIGHT * total
             out_valid[row, col + i] = good
             for band in range(out.shape[0]):
                 if good:

@@ -18,7 +18,7 @@ BEFORE = 8
 
 
 @inner
-def _look_up(table: NDArray[np.float32], distance: float) -> np.float32:
+def look_up(table: NDArray[np.float32], distance: float) -> np.float32:
     """Weight at a distance in steps of the table, linear between them."""
     step = np.int32(distance)
     lower = table[step]
@@ -57,16 +57,16 @@ def axis_weights(
     rate, middle = np.float32(TABLE_STEPS / stretch), np.float32(fraction)
     sum_inside = np.float32(0.0)
     for i in range(stop - start):
-        weight = _look_up(table, abs(np.float32(start - whole + i) - middle) * rate)
+        weight = look_up(table, abs(np.float32(start - whole + i) - middle) * rate)
         weights[BEFORE + i] = weight
         sum_inside += weight
     for i in range(max(stop - start, 0), max(stop - start, 0) + BEFORE):
         weights[BEFORE + i] = np.float32(0.0)
     total = np.float64(sum_inside)
     for i in range(first, min(start - whole, last + 1)):
-        total += np.float64(_look_up(table, abs(np.float32(i) - middle) * rate))
+        total += np.float64(look_up(table, abs(np.float32(i) - middle) * rate))
     for i in range(max(stop - whole, first), last + 1):
-        total += np.float64(_look_up(table, abs(np.float32(i) - middle) * rate))
+        total += np.float64(look_up(table, abs(np.float32(i) - middle) * rate))
     return start, stop, np.float64(sum_inside), total
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.position import RUN, cell_space, locate_run
+from photoplan.kernels.rows import CELL
 
 EMPTY, INTERIOR, BORDER, AVERAGE = 0, 1, 2, 3
 """Kinds of pixels: outside or without relief; all taps inside and valid; some not; averaged over a wider kernel."""
@@ -143,7 +144,7 @@ def place_runs(
     """
     taps, width, height, solid, border = frame
     corner, first, part, kind, fill, ideal = block
-    by_rows = anchors[5].shape[2] == 5
+    by_rows = anchors[5].shape[2] == CELL
     before, shift = max(taps // 2 - 1, 0), np.float32(0.5 if taps == 1 else 0.0)
     origin = np.empty(2)
     located_by = (origin, np.empty((4, 3)), cell_space())

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel, maker
-from photoplan.kernels.rows import add_rows
+from photoplan.kernels.rows import CELL, add_rows, row_cells
 
 RUN = 256
 """Columns of a rectangle that share one set of coefficients."""
@@ -235,7 +235,7 @@ def locate_run(
             higher = np.empty((2, RUN), np.float32)
             _run_positions(coef, run[3] - u_ref, heights, h_ref, higher[0], higher[1])
             _keep_from(heights, np.float32(box_heights[box, 0]), higher[0], higher[1], dx, dy)
-    if field.shape[2] == 5:
+    if field.shape[2] == CELL:
         for i in range(dx.shape[0]):
             work[1][i] = dx[i]
         add_rows(field_frame, field, origin, heights, dx, dy)
@@ -364,5 +364,6 @@ def positions(
     """
     result = np.full((*relief.shape, 2), np.nan, np.float32)
     runs = tile_runs(anchors[0], np.arange(len(anchors[0])), offset, relief.shape)
-    _positions(tuple(anchors), runs, np.ascontiguousarray(relief, np.float32), offset, result)
+    field = row_cells(anchors[5]) if anchors[5].shape[2] == 5 else anchors[5]
+    _positions((*anchors[:5], field), runs, np.ascontiguousarray(relief, np.float32), offset, result)
     return result

@@ -23,6 +23,7 @@ from photoplan.kernels.jit import is_ready
 from photoplan.kernels.pack import as_bytes, pack, solid_patches
 from photoplan.kernels.place import empty_block, place_runs
 from photoplan.kernels.position import ALL_MINE, RUN, Owned, tile_runs
+from photoplan.kernels.rows import CELL, row_cells
 from photoplan.kernels.scale import LOOK_CLOSER, largest_scales, stretch_runs
 from photoplan.kernels.weights import KERNELS, weight_table
 
@@ -113,6 +114,8 @@ def rectify_tile(
         target[...] = 0
         target_valid[...] = False
     arrays = tuple(_plain(np.asarray(array), dtype) for array, dtype in zip(anchors, _ANCHOR_TYPES))
+    if arrays[5].shape[2] == 5:
+        arrays = (*arrays[:5], row_cells(arrays[5]))
     if packed.size and len(arrays[0]):
         mask = solid = np.empty((0, 0), np.uint8)
         if valid is not None:
@@ -179,7 +182,7 @@ def _block(
     coefficients, tags, limits = _rule(name, packed.dtype, lanes)
     taps = KERNELS[name].taps
     relief, tilt = ground
-    by_rows = anchors[5].shape[2] == 5
+    by_rows = anchors[5].shape[2] == CELL
     doubtful = place_runs(anchors, runs, relief, offset, (taps, width, height, solid, edges), block, result[1])
     averaged = 0
     scales = np.empty((0, 2, RUN), np.float32)

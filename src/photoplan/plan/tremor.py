@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,8 +20,8 @@ _SPACINGS = (512.0, 256.0, 128.0, 64.0, 32.0)
 _PLACES, _BEYOND = 5, 64.0
 #: Lines that are measured strictly, and places along each.
 _MEASURED, _MEASURED_ALONG = 16, 12
-#: Heights are counted by steps of this, metres, so that tiles of alike ground have one table.
-_HEIGHTS = 32.0
+#: Heights are counted by steps of this or of a quarter of their range, metres: tiles of alike ground have one table.
+_HEIGHTS = 64.0
 #: Where points pass through the line at less than this part of its speed, a position has no accuracy: not reported.
 _SLOW = 0.2
 #: What is missed beside the places that are measured.
@@ -104,8 +105,9 @@ class TremorTable:
 
 def tremor_table(part: TremorPart, width: int, heights: tuple[float, float], tolerance: float) -> TremorTable:
     """The table of some lines of an image of a width, over a range of heights at least; kept for the next tile."""
-    low, high = np.floor(heights[0] / _HEIGHTS) * _HEIGHTS, np.ceil(heights[1] / _HEIGHTS) * _HEIGHTS
-    return _table(part, width, (float(low), float(max(high, low + _HEIGHTS))), tolerance)
+    step = max(_HEIGHTS, 2.0 ** math.ceil(math.log2(max(heights[1] - heights[0], 1.0) / 4)))
+    low, high = step * math.floor(heights[0] / step), step * math.ceil(heights[1] / step)
+    return _table(part, width, (low, max(high, low + step)), tolerance)
 
 
 @lru_cache(maxsize=48)
