@@ -216,6 +216,12 @@ def embankment(xy: Floats) -> Floats:
     return np.asarray(np.clip((xy[:, 0] - 20) / 1.5, 0, 4) - np.clip((xy[:, 0] - 32) / 1.5, 0, 4))
 
 
+def fold(xy: Floats) -> Floats:
+    """Flanks of 45° with a crest every 40 m: it breaks off all round from one slope for all."""
+    across = (np.cos(0.3) * xy[:, 0] + np.sin(0.3) * xy[:, 1]) / 40
+    return np.asarray(40 * np.abs(across - np.round(across)))
+
+
 def house(xy: Floats) -> Floats:
     """Its corner, cut off by the edge of the data."""
     return 3.0 * ((xy[:, 0] > 52) & (xy[:, 1] > 54))
@@ -225,8 +231,9 @@ def house(xy: Floats) -> Floats:
     "ground, noise, fields",
     [
         (benches, 0.02, 1),
+        (fold, 0.02, 1),
         *(pytest.param(g, n, 2, marks=pytest.mark.slow) for g, n in product((cliff, embankment), (0.02, 0.1))),
-        pytest.param(benches, 0.02, 2, marks=pytest.mark.slow),
+        *(pytest.param(g, 0.02, 2, marks=pytest.mark.slow) for g in (benches, fold)),
     ],
 )
 def test_edges_that_no_line_describes_are_no_errors(ground: Ground, noise: float, fields: int) -> None:

@@ -300,7 +300,11 @@ def _judge(
     local_scales(result[:, 2], around.wide, trusted, some, scale)
     ratio = np.abs(result[:, 2]) / np.fmax(scale, 1.0)
     gross = [screened.single[ratio[screened.single] > PART * limit]]
-    gross += [group for group in screened.clusters if np.median(ratio[group]) > limit]
+    gross += [
+        group
+        for group in screened.clusters
+        if np.median(ratio[group]) > limit and not _at_edge(found, around, screened, group)
+    ]
     wrong = np.unique(np.concatenate(gross))
     kept = [group[~np.isin(group, wrong)] for group in (*screened.clusters, *screened.suspects)]
     kept = [group for group in kept if len(group) and np.median(ratio[group]) > PART * limit]
@@ -308,6 +312,14 @@ def _judge(
     found.noise[wrong] = -1.0
     _test_near(found, some, run)
     return np.vstack([np.empty((0, 5)), *rows])
+
+
+def _at_edge(found: TerrainFit, around: Neighbourhoods, screened: Screened, group: NDArray[np.int64]) -> np.bool_:
+    """Whether the planes of neighbours beyond a group meet half of its points: a crest that breaks off all round."""
+    near = around.points[group]
+    beyond = np.where(np.isin(near, group), -1, near)
+    within = MEETS_MODEL * np.abs(found.residuals[group, 0])
+    return supported(found.seen, beyond, screened.slopes, group, within).mean() >= 0.5
 
 
 def _test_near(found: TerrainFit, changed: NDArray[np.int64], run: Map) -> NDArray[np.int64]:
@@ -336,7 +348,7 @@ def _flag(found: TerrainFit, around: Neighbourhoods, screened: Screened, limit: 
         ratio = np.where(used & ~cleared, np.abs(found.residuals[:, 2]) / np.fmax(scale, 1.0), 0.0)
         wild = np.flatnonzero(ratio > limit)
         within = MEETS_MODEL * np.abs(found.residuals[wild, 0])
-        meets = supported(found.seen, around, screened.slopes, wild, within)
+        meets = supported(found.seen, around.points[wild], screened.slopes, wild, within)
         cleared[wild[meets]] = True
         wild = wild[~meets]
         near = found.neighbours.near[0].query(found.seen.xyz[wild, :2])

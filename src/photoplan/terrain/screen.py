@@ -161,7 +161,8 @@ def _singles(
         local_scales(planes[:, 0], around.wide, used, changed, scale)
         ratio = np.abs(planes[:, 0]) / np.maximum(scale, floor)
         found = asked[used[asked] & (ratio[asked] > PART * limit)]
-        found = found[~supported(seen, around, slopes, found, _MEETS * np.abs(planes[found, 0]))]
+        within = _MEETS * np.abs(planes[found, 0])
+        found = found[~supported(seen, around.points[found], slopes, found, within)]
         worst = np.zeros(p)
         worst[found] = ratio[found]
         near = around.points[found]
@@ -180,7 +181,7 @@ def _singles(
 
 def supported(
     seen: Observations,
-    around: Neighbourhoods,
+    near: NDArray[np.int32],
     slopes: NDArray[np.float64],
     some: NDArray[np.int64],
     within: NDArray[np.float64],
@@ -189,12 +190,14 @@ def supported(
 
     Parameters
     ----------
+    near : ndarray, shape (n, k)
+        Neighbours of each point that is asked for; −1: none.
     slopes : ndarray, shape (points, 2)
         Of the plane at every point; NaN: not known.
     some, within : ndarrays, shape (n,)
         Points that are asked for, and to what a plane meets each of them, metres.
     """
-    near, xyz = around.points[some], seen.xyz
+    xyz = seen.xyz
     step = xyz[some, None] - xyz[near]
     off = step[..., 2] - (step[..., :2] * slopes[near]).sum(axis=2)
     meets = (near >= 0) & (np.abs(off) < within[:, None])
