@@ -31,6 +31,9 @@ class Parallel:
         x = XYZ[..., 0] - 0.5 + self.slope * XYZ[..., 2]
         return np.stack([x, -XYZ[..., 1] - 0.5, np.ones(x.shape)], axis=-1)
 
+    def derivatives(self, XYZ: np.ndarray) -> np.ndarray:
+        return np.array([[1.0, 0.0, self.slope], [0.0, -1.0, 0.0]])
+
 
 def seen(slope: float, texture: np.ndarray) -> np.ndarray:
     """What such a camera sees of the block: for every pixel the first thing on its ray, from above."""
@@ -59,8 +62,8 @@ def test_a_block_on_level_ground() -> None:
         views.append(View(Parallel(slope), Pyramid(Pixels(image), span=3)))
     grid = MapGrid(0.0, 0.0, 2.0, 100, 100, "EPSG:32633")
     window = Window(20, 20, 60, 60)
-    how = Search(Planes(2.0, 0.0), 1, 6.0)
-    found = search(views, grid, window, 2, 0, how, lambda XY: np.full(XY.shape[:-1], -5.0), 60.0)
+    how = Search(Planes(2.0, 0.0), 2, 0, 1, 6.0)
+    found = search(views, grid, window, how, lambda XY: np.full(XY.shape[:-1], -5.0), 60.0)
     assert found is not None
     uv = found.facets.to_posts(grid.to_map(np.array([20.0, 20.0]))).astype(int)
     heights, margin = (a[uv[1] : uv[1] + 60, uv[0] : uv[0] + 60] for a in (found.heights, found.margin))
@@ -72,6 +75,32 @@ def test_a_block_on_level_ground() -> None:
     assert (off < 1).mean() > 0.9 and sure.mean() > 0.7 and (off[sure] < 1).mean() > 0.97
     # Where it went wrong it says so, and only near the block's edges does it doubt.
     assert (off > 5 * spread + 1).mean() < 0.002 and (spread > 1).mean() < 0.1
+
+
+def test_many_images_of_which_few_see_each_place() -> None:
+    """Twelve images, two of which see each sixth of the ground: pairs that do not see a place do not count for it."""
+    rng = np.random.default_rng(5)
+    texture = rng.normal(100, 20, (SIDE, SIDE))
+    views = []
+    for part in range(6):
+        for side in (-0.25, 0.25):
+            slope = side + 0.1 * (part - 2.5)
+            image = seen(slope, texture) + rng.normal(0, 2, (SIDE, SIDE))
+            rows = np.arange(SIDE)
+            image[(rows < 33 * part - 8) | (rows > 33 * part + 42)] = np.nan
+            views.append(View(Parallel(slope), Pyramid(Pixels(image), span=3)))
+    grid = MapGrid(0.0, 0.0, 2.0, 100, 100, "EPSG:32633")
+    window = Window(20, 20, 60, 60)
+    how = Search(Planes(2.0, 0.0), 2, 0, 1, 6.0)
+    found = search(views, grid, window, how, lambda XY: np.full(XY.shape[:-1], -5.0), 60.0)
+    assert found is not None
+    uv = found.facets.to_posts(grid.to_map(np.array([20.0, 20.0]))).astype(int)
+    heights = found.heights[uv[1] : uv[1] + 60, uv[0] : uv[0] + 60]
+    true = np.zeros((100, 100))
+    true[30:60, 35:70] = TALL
+    close = (np.abs(heights - true[20:80, 20:80]) < 1).mean()
+    print(close)
+    assert close > 0.85
 
 
 def test_beside_a_step_a_height_may_be_any_of_it() -> None:

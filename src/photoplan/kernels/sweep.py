@@ -9,7 +9,7 @@ from photoplan.kernels.jit import inner, kernel
 #: Cells up and down, and left and right, with which the middle one is compared (9 × 7).
 HALF_ROWS, HALF_COLUMNS = 3, 4
 #: Pairs of images that a post compares at most.
-MOST_PAIRS = 16
+MOST_PAIRS = 8
 
 
 @inner
@@ -98,14 +98,15 @@ def add_costs(census, known, pairs, step, low, high, ratio, half, neutral, first
     """The cost of a plane at every post that may lie on it.
 
     Of each pair of images the mean share of bits that differ, over the cells around a post; the mean of the better half
-    of the pairs, since what hides a place from one image spoils the pairs that it is in.
+    of the first `MOST_PAIRS` pairs that both see the post, since what hides a place from one image spoils the pairs
+    that it is in.
 
     Parameters
     ----------
     census : ndarray, shape (images, rows · cells, columns · cells), uint64
     known : ndarray of bool, the same shape
     pairs : ndarray, shape (n, 2), int64
-        Images that are compared, `MOST_PAIRS` at most.
+        Images that may be compared, the best to compare first.
     step : int
         Number of the plane.
     low, high : ndarray, shape (rows, columns), int64
@@ -129,6 +130,8 @@ def add_costs(census, known, pairs, step, low, high, ratio, half, neutral, first
             left, right = max(i * ratio - half, 0), min(i * ratio + half + 1, census.shape[2])
             number = 0
             for p in range(len(pairs)):
+                if number == MOST_PAIRS:
+                    break
                 one, other = pairs[p, 0], pairs[p, 1]
                 total, count = 0, 0
                 for r in range(top, bottom):

@@ -116,7 +116,7 @@ def reconstruct(
     found: Searched | None = None
     reach = scheme.reach
     if scheme.search is not None:
-        found = search(views, grid, window, scheme.ratio, scheme.base, scheme.search, start, scheme.reach)
+        found = search(views, grid, window, scheme.search, start, scheme.reach)
         if found is None:
             return None
         start, reach = found, scheme.search.room

@@ -50,7 +50,7 @@ class Planes:
     """Heights of the planes of every level, the same for all windows of a map."""
 
     pixel: float
-    """What one pixel of parallax is at the height `at`, metres; of the finest level."""
+    """What one pixel of parallax of usual pairs of images is at the height `at`, metres; of the finest level."""
     at: float
     ceiling: float = np.inf
     """Height of the images, metres: towards it planes come closer, as parallax grows."""
@@ -88,6 +88,10 @@ class Search:
     """How heights are searched."""
 
     planes: Planes
+    ratio: int
+    """Cells that are compared along the side of a height facet of the finest level."""
+    base: int
+    """Pyramid level of the images for these."""
     coarsest: int
     """Level on which the whole reach is searched."""
     room: float
@@ -122,8 +126,6 @@ def search(
     views: Sequence[View],
     grid: MapGrid,
     window: Window,
-    ratio: int,
-    base: int,
     how: Search,
     start: Callable[[_Doubles], _Doubles],
     reach: float,
@@ -134,8 +136,6 @@ def search(
     ----------
     views, grid, window, start
         See `reconstruct`.
-    ratio, base : int
-        See `Scheme`.
     how : Search
     reach : float
         How far heights may lie above and below the start, metres.
@@ -148,7 +148,7 @@ def search(
     found: Searched | None = None
     planes = how.planes
     for level in range(how.coarsest, -1, -1):
-        facets = facets_of(grid, window, level, ratio)
+        facets = facets_of(grid, window, level, how.ratio)
         begun = np.asarray(start(facets.posts), float)
         if not np.isfinite(begun).any():
             return None
@@ -157,7 +157,7 @@ def search(
         if found is not None:
             near = _near(found, facets)
             low, high = np.clip(near[0], low, high), np.clip(near[1], low, high)
-        before, found = found, _level(views, level, base, facets, planes, low, high + 1) or found
+        before, found = found, _level(views, level, how.base, facets, planes, low, high + 1) or found
         if before is not None and found is not None and found is not before:
             found = replace(found, variance=found.variance + _nearest(before.facets, before.variance, facets))
     if found is None or found.facets.pitch != grid.resolution:
@@ -185,10 +185,16 @@ def _near(found: Searched, facets: Facets) -> tuple[_Integers, _Integers]:
 
 
 def _around(steps: _Doubles, sure: NDArray[np.bool_]) -> tuple[_Doubles, _Doubles]:
-    """Least and largest of the planes of the posts around each, farther around where posts are not sure."""
+    """Least and largest of the planes of the sure posts around each, farther around where a post is not sure.
+
+    Where no post around is sure, of all of them.
+    """
     ends = []
-    for extreme in (ndimage.minimum_filter, ndimage.maximum_filter):
-        ends.append(extreme(np.where(sure, extreme(steps, _NEAR), extreme(steps, _WIDE)), _NEAR))
+    for extreme, nothing in ((ndimage.minimum_filter, np.inf), (ndimage.maximum_filter, -np.inf)):
+        trusted = np.where(sure, steps, nothing)
+        far = extreme(trusted, _WIDE)
+        far = np.where(np.isfinite(far), far, extreme(steps, _WIDE))
+        ends.append(extreme(np.where(sure, extreme(trusted, _NEAR), far), _NEAR))
     return ends[0], ends[1]
 
 
@@ -212,7 +218,7 @@ def _level(
     census, known = np.zeros(shape, np.uint64), np.zeros(shape, bool)
     first = np.concatenate([[0], np.cumsum(high - low)]).astype(np.int64)
     cost = np.full(first[-1], _NEUTRAL, np.float32)
-    pairs = _pairs(seen, facets, float(ends.mean()))
+    pairs = _pairs(seen, facets, planes, level, float(ends.mean()))
     half = max(1, m // 2)
     grey = np.empty(shape[1:], np.float32)
     for k in range(int(low.min()), int(high.max())):
@@ -264,8 +270,13 @@ def _positions(
     return out[0], out[1]
 
 
-def _pairs(seen: Sequence[tuple[View, Window, NDArray[np.float32]]], facets: Facets, height: float) -> _Integers:
-    """Pairs of images that are compared: those whose rays part most like the usual ones."""
+def _pairs(
+    seen: Sequence[tuple[View, Window, NDArray[np.float32]]], facets: Facets, planes: Planes, level: int, height: float
+) -> _Integers:
+    """All pairs of images, the best to compare first: those whose rays part as the planes are made for.
+
+    Rays that part more see things from sides too different, and those that part less tell less of heights.
+    """
     every = np.array(list(combinations(range(len(seen)), 2)))
     if len(every) <= MOST_PAIRS:
         return every
@@ -276,8 +287,8 @@ def _pairs(seen: Sequence[tuple[View, Window, NDArray[np.float32]]], facets: Fac
         J = view.camera.derivatives(np.array([*middle, height]))
         ways.append(np.linalg.solve(J[:, :2], J[:, 2]))
     apart = np.linalg.norm(np.array(ways)[every[:, 0]] - np.array(ways)[every[:, 1]], axis=1)
-    order = np.argsort(np.abs(apart - np.median(apart)), kind="stable")
-    return np.ascontiguousarray(every[np.sort(order[:MOST_PAIRS])])
+    best = facets.pitch / facets.ratio / 2**level / float(planes.pixels(np.array(height)))
+    return np.ascontiguousarray(every[np.argsort(np.abs(np.log(np.maximum(apart, 1e-9) / best)), kind="stable")])
 
 
 def _contrast(cost: NDArray[np.float32], first: _Integers) -> float:

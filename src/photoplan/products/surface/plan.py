@@ -31,6 +31,8 @@ Bounds = tuple[float, float, float, float]
 TILE = 256
 #: Grey facets along a side of a height facet at most: images that are finer still are reduced.
 MOST_RATIO = 6
+#: And cells that a search compares: heights are found to parts of their pixels all the same.
+_CELLS = 3
 #: Height facets are at least so many ground pixels of the images.
 _FINEST = 1.0
 #: How far the start may be wrong if nobody states it, part of the flying height.
@@ -43,6 +45,8 @@ _CATCH, _LEAST = 1.0, 16
 _SOME = 32.0
 #: Part of the smaller footprint that two images share, whose parallax counts.
 _SHARED = 0.2
+#: B : H of images that see the ground from the same direction.
+_PARALLEL = 1e-4
 #: Levels at most.
 _LEVELS = 8
 #: Pixels of parallax of the reach from which on heights are searched; those for which the coarsest level of a search
@@ -183,9 +187,8 @@ def plan_surface(
     grid = MapGrid.covering(bounds, settings.resolution, project.crs)
     if min(grid.width, grid.height) < 2:
         raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
-    base = max(0, math.ceil(math.log2(settings.resolution / gsd / MOST_RATIO)))
-    ratio = max(1, round(settings.resolution / gsd / 2**base))
-    height_error = _height_of_a_pixel(looked, gsd)
+    ratio, base = _facets(settings.resolution / gsd, MOST_RATIO)
+    height_error, usual = _heights_of_a_pixel(looked, gsd)
     flying = _flying_height(looked)
     if 0 < _MOST_WRONG * flying < (settings.reach or 0.0):
         raise UsageError(
@@ -197,8 +200,8 @@ def plan_surface(
     scheme = Scheme(ratio, coarsest, base, reach)
     wanted = reach > _RELIEF * height_error if settings.search is None else settings.search
     if wanted:
-        pixel = height_error * settings.resolution / ratio / gsd
-        scheme = Scheme(ratio, 0, base, reach, _search(looked, pixel, reach, coarsest))
+        search = _search(looked, settings.resolution / gsd, usual, reach, coarsest)
+        scheme = Scheme(ratio, 0, base, reach, search)
     used = tuple(one.name for one in looked)
     files = [Path(path) for path, _ in ScenesAddress.of(project, used).digests]
     if settings.start not in ("terrain",) and _number(settings.start) is None:
@@ -279,9 +282,9 @@ def _bounds(settings: SurfaceSettings, looked: Sequence[Looked], blind: Sequence
     return b
 
 
-def _height_of_a_pixel(looked: Sequence[Looked], gsd: float) -> float:
-    """Height that parts the outermost images of a place by one pixel: GSD · H / B, for images that share enough."""
-    rates = [0.0]
+def _heights_of_a_pixel(looked: Sequence[Looked], gsd: float) -> tuple[float, float]:
+    """Heights that part images by one pixel, GSD · H / B: the outermost, and the usual of those that share enough."""
+    rates = []
     for one, other in combinations(looked, 2):
         a, b = one.look.footprint.bounds, other.look.footprint.bounds
         assert a is not None and b is not None
@@ -290,9 +293,10 @@ def _height_of_a_pixel(looked: Sequence[Looked], gsd: float) -> float:
         if (low < high).all() and float(np.prod(high - low)) > _SHARED * min(areas):
             middle = (low + high) / 2
             rates.append(float(np.linalg.norm(_slope(one, middle) - _slope(other, middle))))
-    if not max(rates) > 1e-4:
+    rates = [rate for rate in rates if rate > _PARALLEL]
+    if not rates:
         raise GeometryError("all images see the ground from the same direction: there is no parallax, and no height")
-    return gsd / max(rates)
+    return gsd / max(rates), gsd / float(np.median(rates))
 
 
 def _slope(one: Looked, XY: np.ndarray) -> np.ndarray:
@@ -313,14 +317,22 @@ def _flying_height(looked: Sequence[Looked]) -> float:
     return float(np.median(heights))
 
 
-def _search(looked: Sequence[Looked], pixel: float, reach: float, coarsest: int) -> Search:
-    """How heights are searched; `pixel`: that of one pixel of parallax on the finest level."""
+def _facets(pixels: float, most: int) -> tuple[int, int]:
+    """Facets along a height facet of so many pixels, and the level of the images whose pixels are as large as they."""
+    base = max(0, math.ceil(math.log2(pixels / most)))
+    return max(1, round(pixels / 2**base)), base
+
+
+def _search(looked: Sequence[Looked], pixels: float, height_error: float, reach: float, most: int) -> Search:
+    """How heights are searched whose facets have so many pixels of usual images along a side; `most` levels."""
     at = float(np.median([sum(one.look.footprint.height_range) / 2 for one in looked]))
     vantages = [one.scene.camera.vantage for one in looked]
     central = all(vantage.central for vantage in vantages)
     ceiling = min(float(vantage.point[2]) for vantage in vantages) if central else math.inf
-    level = math.ceil(math.log2(max(1.0, reach / pixel / _PLANES)))
-    return Search(Planes(pixel, at, ceiling), min(level, coarsest), _ROOM * pixel)
+    ratio, base = _facets(pixels, _CELLS)
+    cell = height_error * pixels / ratio
+    level = math.ceil(math.log2(max(1.0, reach / cell / _PLANES)))
+    return Search(Planes(cell, at, ceiling), ratio, base, min(level, most), _ROOM * cell)
 
 
 def _coarsest(reach: float, looked: Sequence[Looked], height_error: float, base: int) -> int:
