@@ -14,6 +14,8 @@ from tools.facet_scene import CONTRAST, GROUND, GSD, Scene, write_scene
 from tools.sketched import drawn
 from tools.small_block import X0, Y0
 
+from photoplan.products.surface.spread import counted, median
+
 CLOUDS = (".las", ".laz", ".ply")
 BOUNDS = (X0 - 18, Y0 - 30, X0 + 18, Y0 + 30)
 
@@ -197,3 +199,13 @@ def test_what_cannot_be_is_refused_by_name(scene: Scene, made: Path) -> None:
     assert said.code == 3 and "together they see" in said.err
     said = inside("surface", scene.path, "--resolution", 0.2)
     assert said.code == 2 and "finer than the images" in said.err
+
+
+def test_the_median_of_tiles_is_counted_in_classes() -> None:
+    rng = np.random.default_rng(2)
+    sigmas = np.exp(rng.normal(-4, 1, (3, 5000)))
+    sigmas[2, ::3] = 9.0  # a few that doubt do not speak for all
+    sigmas[0, :7] = np.nan
+    counts = np.sum([counted(part) for part in sigmas], axis=0).tolist()
+    assert median(counts) == pytest.approx(np.nanmedian(sigmas), rel=0.02)
+    assert median(counted(np.full((2, 2), np.nan))) is None

@@ -84,10 +84,10 @@ def command(project: Path, **options: Any) -> None:
 def _tell(result: Any, plan: Any, picture: Path | None, events: Any) -> None:
     """Figures of a surface, and where its picture is."""
     known = {name: value for name, value in result.sigma0.items() if value is not None}
-    mean = "unknown" if result.sigma is None else f"{result.sigma:.3g} m ({result.sigma_px:.2g} px of parallax)"
+    median = "unknown" if result.sigma is None else f"{result.sigma:.3g} m ({result.sigma_px:.2g} px of parallax)"
     events.talk(
         f"surface in {result.seconds:.1f} s · {result.valid_share:.1%} of {plan.grid.width * plan.grid.height} posts "
-        f"have a height, mean standard deviation {mean}; {result.misfit_share:.2%} fit badly"
+        f"have a height, median standard deviation {median}; {result.misfit_share:.2%} fit badly"
     )
     corrections = ", ".join(f"{c:.3f}" for c in result.corrections[::-1])
     events.talk(f"  last corrections, coarse to fine: {corrections} px")

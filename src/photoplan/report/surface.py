@@ -31,7 +31,7 @@ def surface_page(plan: SurfacePlan, result: SurfaceResult) -> str:
     parts = [
         headline([
             (f"{result.valid_share:.1%}", "posts with a height", f"of {plan.grid.width} × {plan.grid.height}; {lost}"),
-            (f"{result.sigma:.3g} m", "standard deviation", f"mean; {result.sigma_px:.2g} px of parallax")
+            (f"{result.sigma:.3g} m", "standard deviation", f"median; {result.sigma_px:.2g} px of parallax")
             if result.sigma is not None
             else ("–", "standard deviation", ""),
             (f"{len(plan.images)}", "images", f"{result.redundancy:.3g} observations beyond those that are needed"),

@@ -67,7 +67,7 @@ def findings(
         lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; `resolution` helps")
     if sigma_px is not None and sigma_px > _VAGUE:
         lines.append(
-            f"the mean standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "
+            f"the median standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "
             "images do not determine follows its surroundings; mask it by the standard deviations, or choose a coarser "
             "`resolution`"
         )

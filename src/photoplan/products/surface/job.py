@@ -17,6 +17,7 @@ from photoplan.matching.facets.pyramid import Pyramid
 from photoplan.matching.facets.reconstruct import MARGIN, Scheme, reconstruct
 from photoplan.matching.grey import GreyImage
 from photoplan.plan.tiles import Tile
+from photoplan.products.surface.spread import counted
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.scene import SceneAddress
 from photoplan.project.scenes import ScenesAddress, surface_of
@@ -82,7 +83,7 @@ class SurfaceJob:
             "redundancy": sums[:, 1].tolist(),
             "moves": moves.tolist(),
             "parts": parts,
-            "sigmas": float(np.nansum(sigmas)),
+            "sigmas": counted(sigmas),
             "heights": int(np.isfinite(sigmas).sum()),
             "astray": astray,
             "misfits": int((fit > MISFIT).sum()),

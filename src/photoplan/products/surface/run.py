@@ -27,6 +27,7 @@ from photoplan.products.run import BASE_MEMORY, Run, clock, refuse_inputs
 from photoplan.products.surface.findings import findings
 from photoplan.products.surface.job import SurfaceJob
 from photoplan.products.surface.plan import TILE, SurfacePlan
+from photoplan.products.surface.spread import median
 from photoplan.project.scene import input_files
 
 #: What the files hold: name of the file behind that of the product, band, unit.
@@ -60,7 +61,7 @@ class SurfaceResult:
     redundancy: float
     """Observations beyond those that determine grey values and heights."""
     sigma: float | None
-    """Mean standard deviation of the heights, metres."""
+    """Median standard deviation of the heights, metres."""
     sigma_px: float | None
     """The same in pixels of parallax between the outermost images."""
     misfit_share: float
@@ -219,7 +220,7 @@ def _result(
     pairs = zip(totals["squares"], totals["redundancy"])
     spreads = [float(np.sqrt(square / free)) if free > 0 else None for square, free in pairs]
     sigma0 = dict(zip(plan.images, spreads))
-    sigma = totals["sigmas"] / totals["heights"] if totals["heights"] else None
+    sigma = median(totals["sigmas"])
     sigma_px = None if sigma is None else sigma / plan.height_error
     misfits = totals["misfits"] / totals["heights"] if totals["heights"] else 0.0
     corrections = tuple(move / parts for move in totals["moves"])
