@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
+from photoplan.kernels.profiles import Shown
 from photoplan.kernels.sample_grid import sample_lattice, sample_points
 from photoplan.surfaces.carried import box_points, carried_positions
+from photoplan.surfaces.columns import follow_fan
 from photoplan.surfaces.grid_ranges import GridRanges, HeightGrid, RangeStore
 from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.rays import Cache, Hits, Part, carried_hits
@@ -148,10 +150,29 @@ class RasterSurface:
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
         """Where rays first come down onto the surface; see `Terrain.first_hit`."""
         paths = np.asarray(paths, float)
+        parts, cache = self._parts(FEW_PART if len(paths) < FEW else MANY_PART)
+        return carried_hits(parts, paths, self.to_grid_crs, bend, cache)
+
+    def fan_hit(
+        self,
+        center: NDArray[np.float64],
+        ends: NDArray[np.float64],
+        rise: tuple[NDArray[np.float64], NDArray[np.float64]],
+        rows: tuple[int, int],
+        bend: float,
+    ) -> Shown | None:
+        """What the rays of a picture whose columns are vertical planes meet; see `follow_fan`. None: the grid lies in
+        another CRS."""
+        if self.to_grid_crs is not None:
+            return None
+        parts, cache = self._parts(MANY_PART)
+        return follow_fan(parts, center, ends, rise, rows, bend, cache)
+
+    def _parts(self, most: int) -> tuple[RasterParts, Cache]:
+        """Parts of at most so many meshes along a side, and those that were used last."""
         # No more posts at once than the file's blocks have.
-        side = max(16, min(FEW_PART if len(paths) < FEW else MANY_PART, *self.part))
-        cache: Cache = self._kept.setdefault(side, OrderedDict())
-        return carried_hits(RasterParts(self, side), paths, self.to_grid_crs, bend, cache)
+        side = max(16, min(most, *self.part))
+        return RasterParts(self, side), self._kept.setdefault(side, OrderedDict())
 
     def _posts(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map coordinates to (column, row) of the posts."""

@@ -188,7 +188,8 @@ def follow(parts: Parts, paths: ArrayLike, bend: float = 0.0, cache: Cache | Non
     for piece in range(at.shape[1] - 1):
         box = begin_lines(at, piece, bend, parts.inside, frame, away, hits.result, states, lines, rays, spans)
         if box[0] <= box[2]:
-            _over_parts(parts, _window(parts, box), (lines, rays, states, hits, spans), cache)
+            which = np.flatnonzero(spans[:, 1] >= 0)
+            over_parts(parts, box, which, _Rays(parts, lines, rays, states, hits), cache)
         end_lines(at, piece, bend, away, rays, spans, hits.result, states, hits.XYZ, hits.along, hits.normal)
     hits.below[:] = (hits.result == MISS) & (states == BELOW)
     hits.owner[hits.result != MISS] = 0
@@ -228,20 +229,71 @@ def _carry_back(hits: Hits, there: NDArray[np.int64], carry: Carry) -> None:
     hits.normal[there] = n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
-_Walk = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], Hits, NDArray[np.float64]]
-"""Lines, rays, states, hits and spans: see `kernels.raywalk`."""
+class Walk(Protocol):
+    """Rays that are followed from part to part: lines of `kernels.raywalk`, each in one part at a time."""
+
+    def next(
+        self,
+        ranges: tuple[NDArray[np.float64], NDArray[np.float64]],
+        first: tuple[int, int],
+        which: NDArray[np.int64],
+        places: NDArray[np.int64],
+    ) -> None:
+        """Fill in the part that each of some rays has to be followed over next: see `kernels.raywalk.next_part`."""
+        ...
+
+    def over(self, part: Part, group: NDArray[np.int64]) -> None:
+        """Follow some rays over a part."""
+        ...
+
+    def going(self, which: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of some rays still look for ground."""
+        ...
 
 
-def _over_parts(parts: Parts, window: Window, walk: _Walk, cache: Cache) -> None:
-    """Follow one piece of all rays from part to part, as far as the first hit."""
-    lines, rays, states, hits, spans = walk
-    ranges = parts.ranges(window)
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """One piece of all rays, as far as the first hit: see `kernels.raywalk`."""
+
+    parts: Parts
+    lines: NDArray[np.float64]
+    rays: NDArray[np.float64]
+    states: NDArray[np.int64]
+    hits: Hits
+
+    def next(
+        self,
+        ranges: tuple[NDArray[np.float64], NDArray[np.float64]],
+        first: tuple[int, int],
+        which: NDArray[np.int64],
+        places: NDArray[np.int64],
+    ) -> None:
+        next_part(*ranges, first, self.rays, self.states, which, places)
+
+    def over(self, part: Part, group: NDArray[np.int64]) -> None:
+        hits, states = self.hits, self.states
+        asks = follow_part(part.posts, part.pyramid, part.faces, (*part.corner, *part.mesh, part.datum),
+                           self.lines, self.rays, states, hits.result, hits.normal, group)  # fmt: skip
+        if asks:
+            asking = group[hits.result[group] == ASK]
+            states[asking] = _before(self.parts, self.lines[asking], self.rays[asking, 7])
+            hits.result[asking] = MISS
+
+    def going(self, which: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return np.asarray(self.hits.result[which] == MISS)
+
+
+def over_parts(
+    parts: Parts, box: tuple[float, float, float, float], which: NDArray[np.int64], walk: Walk, cache: Cache
+) -> None:
+    """Follow rays from part to part inside lowest x, y and highest x, y, counted in parts; parts may be kept."""
+    window = _window(parts, box)
+    ranges, first = parts.ranges(window), (window.col, window.row)
     low, high = (np.array(ranges[..., j], order="C") for j in (0, 1))
     low[np.isnan(low)], high[np.isnan(high)] = np.inf, -np.inf
-    which, first = np.flatnonzero(spans[:, 1] >= 0), (window.col, window.row)
     while len(which):
         places = np.empty(len(which), np.int64)
-        next_part(low, high, first, rays, states, which, places)
+        walk.next((low, high), first, which, places)
         for group, place in _groups(which, places):
             row, column = divmod(place, window.width)
             at = column + window.col, row + window.row
@@ -254,13 +306,8 @@ def _over_parts(parts: Parts, window: Window, walk: _Walk, cache: Cache) -> None
             if part is None:
                 low[row, column], high[row, column] = np.inf, -np.inf
                 continue
-            asks = follow_part(part.posts, part.pyramid, part.faces, (*part.corner, *part.mesh, part.datum),
-                               lines, rays, states, hits.result, hits.normal, group)  # fmt: skip
-            if asks:
-                asking = group[hits.result[group] == ASK]
-                states[asking] = _before(parts, lines[asking], rays[asking, 7])
-                hits.result[asking] = MISS
-        which = which[(places >= 0) & (hits.result[which] == MISS)]
+            walk.over(part, group)
+        which = which[(places >= 0) & walk.going(which)]
 
 
 def _window(parts: Parts, box: tuple[float, float, float, float]) -> Window:

@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.geometry.rotation import dot
+from photoplan.kernels.profiles import LEFT
 from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.rays import Hits
 from photoplan.targets.base import Target
+from photoplan.targets.fan import fan_of
 from photoplan.targets.view import ViewTarget
 
 #: How far one sees where terrain has no end, metres; and how deep the earth's surface reaches.
@@ -81,7 +84,15 @@ class SeenSurface:
         return self.look(target, window).uvh[..., 2].astype(np.float32)
 
     def look(self, target: Target, window: Window) -> Seen:
-        """What the pixels of a window show, shape (height, width, …)."""
+        """What the pixels of a window show, shape (height, width, …).
+
+        By a profile for each column where columns are vertical planes and the terrain is a grid of heights; else by a
+        ray for each pixel. Both see the same.
+        """
+        if isinstance(target, ViewTarget) and isinstance(self.terrain, RasterSurface):
+            seen = self._by_columns(self.terrain, target, window)
+            if seen is not None:
+                return seen
         v, u = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].astype(float)
         return self.at(target, np.stack([u, v], axis=-1).reshape(-1, 2)).reshaped(window.height, window.width)
 
@@ -115,6 +126,35 @@ class SeenSurface:
             owner=hits.owner,
             lost=(hits.owner < 0) & (ways[:, 2] < 0),
         )
+
+    def _by_columns(self, terrain: RasterSurface, target: ViewTarget, window: Window) -> Seen | None:
+        """What pixels show, by profiles; None: they are of no use here."""
+        reach = self._reach(target)
+        fan = fan_of(target, window, reach, self.bound / 2)
+        if fan is None:
+            return None
+        ends = target.center[:2] + min(reach, self.farthest) * fan.ways
+        shown = terrain.fan_hit(target.center, ends, (fan.rise, fan.steeper), fan.rows, target.bend)
+        if shown is None:
+            return None
+        XYZ, normal, towards, away, owner = shown
+        uvh = np.empty(XYZ.shape)
+        uvh[..., 0] = np.arange(window.col, window.stop[0])
+        uvh[..., 1] = np.arange(window.row, window.stop[1])[:, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            uvh[..., 2] = away / fan.level[0] / fan.level[1][:, None]
+        left, ground = owner == LEFT, owner == 0
+        seen = Seen(XYZ, uvh, normal, towards, owner, (owner < 0) & ~fan.up[:, None])
+        if np.isfinite(self.farthest):
+            gone = np.zeros(owner.shape, bool)
+            gone[ground] = target.distance(uvh[ground]) > self.farthest
+            XYZ[gone], normal[gone], towards[gone], uvh[gone, 2], owner[gone] = np.nan, np.nan, np.nan, np.nan, -1
+            seen.lost[gone & ~fan.up[:, None]] = True
+        if left.any():
+            own = self.at(target, uvh[left][:, :2])
+            for name, values in vars(seen).items():
+                values[left] = getattr(own, name)
+        return seen
 
     def _reach(self, target: ViewTarget) -> float:
         """Length at which rays have left the terrain, to its side or below it."""

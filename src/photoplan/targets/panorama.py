@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +30,8 @@ class Panorama:
     horizon: float
     """Row of the horizon."""
     spherical: bool = False
+    upright: bool = field(default=True, init=False)
+    """Columns are vertical planes."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.scale) and self.scale > 0 and min(self.size) >= 1):

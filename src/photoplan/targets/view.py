@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import CentralCamera, project
 from photoplan.cameras.build import taken_apart
+from photoplan.cameras.risen import EarthBend, Exaggeration
 from photoplan.cameras.warped import Warp
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Placement, Window
@@ -22,6 +23,8 @@ from photoplan.geometry.rotation import dot
 
 #: Rays that are bent are followed in at most so many pieces.
 MOST_PIECES = 64
+#: Tangents by which columns of a picture may differ from vertical planes: they are some roundings.
+_UPRIGHT = 1e-13
 #: Rays of a window that are looked at to find out how many pieces are needed.
 _SAMPLE = 49
 
@@ -37,6 +40,12 @@ class Bundle(Protocol):
     @property
     def center(self) -> NDArray[np.float64]:
         """The point, shape (3,)."""
+        ...
+
+    @property
+    def upright(self) -> bool:
+        """Whether each column lies in a vertical plane, and the rays of a row are equal but for a factor of their level
+        part; the first row is the uppermost."""
         ...
 
     def directions(self, uv: ArrayLike) -> NDArray[np.float64]:
@@ -84,6 +93,14 @@ class FrameBundle:
     def center(self) -> NDArray[np.float64]:
         """Projection centre."""
         return self.camera.center
+
+    @property
+    def upright(self) -> bool:
+        """That of a level camera without roll, lens and shear: looked at in five columns and rows."""
+        u, v = (np.linspace(-0.5, side - 0.5, 5) for side in self.size)
+        d = self.directions(np.stack(np.meshgrid(u, v), axis=-1))
+        apart = max(np.abs(d[..., :2] - d[:1, :, :2]).max(), np.abs(d[..., 2] - d[:, :1, 2]).max())
+        return bool(apart < _UPRIGHT and d[0, 0, 2] > d[-1, 0, 2])
 
     @property
     def _axis(self) -> NDArray[np.float64]:
@@ -135,6 +152,11 @@ class ViewTarget:
         assert isinstance(self.bundle, FrameBundle)
         camera = self.bundle.camera.moved(aside)
         return replace(self, bundle=FrameBundle(camera), center=self._on_map(camera.center))
+
+    @property
+    def upright(self) -> bool:
+        """Whether the columns of the picture are vertical planes on the map, see `Bundle.upright`."""
+        return self.bundle.upright and all(isinstance(warp, EarthBend | Exaggeration) for warp in self.warps)
 
     @property
     def window(self) -> Window:

@@ -146,11 +146,13 @@ class _Finer:
     n: int
     size: tuple[int, int] = field(init=False)
     center: NDArray[np.float64] = field(init=False)
+    upright: bool = field(init=False)
 
     def __post_init__(self) -> None:
         width, height = self.bundle.size
         object.__setattr__(self, "size", (width * self.n, height * self.n))
         object.__setattr__(self, "center", self.bundle.center)
+        object.__setattr__(self, "upright", self.bundle.upright)
 
     def directions(self, uv: ArrayLike) -> NDArray[np.float64]:
         return self.bundle.directions((np.asarray(uv, float) + 0.5) / self.n - 0.5)
