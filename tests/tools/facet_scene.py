@@ -66,17 +66,18 @@ def write_scene(
     size: tuple[int, int] = SIZE,
     gain: float = 0.0,
     bare: float = 0.0,
+    relief: Field | None = None,
 ) -> Scene:
     """Images in a strip with `base` metres between the outermost; the shortest wave of the pattern has `finest` pixels.
 
     Noise of CONTRAST / snr, then whole grey values. From the first to the last image they become brighter by the part
-    `gain`. Within `bare` metres north and south of the middle there is no pattern.
+    `gain`. Within `bare` metres north and south of the middle there is no pattern. `relief`: other hills.
     """
     flight = Flight((X0, Y0), GROUND + HEIGHT, (base / (images - 1), 0.0), (images, 1), size, FOCAL)
     path = write_project(folder, CRS, f"height = {GROUND}", "", flight)
     rng = np.random.default_rng(seed)
     lengths = np.repeat((40.0, 100.0), 6)
-    hills = waves(seed + 1, lengths, lengths / 100.0)
+    hills = relief or waves(seed + 1, lengths, lengths / 100.0)
     pattern = waves(seed + 2, finest * GSD * 12.0 ** np.linspace(0, 1, 64), np.full(64, CONTRAST * np.sqrt(2 / 64)))
     grey: Field = lambda X, Y: 120 + pattern(X, Y) * np.clip(np.abs(Y - Y0) - bare, 0, 1)  # noqa: E731
     scene = Scene(path, lambda X, Y: GROUND + hills(X, Y), grey if bare else lambda X, Y: 120 + pattern(X, Y), base)
