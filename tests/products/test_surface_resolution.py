@@ -9,7 +9,7 @@ import pytest
 import rasterio
 from scipy import ndimage
 from tools.command import inside
-from tools.facet_scene import GROUND, GSD, waves, write_scene
+from tools.facet_scene import GSD, waves, write_scene
 from tools.small_block import X0, Y0
 
 #: Side of the fine grid of the truth, pixels of the images.
@@ -47,6 +47,7 @@ def test_resolution_times_error(images: int, tmp_path: Path) -> None:
     error, width = best[0] / scene.height_of_a_pixel, best[1]
     spread = true.std() / scene.height_of_a_pixel
     print(
-        f"{images} images: resolution {width} px, error {error:.3f} px (hills {spread:.2f}), product {width * error:.2f}"
+        f"{images} images: resolution {width} px, error {error:.3f} px (hills {spread:.2f}), "
+        f"product {width * error:.2f}"
     )
     assert width * error < 0.5
