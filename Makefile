@@ -9,7 +9,7 @@ OLDEST := .venv-oldest
 # Every process would compile all sources of photoplan and of the tests anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-times test-slow test-nojit test-plain test-oldest lint docs bench clean
+.PHONY: demo test collected test-times test-slow test-nojit test-plain test-oldest lint docs bench clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -20,15 +20,20 @@ $(STAMP): pyproject.toml
 demo: $(STAMP)
 	$(BIN)/photoplan demo demo
 
-# Static checks take as long as docs and plain kernels together: side by side, each with its output in one piece.
+# Static checks take as long as the others together: side by side, each with its output in one piece.
 SIDE_BY_SIDE := --jobs=2 $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 
 # One process more than cores: many tests wait for processes of their own, for locks and for the disk.
 PROCESSES = $(shell $(PYTHON) -c "import os; print(min(5, 1 + (os.cpu_count() or 1)))")
 
 test: $(STAMP)
-	$(MAKE) $(SIDE_BY_SIDE) lint docs test-nojit
+	$(MAKE) $(SIDE_BY_SIDE) lint docs test-nojit collected
 	$(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile -m "not slow and not bench"
+
+# In a fresh clone each process of tests would compile the sources of all of them and of what they import, 20 CPU s; here
+# it is done once. What cannot be collected is told by the tests themselves.
+collected: $(STAMP)
+	$(BIN)/python -m pytest -q --collect-only -m "not slow and not bench" >/dev/null || true
 
 # Which tests take the processor's time: folders, files, the dearest tests. Of some only: `make test-times TESTS=tests/cli`.
 test-times: $(STAMP)

@@ -138,7 +138,14 @@ def test_linearity_ends_where_the_sensor_saturates(told):
     assert found["response"]["value"] == pytest.approx(0.4 * 0.5 * PHOTONS_PER_MS, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn
+def test_figures_of_the_report_are_drawn(folder, tmp_path, run):
+    report = tmp_path / "r.html"
+    assert run("characterise", folder / "series.toml", "--report", report).code == 0
+    assert report.read_text("utf-8").count("data:image/png") > 10
+
+
 def test_report_tables_and_json(folder, tmp_path, run):
     report, tables = tmp_path / "r.html", tmp_path / "csv"
     said = run("characterise", folder / "series.toml", "--report", report, "--csv", tables)

@@ -12,7 +12,7 @@ from tools.arrays import noise, product
 from tools.function_surface import FunctionSurface
 from tools.kinds import FEW, KINDS
 from tools.pinhole import Pinhole
-from tools.thinned import some
+from tools.thinned import examples, some
 from tools.twin import TwinSource, twin_compose
 
 from photoplan.engine.arrays import ArrayReader
@@ -68,7 +68,7 @@ def compare(got, want, good, dtype: str, slack: float) -> None:  # type: ignore[
 
 
 @pytest.mark.parametrize("kinds", some([SMOOTH_FEW, SMOOTH], 0), ids=["few", "all"])
-@settings(max_examples=25, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@settings(max_examples=examples(12, 25), deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(
     kappa=st.floats(-3.1, 3.1),
     tilt=st.floats(-0.15, 0.15),
@@ -130,7 +130,7 @@ def test_a_window_beside_the_image_holds_nothing() -> None:
 
 
 @pytest.mark.parametrize("kinds", some([SMOOTH_FEW, SMOOTH], 0), ids=["few", "all"])
-@settings(max_examples=15, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@settings(max_examples=examples(7, 15), deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(
     count=st.integers(2, 8),
     kind=st.integers(0, 999),

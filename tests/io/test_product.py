@@ -261,6 +261,7 @@ print(peak_memory_bytes() - before)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="memory is measured by the system's own count")
 def test_fault_06_memory_does_not_grow_with_the_product(tmp_path: Path) -> None:
     """162 MB of pixels with overviews; GDAL's cache takes 32 MiB, compression and overviews about as much."""

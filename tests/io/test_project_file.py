@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tools.thinned import examples
 
 from photoplan.errors import HeightSystemError, InputError, UsageError
 from photoplan.io.camera.film import FilmEntry
@@ -80,7 +81,7 @@ def usable(name: str) -> bool:
         return False
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(25, 60), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.text(min_size=1, max_size=30).filter(usable),
     numbers=st.tuples(

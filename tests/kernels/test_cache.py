@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -43,6 +45,31 @@ def test_second_process_loads_what_the_first_compiled(tmp_path):
     assert talk[0].split() == ["False", "True", "1", "1"]
     # What lies on the disk is asked of numba's inside; where that is not leaned on, the answer is no.
     assert talk[1].split() == [str(numba_parts.USABLE), "True", "0", "0"]
+
+
+def _compiled(path: Path):
+    """Functions of a file that numba compiles."""
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.FunctionDef) and {"kernel", "inner", "maker"} & {
+            ast.unparse(d) for d in node.decorator_list
+        }:
+            yield node
+
+
+def test_no_kernel_assigns_an_array_to_a_slice_or_takes_differences():
+    """Either makes numba compile messages about shapes, text and all: 3 s for each kernel, of every new user."""
+    seen = 0
+    for path in sorted(Path(jit.__file__).parent.glob("*.py")):
+        for function in _compiled(path):
+            seen += 1
+            for node in ast.walk(function):
+                place = f"{path.name}: {function.name}: {ast.unparse(node)}" if isinstance(node, ast.stmt) else ""
+                if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Subscript):
+                    sliced = any(isinstance(each, ast.Slice) for each in ast.walk(node.targets[0].slice))
+                    names = {each.id for each in ast.walk(node.value) if isinstance(each, ast.Name)} - {"np"}
+                    assert not (sliced and names), place
+                assert not (isinstance(node, ast.Call) and ast.unparse(node.func) == "np.diff"), function.name
+    assert seen > 150
 
 
 LOADED = """

@@ -41,8 +41,8 @@ def spoilt(kind: str, seed: int) -> Block:
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("constant", "the camera constant of camera 'cam'"),
-        ("principal point", "the principal point of camera 'cam'"),
+        pytest.param("constant", "the camera constant of camera 'cam'", marks=pytest.mark.slow),
+        pytest.param("principal point", "the principal point of camera 'cam'", marks=pytest.mark.slow),
         ("datum", "a common shift of the observed positions"),
         ("shift", "a shift of the observed positions in each strip"),
         ("drift", "a drift of the observed positions in each strip"),

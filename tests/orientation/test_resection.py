@@ -78,6 +78,7 @@ def test_curvature_and_refraction_at_6_km(curvature: str) -> None:
     assert np.abs(plain.pose.center - pose.center).max() > 0.05, "the effect is there"
 
 
+@pytest.mark.slow
 def test_camera_constant_and_principal_point_of_hilly_terrain() -> None:
     rng = np.random.default_rng(6)
     interior = Interior.digital((4000, 3000), (3100.0, 3100.0), (12.0, -8.0))

@@ -93,7 +93,7 @@ def normalised(made: SimulatedStrips, settings: AdjustSettings = PLAIN) -> tuple
     return errors, (found.XYZ - XYZ) / sigma
 
 
-@thinned("runs", 2, 200)
+@thinned("runs", 1, 200)
 def test_boresight_clock_and_splines_are_unbiased_with_right_accuracy(runs: int) -> None:
     """Truth is drawn from what is known beforehand, so that normalised errors have a standard deviation of one."""
     mount, spline, points = [], [], []

@@ -209,7 +209,7 @@ def test_images_that_drop_out_do_not_shift_the_others(tmp_path: Path) -> None:
     np.testing.assert_allclose(rotations[1:], made.rotations[1:], atol=2e-7)
 
 
-@thinned("blocks", 8, 20)
+@thinned("blocks", 5, 20)
 def test_standard_deviations_are_those_of_the_map(tmp_path: Path, blocks: int) -> None:
     """Noisy blocks: errors of orientations divided by their standard deviations spread by about one."""
     z: list[np.ndarray] = []

@@ -127,6 +127,7 @@ def test_a_block_at_the_edge_of_the_terrain_is_left_alone() -> None:
     assert result.alternative is None
 
 
+@pytest.mark.slow
 def test_a_heading_askew_to_the_lines_is_left_alone() -> None:
     opk, centers = strips()
     for askew in (20.0, 40.0, -30.0):
@@ -134,6 +135,7 @@ def test_a_heading_askew_to_the_lines_is_left_alone() -> None:
         assert assess(views(opk, centers), hills).alternative is None
 
 
+@pytest.mark.slow
 def test_irregular_flights_are_left_alone() -> None:
     rng = np.random.default_rng(8)
     for _ in range(4):

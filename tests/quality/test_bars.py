@@ -7,6 +7,7 @@ from math import pi
 import numpy as np
 import pytest
 from tools.patterns import bars, gauss_box, star
+from tools.thinned import thinned
 
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
@@ -161,12 +162,13 @@ def test_full_contrast_has_to_be_known():
         bar_curve([measure_bars(noisy(0.3, 10.0))], (5.0, 4.0))
 
 
-def test_standard_deviations_hold_the_error_of_the_object_s_contrast():
-    """Of noisy bars, the widest of which tell the contrast: 40 series, MTF and contrast transfer."""
+@thinned("series", 20, 40)
+def test_standard_deviations_hold_the_error_of_the_object_s_contrast(series):
+    """Of noisy bars, the widest of which tell the contrast: MTF and contrast transfer."""
     known = [measure_bars(bars((60, 80), f, 5.0, SIGMA)) for f in (0.05, 0.1)]
     truth = bar_curve(known)
     errors, sigmas = [], []
-    for seed in range(40):
+    for seed in range(series):
         groups = [measure_bars(noisy(f, 5.0, 100 * k + seed, 12.0)) for k, f in enumerate((0.05, 0.1))]
         curve, given = bar_curve(groups), bar_curve(groups, LEVELS)
         for found, right in ((curve.mtf, truth.mtf), (curve.contrast, truth.contrast)):

@@ -54,6 +54,7 @@ def test_normalised_errors_of_gain_and_read_noise_spread_by_one(runs):
         assert abs(np.mean(normalised)) < 0.15
 
 
+@pytest.mark.slow
 @thinned("runs", 200, 500)
 def test_normalised_errors_of_read_noise_without_dark_frames_spread_by_one(runs):
     """Far extrapolated: the errors of slope and offset of the line belong together."""

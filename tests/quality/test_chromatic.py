@@ -114,6 +114,7 @@ def roofs(size, k, seed=0):
     return ArrayScene(np.stack([0.8 * scene, scene, 0.9 * scene + 0.05]), k)
 
 
+@pytest.mark.slow
 def test_displacements_from_edges_of_a_scene():
     """Issue: the same from edges, at a median signal-to-noise ratio of 50."""
     size = (480, 360)

@@ -91,6 +91,7 @@ def _least_error(blur, length):
     return sqrt(4.0 * sqrt(pi) / (SNR**2 * length * width))
 
 
+@pytest.mark.slow
 def test_long_edges_reach_the_bounds_one_by_one():
     random = np.random.default_rng(8)
     worst = np.zeros(2)

@@ -22,10 +22,11 @@ def transition(
     return y + np.random.default_rng(seed).normal(0, np.where(TIMES < STEP, noise[0], noise[1]))
 
 
-def test_17_grey_values_after_bright_to_dark_are_recovered() -> None:
+@thinned("runs", 100, 200)
+def test_17_grey_values_after_bright_to_dark_are_recovered(runs: int) -> None:
     """Behr: about 17 grey values after a step from bright to dark; hardly any after one from dark to bright."""
     sizes, constants = [], []
-    for seed in range(200):
+    for seed in range(runs):
         found = gain_control(TIMES, transition(seed, 160, 60, 17.0))
         assert found.direction == "bright to dark" and found.approach.significant
         a = found.approach

@@ -63,6 +63,7 @@ def test_four_corner_marks_are_found_unaided(
     assert (tmp_path / f"{name}.fiducials.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_scan_of_unknown_resolution_gives_the_same_places(shared: Path, camera: Path, photoplan: Here) -> None:
     file = shared / "data" / "film_act_canberra" / "act1985_run12_030_200dpi.jpg"
     places = []

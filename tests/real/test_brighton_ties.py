@@ -63,6 +63,7 @@ def test_approximate_orientation_guides(project: Path) -> None:
     assert within(residuals, 3.0) >= 0.95
 
 
+@pytest.mark.slow
 def test_refined_points_fit_better_than_features(project: Path, free) -> None:
     residuals = free[2]
     _, plain, before = ties(project, use_orientation=False, refine=False)

@@ -43,7 +43,7 @@ def test_frames_agree_with_each_other_within_1_m(against_satellite):
 
 @pytest.mark.parametrize(
     "frame, limit",
-    some([(0, 1.0), (1, 1.0), (2, 1.0), (3, 2.5)], 0),
+    some([(0, 1.0), (1, 1.0), (2, 1.0), (3, 2.5)]),
 )
 def test_orthophotos_agree_with_others_of_the_same_frames(shared, ngi, frame, limit):
     """Same orientation and heights; made from the full-resolution frames by other software, 5 m.

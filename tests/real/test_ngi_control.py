@@ -15,7 +15,10 @@ from photoplan.products.control.run import ControlRequest, propose_control
 
 @pytest.mark.parametrize(
     ("orthos", "limit"),
-    [([f"ngi_rgb_byte_{k}.tif" for k in (1, 2, 3, 4)], 1.0), (["sentinel2_b432_byte.tif"], 1.5)],
+    [
+        ([f"ngi_rgb_byte_{k}.tif" for k in (1, 2, 3, 4)], 1.0),
+        pytest.param(["sentinel2_b432_byte.tif"], 1.5, marks=pytest.mark.slow),
+    ],
     ids=["of the same flight", "of a satellite, 10 m"],
 )
 def test_control_fits_the_true_orientation_to_a_pixel(

@@ -108,7 +108,7 @@ def one_of_each() -> list[Crop]:
     return [crops[k % len(crops)] for k, crops in enumerate(families.values())]
 
 
-@pytest.mark.parametrize("some", [one_of_each(), pytest.param(CROPS, marks=pytest.mark.slow)], ids=["seven", "all"])
+@pytest.mark.parametrize("some", [one_of_each()[:2], pytest.param(CROPS, marks=pytest.mark.slow)], ids=["two", "all"])
 def test_marks_of_another_camera_are_refused(shared, some):
     taken = []
     for crop in some:

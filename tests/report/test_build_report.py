@@ -147,6 +147,7 @@ def test_many_findings_are_counted(document):
     assert "and 10 more of this kind" in document
 
 
+@pytest.mark.slow
 @pytest.mark.drawn
 def test_the_same_model_has_the_same_report(facts, document):
     assert build_page(facts) == document

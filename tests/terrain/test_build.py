@@ -70,6 +70,7 @@ class TestNoSeams:
         assert np.isfinite(jump).sum() > 100
         assert np.nanmax(np.abs(jump)) < 1e-6
 
+    @pytest.mark.slow
     def test_any_number_of_workers_gives_the_same(self, model: Built) -> None:
         again = built(
             terrain(model.plan.seen.xyz[: model.plan.seen.points] + model.plan.seen.origin),
@@ -320,7 +321,7 @@ class TestFigures:
 
     def test_the_plan_names_the_grid_that_is_built(self) -> None:
         """Half the width where breaklines pass, unless a width is asked for."""
-        xyz = with_heights(scattered(60.0, 900, 1), smooth, 0.02)
+        xyz = with_heights(scattered(40.0, 400, 1), smooth, 0.02)
         edge = line(np.column_stack([np.full(9, 10.2), np.linspace(5, 30, 9), np.full(9, 300.0)]))
         for measured, asked, part in (
             (terrain(xyz, edge), None, 2),

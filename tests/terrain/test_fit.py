@@ -156,8 +156,9 @@ class TestGrossErrors:
     def test_two_neighbours_that_deviate_alike_contradict_all_others(self, roof: NDArray[np.float64]) -> None:
         """A small group whose border breaks off all round is wrong, or a stone; whoever knows it takes `gross=0`."""
         k = int(np.flatnonzero(np.abs(roof[:, 0] - 30) > 4)[107])
-        pair = [k, self.nearest(roof, k)]
-        xyz = roof.copy()
+        near = np.flatnonzero(np.abs(roof[:, 1] - roof[k, 1]) < 14)
+        xyz, k = roof[near], int(np.searchsorted(near, k))
+        pair = [k, self.nearest(xyz, k)]
         xyz[pair, 2] += 20 * self.NOISE
         assert set(pair) <= set(built(terrain(xyz, self.ridge())).fit.gross.tolist())
 
@@ -198,7 +199,7 @@ class TestGrossErrors:
 
     def test_none_is_sought_with_limit_zero(self, roof: NDArray[np.float64]) -> None:
         xyz, _ = self.spoiled(roof)
-        found = built(terrain(xyz, self.ridge()), gross=0.0).fit
+        found = built(terrain(xyz[:900], self.ridge()), gross=0.0).fit
         assert len(found.gross) == 0 and np.isfinite(found.residuals[:, 2]).mean() > 0.99
 
 

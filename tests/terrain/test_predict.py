@@ -116,6 +116,7 @@ def plain(xyz: NDArray[np.float64], way: NDArray[np.float64]) -> tuple[NDArray[n
 
 
 class TestInvariance:
+    @pytest.mark.slow
     def test_shift(self, xyz: Any, way: Any, plain: Any) -> None:
         """By a million metres, a multiple of the units; in height too."""
         by = np.array([1_000_000.0, 6_400_000.0, 1000.0])

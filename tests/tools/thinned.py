@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 
 def thinned(name: str, few: int, all_of_them: int) -> pytest.MarkDecorator:
@@ -25,3 +26,8 @@ def some(values: Iterable[Any], *places: int) -> list[Any]:
         return pytest.param(*(value if isinstance(value, tuple) else (value,)), marks=pytest.mark.slow)
 
     return [value if place in places else slow(value) for place, value in enumerate(values)]
+
+
+def examples(few: int, all_of_them: int) -> int:
+    """Number of invented cases: the few in `make test`, all where new ones are looked for (`make test-slow`)."""
+    return few if settings.default.derandomize else all_of_them

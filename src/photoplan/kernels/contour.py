@@ -290,7 +290,8 @@ def smooth_line(places: NDArray[np.float64], closed: bool, passes: int) -> None:
                 s = (mx * ex + my * ey) / size
             s = min(max(s, 0.0), 1.0)
             moved[i, 0], moved[i, 1] = places[i, 2] + s * ex, places[i, 3] + s * ey
-        places[:, :2] = moved
+        for i in range(n):
+            places[i, 0], places[i, 1] = moved[i, 0], moved[i, 1]
 
 
 @inner

@@ -57,7 +57,9 @@ def block_score(
     while scored < n and noise[scored, 2] != 0.0:
         scored += 1
     w = np.zeros((n, 4 + scored))
-    w[:, :4] = b
+    for i in range(n):
+        for k in range(4):
+            w[i, k] = b[i, k]
     for i in range(scored):
         w[i, 4 + i] = 1.0
     solve_transposed(u, w)
@@ -94,7 +96,6 @@ def _objective(
     return total
 
 
-@kernel
 def minimise(
     d2: NDArray[Any],
     sides: NDArray[Any],
@@ -105,6 +106,8 @@ def minimise(
     family: int,
 ) -> tuple[NDArray[Any], float]:
     """Logarithms of the parameters of the best prediction, by the simplex of Nelder and Mead; and the objective.
+
+    Not compiled: its time is that of the objective, and numba would take 10 s for this little of NumPy.
 
     Parameters
     ----------
@@ -154,4 +157,4 @@ def minimise(
             simplex[i] = simplex[0] + 0.5 * (simplex[i] - simplex[0])
             values[i] = _objective(d2, sides, b, noise, prior, simplex[i], family)
     best = np.argmin(values)
-    return simplex[best], values[best]
+    return simplex[best], float(values[best])

@@ -25,7 +25,10 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": _FAST}
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile `function` on its first call for each set of types; later processes load it from the disk."""
+    """Compile `function` on its first call for each set of types; later processes load it from the disk.
+
+    It copies arrays element by element: for `a[:n] = b` numba compiles messages about shapes, 3 s for each kernel.
+    """
     if not COMPILED:
         return function
     dispatcher = njit(**_OPTIONS, **KERNEL_OPTIONS)(function)

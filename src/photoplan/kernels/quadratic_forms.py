@@ -89,7 +89,10 @@ def point_variances(Q, A, P, row_pointer, row_index, V_inverse):
                     N[k, column] += P[r, k] * A.values[a]
         C = V_inverse[p] @ N
         QC = dense @ np.ascontiguousarray(C.T)
-        covariance[p] = V_inverse[p] + C @ QC
+        own = C @ QC
+        for i in range(3):
+            for k in range(3):
+                covariance[p, i, k] = V_inverse[p, i, k] + own[i, k]
         for q in range(row_pointer[p], row_pointer[p + 1]):
             r = row_index[q]
             # (a_g − a_p C) Q (a_g − a_p C)ᵀ in parts: the first is sparse, the others are small.

@@ -34,7 +34,8 @@ def fill_pattern(pointer, rows):
         begin = at
         if at + n - j > len(out):
             grown = np.empty(2 * len(out) + n, np.int64)
-            grown[:at] = out[:at]
+            for q in range(at):
+                grown[q] = out[q]
             out = grown
         mark[j] = j
         for q in range(pointer[j], pointer[j + 1]):
@@ -52,7 +53,7 @@ def fill_pattern(pointer, rows):
                     out[at] = i
                     at += 1
             child = next_child[child]
-        out[begin:at] = np.sort(out[begin:at])
+        out[begin:at].sort()
         out_pointer[j + 1] = at
         if at > begin:
             parent = out[begin]

@@ -35,7 +35,9 @@ def tone_pixels(
     """
     half = np.hypot(size[0], size[1]) / 2
     powers, last = np.empty(trend.shape[0]), len(grey) - 2
-    slopes, steps = np.diff(becomes) / np.diff(grey), (last + 1) / (grey[-1] - grey[0])
+    slopes, steps = np.empty(last + 1), (last + 1) / (grey[-1] - grey[0])
+    for k in range(last + 1):
+        slopes[k] = (becomes[k + 1] - becomes[k]) / (grey[k + 1] - grey[k])
     for row in range(values.shape[0]):
         v = (corner[1] + row - (size[1] - 1) / 2) / half
         for i in range(trend.shape[0]):
