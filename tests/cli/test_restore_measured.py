@@ -44,6 +44,7 @@ def test_a_measured_filter_is_printed_kept_and_gives_the_same_again(photoplan, i
         assert np.array_equal(a.read(), b.read())
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on_and_another_filter_is_not_overwritten(photoplan, image, tmp_path):
     with rasterio.open(image) as whole:
         cut = whole.read(1)[:200, :200]

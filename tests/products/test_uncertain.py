@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 from tools.adjust_project import Make, write_project
-from tools.command import process
+from tools.command import inside
 from tools.small_model import CRS, write_small
 
 from photoplan.cameras.base import project
@@ -191,7 +191,7 @@ def test_of_an_adjusted_project_with_a_calibrated_camera(tmp_path) -> None:
     inputs, starts = started(read_inputs(adjusted, adjusted.select()))
     free = {"cam": {"c": None, "x0": None}}
     result = map_result(*adjust_prepared(prepare(inputs, starts, free), AdjustSettings(robust=False)))
-    assert process("adjust", made.path, "--calibrate", "cam=c,x0", "--no-robust").code == 0
+    assert inside("adjust", made.path, "--calibrate", "cam=c,x0", "--no-robust").code == 0
     terrain = StatedTerrain(height=0.0, height_system="same")
     loaded = load_project(made.path).model_copy(update={"terrain": terrain})
     assert set(loaded.cameras["cam"].sigma or ()) == {"c", "x0"}

@@ -72,6 +72,11 @@ def test_group_numbers_by_pixel_size_or_as_given():
     # 44.84 µm on the target: the first element would have 1 LP/mm; a quarter of it: 4 LP/mm, group 2.
     assert measure_usaf(picture, UsafRules(pixel_um=250 / SCALE)).groups[0] == 2
     assert measure_usaf(picture, UsafRules(group=-2)).bars[0].lp_mm == 0.25
+
+
+@pytest.mark.slow
+def test_group_numbers_that_cannot_be_are_refused():
+    picture = noisy()
     with pytest.raises(InputError, match="same at every scale"):
         measure_usaf(picture, UsafRules())
     with pytest.raises(InputError, match="no even group"):
