@@ -164,7 +164,10 @@ def test_a_table_of_elements_is_what_its_polynomial_is(tmp_path: Path, suffix: s
         (lambda t: t[:-1], "399 rows; needed are x and y of 400 elements"),
         (lambda t: np.where(np.arange(400)[:, None] == 17, np.nan, t), "row 18 holds a number that is not finite"),
         (lambda t: t + 0.3 * strip.pitch * (np.arange(400)[:, None] == 17), "element 18 lies 0.4"),
-        (lambda t: t + 3.0 * strip.pitch * (np.arange(400)[:, None] >= 200), "Two chips in one line are two images"),
+        (
+            lambda t: t + 3.0 * strip.pitch * (np.arange(400)[:, None] >= 200),
+            "several chips in one line, state `chips`",
+        ),
     ):
         write_table(tmp_path / f"nadir{suffix}", change(table))
         with pytest.raises(InputError, match=message):

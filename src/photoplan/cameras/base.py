@@ -80,6 +80,32 @@ class TremorPart(Hashable, Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Some columns of an image, with a smooth mapping of their own."""
+
+    projection: Projection
+    """Of all columns; it holds for its own."""
+    first: float
+    """Outer edge of the first of them."""
+    end: float
+    """Outer edge of the last."""
+    before: float = 0.0
+    """Pixels beyond the first edge that its border pixels show, up to the next part; below 0: what it leaves to it."""
+    after: float = 0.0
+    """The same beyond the last edge."""
+    rest: bool = False
+    """Whether it has stood before, and now shows what all have left near its edges."""
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """An image of parts beside each other, as of a line of several chips: between them the mapping has a step."""
+
+    parts: tuple[Part, ...]
+    """Of what several see, the first counts."""
+
+
 class Projection(Protocol):
     """A mapping from ground to image in two factors: a projective or smooth one, and a field in the image.
 
@@ -99,9 +125,9 @@ class Projection(Protocol):
         ...
 
     @property
-    def breaks(self) -> Breaks | Tremor | None:
+    def breaks(self) -> Breaks | Tremor | Parts | None:
         """Where the first factor is bent, by its ideal positions (knots of a trajectory), or what bends it at every
-        line; None: nowhere."""
+        line, or the parts between which it has steps; None: nowhere."""
         ...
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
@@ -184,4 +210,10 @@ def project(projection: Projection, XYZ: ArrayLike) -> NDArray[np.float64]:
 def tremor_of(projection: Projection) -> Tremor | None:
     """What of it changes from line to line; None: nothing does."""
     breaks = projection.breaks
-    return None if breaks is None or isinstance(breaks, Breaks) else breaks
+    return None if breaks is None or isinstance(breaks, Breaks | Parts) else breaks
+
+
+def parts_of(projection: Projection) -> tuple[Part | None, ...]:
+    """The parts of its image; (None,): it is one."""
+    breaks = projection.breaks
+    return breaks.parts if isinstance(breaks, Parts) else (None,)

@@ -50,6 +50,10 @@ class LineCamera:
         """All is in the first factor."""
         return None
 
+    def along(self, track: LineTrack) -> LineCamera:
+        """The same line on another way."""
+        return LineCamera(track, self.look, self.ground)
+
     @cached_property
     def breaks(self) -> LineTremor | None:
         """What of a turbulent flight changes from line to line; None: the trajectory is smooth."""

@@ -13,6 +13,7 @@ from scipy import sparse
 from photoplan.cameras.base import Camera
 from photoplan.cameras.correctable import ByCorrections, Corrections, prior_rows
 from photoplan.cameras.line import LineCamera
+from photoplan.cameras.line_chips import ChippedLine
 from photoplan.cameras.line_correction import TURNED, LineCorrection, TrackSpline, map_axes, spline_weights
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import rotation_vector, skew
@@ -52,7 +53,7 @@ class TrackPriors:
 class CorrectableLine:
     """An image of a line camera whose trajectory is corrected."""
 
-    plain: LineCamera
+    plain: LineCamera | ChippedLine
     """As delivered."""
     mount: str
     """Images of one mount share boresight, lever arm and clock."""
@@ -130,15 +131,16 @@ class CorrectableLine:
         """See `Correctable`."""
         track = self.correction(values).track(self.plain.track)
         # Calm flights are as smooth between the lines as the record; poses of all lines would be made at every step.
-        return replace(self.plain, track=track if self._shaken else replace(track, per_line=False))
+        return self.plain.along(track if self._shaken else replace(track, per_line=False))
 
     @cached_property
     def _shaken(self) -> bool:
-        return self.plain.breaks is not None
+        plain = self.plain.chips[0] if isinstance(self.plain, ChippedLine) else self.plain
+        return plain.breaks is not None
 
     def by_corrections(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> Mapping[str, ByCorrections]:
         """See `Correctable`; whatever moves the camera moves the ground the other way."""
-        assert isinstance(camera, LineCamera)
+        assert isinstance(camera, LineCamera | ChippedLine)
         track, ground = camera.track, camera.ground
         S, R = track(xy[:, 1])
         d = np.einsum("nij,ni->nj", R, ground(XYZ) - S)

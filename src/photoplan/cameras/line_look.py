@@ -40,17 +40,19 @@ class LineLook:
     columns: int
     coefficients: _Floats
     """Shape (degree + 1, 2); over the columns of `span` as −1 to 1."""
+    part: tuple[int, int] | None = None
+    """First and end column of those that are its own, of a line of several chips; None: all."""
 
     @classmethod
-    def of(cls, tangents: Callable[[_Floats], _Floats], columns: int) -> LineLook:
+    def of(cls, tangents: Callable[[_Floats], _Floats], columns: int, part: tuple[int, int] | None = None) -> LineLook:
         """The curve of a function from columns (n,) to tangents (n, 2)."""
-        low, high = _span(columns)
+        low, high = _span(part or (0, columns))
         nodes = chebyshev.chebpts1(4 * _DEGREE)
         values = tangents((low + high) / 2 + (high - low) / 2 * nodes)
         if not np.isfinite(values).all():
             raise InputError("detectors of the line have no direction; are the numbers of its lens right?")
         coefficients = chebyshev.chebfit(nodes, values, _DEGREE)
-        look = cls(columns, np.asarray(coefficients, float))
+        look = cls(columns, np.asarray(coefficients, float), part)
         if not look.pitch > _FINEST:
             raise InputError(
                 f"the line's detectors are {look.pitch:.3g} rad apart, which no telescope tells; is its focal length "
@@ -58,47 +60,58 @@ class LineLook:
             )
         # Most lenses are of low degree; what is next to nothing is not computed a million times.
         tiny = np.abs(coefficients).max(axis=1) < _NOTHING * look.pitch
-        look = cls(columns, look.coefficients[: max(2, len(tiny) - int(np.argmin(tiny[::-1])))])
+        look = cls(columns, look.coefficients[: max(2, len(tiny) - int(np.argmin(tiny[::-1])))], part)
         miss = float(np.abs(chebyshev.chebval(nodes, look.coefficients).T - values).max())
         if miss > _TOLERANCE * look.pitch:
             raise InputError(f"the line's lens is not smooth: polynomials miss it by {miss / look.pitch:.2g} columns")
-        if not (look.along(look._ends[1]) > look.along(look._ends[0])):
+        if not (look.along(look.ends[1]) > look.along(look.ends[0])):
             raise InputError("the directions of the line's detectors turn back")
         return look
 
     def tangents(self, column: _Floats) -> _Floats:
         """Tangents (n, 2) of columns (n,); straight on where the line has ended."""
-        inside = np.clip(column, *_span(self.columns))
+        inside = np.clip(column, *self.span)
         values, away = chebyshev.chebval(self._unit(inside), self.coefficients).T, column - inside
         return np.asarray(values + self.slope(inside) * away[:, None] if np.any(away) else values)
 
     def slope(self, column: _Floats) -> _Floats:
         """Change of the tangents (n, 2) from column to column."""
-        unit = self._unit(np.clip(column, *_span(self.columns)))
+        unit = self._unit(np.clip(column, *self.span))
         return np.asarray(chebyshev.chebval(unit, self._slopes).T)
 
     @property
     def span(self) -> tuple[float, float]:
         """First and last column over which the curve goes on."""
-        return _span(self.columns)
+        return _span(self.part or (0, self.columns))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Outer edges of its first and last column."""
+        first, end = self.part or (0, self.columns)
+        return first - 0.5, end - 0.5
+
+    @property
+    def _outer(self) -> _Floats:
+        """Its first and last column."""
+        return np.add(self.ends, (0.5, -0.5))
 
     @cached_property
     def axes(self) -> _Floats:
         """Unit vectors along the line, from the first to the last column, and across it, (2, 2)."""
-        chord = chebyshev.chebval(self._unit(np.array([0.0, self.columns - 1.0])), self.coefficients)
+        chord = chebyshev.chebval(self._unit(self._outer), self.coefficients)
         e = (chord[:, 1] - chord[:, 0]) / np.linalg.norm(chord[:, 1] - chord[:, 0])
         return np.array([e, [-e[1], e[0]]])
 
     @cached_property
     def pitch(self) -> float:
         """Tangent of a column in the middle of the line."""
-        return float(np.linalg.norm(self.slope(np.array([(self.columns - 1) / 2]))))
+        return float(np.linalg.norm(self.slope(np.array([sum(self.ends) / 2]))))
 
     @cached_property
     def is_wide(self) -> bool:
         """Whether it looks further to the sides than ahead."""
-        middle = self.tangents(np.array([0.0, self.columns - 1.0])).mean(axis=0)
-        half = abs(self.along(self._ends[1]) - self.along(self._ends[0])) / 2
+        middle = self.tangents(self._outer).mean(axis=0)
+        half = abs(self.along(self.ends[1]) - self.along(self.ends[0])) / 2
         return bool(half > abs(middle @ self.axes[1]))
 
     def along(self, column: float) -> float:
@@ -108,10 +121,10 @@ class LineLook:
     def column(self, along: _Floats) -> _Floats:
         """The columns (n,) with these tangents along the chord (n,), by Newton's method."""
         first, last = self._along_ends
-        at = self._ends[0] + (along - first) * (self._ends[1] - self._ends[0]) / (last - first)
+        at = self.ends[0] + (along - first) * (self.ends[1] - self.ends[0]) / (last - first)
         values, slopes = self._chord
         for _ in range(12):
-            inside = np.clip(at, *_span(self.columns))
+            inside = np.clip(at, *self.span)
             unit = self._unit(inside)
             slope = chebyshev.chebval(unit, slopes)
             step = (chebyshev.chebval(unit, values) + slope * (at - inside) - along) / slope
@@ -128,22 +141,19 @@ class LineLook:
     @cached_property
     def _along_ends(self) -> tuple[float, float]:
         """Tangents of the ends along the chord."""
-        return self.along(self._ends[0]), self.along(self._ends[1])
-
-    @property
-    def _ends(self) -> tuple[float, float]:
-        return -0.5, self.columns - 0.5
+        return self.along(self.ends[0]), self.along(self.ends[1])
 
     @cached_property
     def _slopes(self) -> _Floats:
-        low, high = _span(self.columns)
+        low, high = self.span
         return np.asarray(chebyshev.chebder(self.coefficients) * 2.0 / (high - low))
 
     def _unit(self, column: _Floats) -> _Floats:
-        low, high = _span(self.columns)
+        low, high = self.span
         return (2.0 * column - (low + high)) / (high - low)
 
 
-def _span(columns: int) -> tuple[float, float]:
-    room = 1.0 + _ROOM * columns
-    return -0.5 - room, columns - 0.5 + room
+def _span(part: tuple[int, int]) -> tuple[float, float]:
+    first, end = part
+    room = 1.0 + _ROOM * (end - first)
+    return first - 0.5 - room, end - 0.5 + room

@@ -50,7 +50,7 @@ class StraightFlight:
         """Positions (n, 2) of points (n, 3) in the axes of the body; NaN behind the camera. Rows may be any."""
         d, out = np.ascontiguousarray((P - self.place) @ self.R), np.empty((len(P), 2))
         coefficients = np.ascontiguousarray(self.look.coefficients)
-        seen_straight(d, self.speed @ self.R, (coefficients, *self.look.span, (self.look.columns - 1) / 2), out)
+        seen_straight(d, self.speed @ self.R, (coefficients, *self.look.span, sum(self.look.ends) / 2), out)
         out[:, 1] += self.middle
         return out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
@@ -9,10 +10,12 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.cameras.base import Part
 from photoplan.engine.bands import detail_bands
 from photoplan.engine.base import Reader, Source
 from photoplan.engine.run import Made, Output
 from photoplan.geometry.grid import Window
+from photoplan.geometry.levels import Pixels
 from photoplan.kernels.position import ALL_MINE
 from photoplan.kernels.rectify import rectify_tile
 from photoplan.plan.accuracy import DepthErrors, SourceErrors, radial_counts, tile_accuracy
@@ -80,9 +83,14 @@ def execute_tile(
         pixels, usable = reader.read(window, layer.level)
         if not len(values):
             values = np.zeros((len(pixels), *tile.relief.shape), pixels.dtype)
+        border = _border(layer, reader.size)
+        owner = layer.owner
+        if layer.columns is not None:
+            pixels, usable, border = _columns_of(layer, layer.columns, (pixels, usable), border)
+            # What parts before it have painted stays.
+            owner = np.where(valid, 0, layer.source + 1 if owner is None else owner).astype(np.uint16)
         if usable is None or usable.any():
-            border = _border(layer, reader.size)
-            owned = ALL_MINE if layer.owner is None else (layer.owner, layer.source + 1, layer.part.tolist())
+            owned = ALL_MINE if owner is None else (owner, layer.source + 1, layer.part.tolist())
             arrays, tilt = layer.anchors.arrays, tile.tilt
             rectify_tile(arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned, tilt=tilt)
     return values, valid
@@ -213,6 +221,29 @@ def _border(layer: Layer, size: tuple[int, int]) -> tuple[float, float, float, f
     """Outer edges of the image x_min, y_min, x_max, y_max in the pixel coordinates of the layer's window."""
     window, f = layer.anchors.source_window, 2.0**layer.level
     return (-0.5 - window.col, -0.5 - window.row, size[0] / f - 0.5 - window.col, size[1] / f - 0.5 - window.row)
+
+
+def _columns_of(
+    layer: Layer, part: Part, pixels: Pixels, border: tuple[float, float, float, float]
+) -> tuple[NDArray[Any], NDArray[np.bool_], tuple[float, float, float, float]]:
+    """Pixels of a layer's window without those of other parts of the image, and the outer edges of the part.
+
+    Up to the next part, the border pixels are shown twice.
+    """
+    values, usable = pixels
+    f, width = 2.0**layer.level, values.shape[2]
+    # A reduced column that holds pixels of two parts belongs to neither.
+    first = math.ceil((part.first + 0.5) / f) - layer.anchors.source_window.col
+    end = math.floor((part.end + 0.5) / f) - layer.anchors.source_window.col
+    mine = np.ones(values.shape[1:], bool) if usable is None else usable.copy()
+    mine[:, : max(first, 0)], mine[:, max(end, 0) :] = False, False
+    values = np.where(mine, values, 0).astype(values.dtype)
+    for gap, at, of in ((part.before, first - 1, first), (part.after, end, end - 1)):
+        if gap > 0 and min(at, of) >= 0 and max(at, of) < width:
+            values[:, :, at], mine[:, at] = values[:, :, of], mine[:, of]
+    shift = layer.anchors.source_window.col + 0.5
+    left, right = (part.first - part.before + 0.5) / f - shift, (part.end + part.after + 0.5) / f - shift
+    return values, mine, (max(left, border[0]), border[1], min(right, border[2]), border[3])
 
 
 class Opened(Protocol):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Projection
+from photoplan.cameras.base import Part, Projection, parts_of
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.footprint import depth_tilt, footprint_levels
@@ -22,6 +22,9 @@ from photoplan.plan.owner import Ownership, Share
 from photoplan.plan.tiles import Tile, Tiles
 from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
+
+#: Columns from the edge of a part of an image within which another part may leave something to it.
+_NEAR = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +41,9 @@ class Layer:
     """First column, first row, end column, end row in the tile between which are all pixels that it paints."""
     owner: NDArray[np.uint16] | None
     """It paints the pixels that are `source` + 1 here; None: all."""
+    columns: Part | None = None
+    """The columns of the source that it is made of, at full size; None: all. Layers of such parts follow each other:
+    each paints what those before have left."""
 
     def window(self, size: tuple[int, int]) -> Window:
         """What is read of a source of this size, in its pixels at full size."""
@@ -232,22 +238,18 @@ def _compiled(
         wanted, parts = ground.owned(share.owner, tile.sources, len(product.sources))
     layers: list[Layer] = []
     for source, mine, part in zip(tile.sources, wanted, parts):
-        anchors = compile_anchors(cameras[source], ground, product.rule, mine)
-        if anchors is None:
-            continue
-        if tilt is None:
-            level = product.rule.level(anchors)
-            layers.append(
-                Layer(
-                    source=source,
-                    level=level,
-                    anchors=anchors.at_level(level, cameras[source].size),
-                    part=part,
-                    owner=share.owner,
-                )
-            )
-        else:
-            layers += _layers_by_level(product.rule, ground, tilt, (source, cameras[source], anchors), share.owner)
+        for columns in parts_of(cameras[source]):
+            camera = cameras[source] if columns is None else columns.projection
+            anchors = compile_anchors(camera, ground, product.rule, mine)
+            if anchors is None or not _shows(anchors, columns):
+                continue
+            if tilt is None:
+                level = product.rule.level(anchors)
+                reduced = anchors.at_level(level, camera.size)
+                found = [Layer(source=source, level=level, anchors=reduced, part=part, owner=share.owner)]
+            else:
+                found = _layers_by_level(product.rule, ground, tilt, (source, camera, anchors), share.owner)
+            layers += found if columns is None else [replace(each, columns=columns) for each in found]
     return CompiledTile(
         window=tile.window,
         relief=ground.relief,
@@ -256,6 +258,17 @@ def _compiled(
         owner=share.owner,
         hidden=share.hidden,
     )
+
+
+def _shows(anchors: Anchors, columns: Part | None) -> bool:
+    """Whether a tile needs anything of some columns of a source."""
+    if columns is None:
+        return True
+    window = anchors.source_window
+    if columns.rest:
+        edges = np.array([columns.first, columns.end])
+        return bool(((window.col < edges + _NEAR) & (window.stop[0] > edges - _NEAR)).any())
+    return window.col < columns.end and window.stop[0] > columns.first
 
 
 def _depth(

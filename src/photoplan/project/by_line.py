@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -39,7 +38,7 @@ def line_camera(project: Project, image: LineImage, ground: Ground, size: tuple[
     if image.correction is None:
         return camera
     correction = read_line_correction(project.resolve(image.correction))
-    return replace(camera, track=correction.track(camera.track))
+    return camera.along(correction.track(camera.track))
 
 
 @lru_cache(maxsize=64)

@@ -21,7 +21,7 @@ from photoplan.geometry.body import EARTH_RADII, BodyGround
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.motion import between, continuous, cubic, odd_step, quaternions
 from photoplan.geometry.rotation import ANGLE_UNITS, rotation_from_angles, rotation_opk
-from photoplan.io.camera.line.detectors import StripDetectors, look_of
+from photoplan.io.camera.line.detectors import StripDetectors, looks_of
 from photoplan.io.camera.line.model import MAX_BYTES, StatedLine
 from photoplan.io.camera.line.number_table import read_numbers
 from photoplan.io.camera.model import Entry, Name, Number, Pixels, Positive
@@ -121,8 +121,9 @@ def read(path: Path, name: str | None) -> StatedLine:
     if detectors is None:
         raise InputError(f"{path}: no line of detectors {name!r}; there are {known}")
     try:
-        look, beside = look_of(detectors, path.parent, MAX_BYTES)
-        return StatedLine(path, FORM, _track(strip, path), look, EARTH_RADII, beside)
+        looks, beside = looks_of(detectors, path.parent, MAX_BYTES)
+        chips = looks if len(looks) > 1 else ()
+        return StatedLine(path, FORM, _track(strip, path), looks[0], EARTH_RADII, beside, chips)
     except HeightSystemError:
         raise
     except InputError as error:
