@@ -29,6 +29,7 @@ KINDS = {"FrameCamera", "WarpedCamera", "corrected_camera", "curved_camera", "Li
 #: Files that may name a kind, and why.
 ALLOWED = {
     "cameras/line.py": "a kind",
+    "cameras/line_chips.py": "a kind of several of a kind",
     "cameras/line_correctable.py": "corrections of a kind",
     "cameras/line_tremor.py": "what of a kind changes from line to line",
     "io/camera/line/model.py": "makes a kind of what files state",
