@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tools.plain_block import Make, plain_block
-from tools.thinned import thinned
+from tools.thinned import some, thinned
 
 from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.adjust import adjust_block
@@ -28,7 +28,7 @@ def disturbed(seed: int, gnss: float | None) -> tuple[set[int], Adjusted]:
     return set(wrong.tolist()), adjust_block(truth.with_ground(XYZ))
 
 
-@pytest.mark.parametrize("gnss", [None, 0.05])
+@pytest.mark.parametrize("gnss", some([None, 0.05], 0))
 @thinned("count", 3, 200)
 def test_wrong_control_takes_no_right_control_with_it(count: int, gnss: float | None) -> None:
     """Asked: in 95 % of 200 blocks no right point is lost."""

@@ -252,6 +252,7 @@ def test_texture_that_may_be_noise_stays_as_it_is(kind, name):
     assert "fine texture and noise cannot be told apart" in design.reason
 
 
+@pytest.mark.slow
 def test_texture_that_compression_has_erased_is_not_sharpened():
     """The borders of compressed blocks were sharpened in its place: 1.1 times the error."""
     rng = np.random.default_rng(16)

@@ -70,6 +70,7 @@ def test_eleven_points_without_start_values(facts: dict, tmp_path: Path) -> None
     assert (np.array(image["sigma_center"]) > 10.0).all()
 
 
+@pytest.mark.slow
 def test_points_above_the_camera_need_strict_curvature(facts: dict, tmp_path: Path) -> None:
     path = prepared(facts, tmp_path, "correction")
     result = CliRunner().invoke(command, [str(path), "--unknown-camera-constant"])

@@ -11,7 +11,7 @@ from tools.build_terrain import built, directly, line, scattered, terrain
 from tools.build_terrain import unit_of as unit_at
 from tools.random_field import random_field
 from tools.rough_terrain import dunes, sampled
-from tools.thinned import thinned
+from tools.thinned import some, thinned
 
 from photoplan.surfaces.measured import MeasuredLine
 from photoplan.terrain.build import Built, plan_build
@@ -83,9 +83,7 @@ def test_the_smoothest_and_the_roughest_family_are_told_apart() -> None:
 class TestSigma:
     NOISE = 0.15
 
-    @pytest.mark.parametrize(
-        "family", [*(pytest.param(each, marks=pytest.mark.slow) for each in ("gaussian", "matern")), "exponential"]
-    )
+    @pytest.mark.parametrize("family", some(FAMILIES))
     def test_held_out_points_scatter_as_sigma_says(self, family: str) -> None:
         """Residual over √(σ² + noise²): σ is that of the surface, the held-out height has its own noise."""
         xyz = sample(family, 4.0, 7, self.NOISE, 6000)
