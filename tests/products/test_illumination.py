@@ -156,3 +156,31 @@ def test_fault_16_pixels_of_one_part_alone_are_refused() -> None:
     ground = Ground(np.linspace(0.2, 1, n), np.ones(n), np.linspace(0.0, 100, n), np.zeros(n, bool))
     with pytest.raises(GeometryError, match="without one part of the picture 0 pixels"):
         estimate(np.ones((1, n)), ground, np.zeros(n, int), ["haze-by-height"], 0.7)
+
+
+def test_slopes_have_no_steps_at_coarse_posts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Even ground on hills, posts six pixels apart: less than 1 % of the light is left (2.4 % by plain slopes)."""
+    side, pixel, apart = 240, 2.0, 6
+    place = {"crs": "EPSG:32633", "transform": from_origin(500_000, 5_300_000, pixel, pixel)}
+
+    def hills(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(900 + 12 * np.sin(x / 30) + 9 * np.cos(y / 25))
+
+    y, x = (np.mgrid[:side, :side] + 0.5) * pixel
+    gx, gy = 12 / 30 * np.cos(x / 30), 9 / 25 * np.sin(y / 25)
+    azimuth, altitude = np.radians(SUN)
+    toward = np.array([np.cos(altitude) * np.sin(azimuth), np.cos(altitude) * np.cos(azimuth), np.sin(altitude)])
+    cos_i = (toward[2] - toward[0] * gx - toward[1] * gy) / np.sqrt(1 + gx**2 + gy**2)
+    grey = np.rint(100 * (60 + 120 * np.maximum(cos_i, 0))).astype(np.uint16)[None]
+    picture = write_image(tmp_path / "ortho.tif", grey, **place)
+    step = apart * pixel
+    posts = (np.mgrid[: side // apart + 2, : side // apart + 2] - 0.5) * step
+    coarse = {"crs": "EPSG:32633", "transform": from_origin(500_000 - step, 5_300_000 + step, step, step)}
+    terrain = write_image(tmp_path / "dtm.tif", hills(posts[1], posts[0])[None].astype(np.float32), **coarse)
+    out = tmp_path / "even.tif"
+    said = Here(capsys)("illumination", picture, "--terrain", terrain, "--sun", *SUN, "-o", out, "--no-picture")
+    assert said.code == 0, said.err
+    inner = read(out)[0, 2 * apart : -2 * apart, 2 * apart : -2 * apart]
+    left = float(inner.std() / inner.mean())
+    print(f"light left on slopes: {100 * left:.2f} %")
+    assert left < 0.01

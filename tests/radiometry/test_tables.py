@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from tools.overlaps import block_of
 
+from photoplan.radiometry import adjust
 from photoplan.radiometry.balance import balance, even_images, pairs_of, parts_of, shoulder
 from photoplan.radiometry.cells import LEVELS, PIXELS, SIDE, Cells, cells_of
 from photoplan.radiometry.ratio import factors
@@ -122,6 +123,17 @@ def test_with_a_reference_all_is_found_again(rows: int, columns: int, seeds: tup
     # Few images tell little about standard deviations.
     low, high = (0.9, 1.1) if len(seeds) > 1 else (0.4, 2.5)
     assert all(low <= value <= high for value in np.sqrt(np.mean(normal, axis=0)))
+
+
+def test_equations_of_some_cells_at_a_time_are_those_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, _ = block_of(2, 2, seed=3, change=0.1, noise=2.0)
+    (whole,) = balance(scene.cells, scene.sizes, LIMITS).bands
+    monkeypatch.setattr(adjust, "_AT_ONCE", 700)
+    (parts,) = balance(scene.cells, scene.sizes, LIMITS).bands
+    assert len(whole.state.ground) > 3 * 700 / 4
+    np.testing.assert_allclose(parts.state.tables, whole.state.tables, atol=1e-6)
+    np.testing.assert_allclose(parts.state.ground, whole.state.ground, atol=1e-6)
+    np.testing.assert_allclose(parts.sigmas.tables, whole.sigmas.tables, rtol=1e-4)
 
 
 def test_images_that_show_nothing_in_common_are_told_apart() -> None:

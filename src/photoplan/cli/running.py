@@ -150,7 +150,13 @@ def _hidden(results: list[ProductResult]) -> str:
     """Ground that images cannot see, if somebody has asked."""
     areas = [r.hidden for r in results if r.hidden is not None]
     outside = [r.bare for r in results if r.bare is not None]
-    hidden = f" · hidden {sum(areas):.4g} m²" if areas else ""
+    hidden = f" · hidden {_area(areas)} m²" if areas else ""
     gaps = [r.gaps for r in results if r.gaps is not None]
-    hidden += f" · gaps {sum(gaps):.4g} m²" if gaps else ""
-    return f"{hidden} · in no image {sum(outside):.4g} m²" if outside else hidden
+    hidden += f" · gaps {_area(gaps)} m²" if gaps else ""
+    return f"{hidden} · in no image {_area(outside)} m²" if outside else hidden
+
+
+def _area(parts: list[float]) -> str:
+    """Their sum, with all digits before the point."""
+    whole = sum(parts)
+    return f"{whole:,.0f}" if whole >= 1000 else f"{whole:.4g}"

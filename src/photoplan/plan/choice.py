@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Projection
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.kernels.choose import between_nodes
+from photoplan.kernels.choose import add_penalties, between_nodes
 from photoplan.plan.ground import TileGround
 from photoplan.plan.owner import Share
 from photoplan.plan.visibility import hidden_pixels, sight_lines
@@ -120,8 +120,8 @@ class BestImage:
             cost = np.stack([costs[row] for row in rows])
             blind = cost if not self.paints_hidden else cost.copy()
             while True:
-                best = np.argmin(cost, axis=0)[np.isfinite(cost.min(axis=0))]
-                ahead = [rows[k] for k in np.flatnonzero(np.bincount(best)).tolist()]
+                best, known = _least(cost)
+                ahead = [rows[k] for k in np.flatnonzero(np.bincount(best[known])).tolist()]
                 asked = [row for row in ahead if row not in clear]
                 for row in asked:
                     costs[row] = cost[rows.index(row)]
@@ -138,9 +138,9 @@ class BestImage:
         if len(rows) < len(cameras) and not ((cost.min(axis=0) < least) | np.isnan(ground.relief)).all():
             rows = sorted(cameras)
             blind, cost = among(rows)
-        best, seen = np.argmin(cost, axis=0), np.isfinite(cost.min(axis=0))
+        best, seen = _least(cost)
         if self.paints_hidden:
-            best = np.where(seen, best, np.argmin(blind, axis=0))
+            best = np.where(seen, best, _least(blind)[0])
         paints = inside if self.paints_hidden else seen
         owner = np.where(paints, np.array(rows)[best] + 1, 0).astype(np.uint16)
         return Share(owner, inside & ~seen, clear)
@@ -153,7 +153,7 @@ class BestImage:
         grounds: tuple[TileGround, TileGround],
         surface: Surface,
     ) -> None:
-        """Add to an image's penalty what it does not see, and what is near that; `scale`: its pixels per pixel."""
+        """Add to an image's penalty what it does not see, and what is near that; `scale`: its coarseness."""
         ground, wide = grounds
         # Orthophotos of single images do without it: a tenth of a second of their start.
         from scipy.ndimage import distance_transform_edt  # noqa: PLC0415
@@ -166,7 +166,7 @@ class BestImage:
         near = np.clip(1.0 - away / _AROUND, 0.0, 1.0)
         cost += np.float32(self.weights.occlusion) * near.astype(np.float32)
         # Kernels mix what hides ground into what lies beside it, as far as they do at the image's border.
-        cost[away <= np.maximum(_BESIDE, _BESIDE / scale)] += np.float32(_RIMMED)
+        cost[away <= np.maximum(_BESIDE, _BESIDE * np.exp2(scale))] += np.float32(_RIMMED)
         cost[hidden[at]] = np.inf
 
     def _penalty(
@@ -176,27 +176,25 @@ class BestImage:
         sloping: tuple[TileGround, NDArray[np.float32]],
         drawn: NDArray[np.uint16] | None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Penalty of each pixel without what hides it; infinite outside the image, and without a surface. Also the
-        image's pixels per pixel."""
+        """Penalty of each pixel without what hides it; infinite outside the image, and without a surface. Also its
+        coarseness."""
         ground, slope = sloping
-        xy = np.empty((*ground.relief.shape, 2))
-        values = np.empty((4, *ground.relief.shape), np.float32)
+        shape, (width, height) = ground.relief.shape, camera.size
+        xy, near, values = np.empty((*shape, 2)), np.empty(shape), np.empty((4, *shape), np.float32)
         nodes, levels, corner = self._nodes(camera, ground)
-        between_nodes(ground.relief, nodes, levels, corner, _SPACING, xy, values)
-        cost = values[0]
-        if self.weights.coarseness:
-            # By this the image's area of a pixel is larger on the slope than on the level.
-            larger = np.abs(1.0 - values[2] * slope[0] - values[3] * slope[1])
-            cost -= np.float32(0.5 * self.weights.coarseness) * np.log2(np.clip(larger, _FLATTEST, _STEEPEST))
-        near = _to_border(camera, xy)
-        rim = np.clip(1.0 - near / (_RIM * min(camera.size)), 0.0, 1.0)
-        cost += (self.weights.border * rim**2 + (self.ranks[row] if self.ranks else 0.0)).astype(np.float32)
-        if drawn is not None:
-            cost[drawn == row + 1] -= _DRAWN
-        # Beyond the margin an image only comes after all others.
-        cost[near < _MARGIN] += _RIMMED
-        cost[~(near >= 0.0) | np.isnan(cost)] = np.inf
-        return cost, np.exp2(-values[1])
+        between_nodes(ground.relief, nodes, levels, corner, _SPACING, (float(width), float(height)), xy, near, values)
+        rim = _RIM * min(camera.size)
+        if camera.field is not None:
+            # The field moves positions a little; only where that decides, or where the border counts, it is asked.
+            there = np.abs(near) < 2 * rim
+            x, y = np.moveaxis(np.abs(camera.field(xy[there]) - (np.array(camera.size) - 1) / 2), -1, 0)
+            near[there] = np.minimum(width / 2 - x, height / 2 - y)
+        border = self.weights.border, rim, _MARGIN, _RIMMED
+        sloped = 0.5 * self.weights.coarseness, _FLATTEST, _STEEPEST
+        mine = np.zeros((0, 0), np.uint16) if drawn is None else drawn
+        ahead = self.ranks[row] if self.ranks else 0.0, row + 1, _DRAWN
+        add_penalties(near, values, slope, mine, border, sloped, ahead)
+        return values[0], values[1]
 
     def _nodes(
         self, camera: Projection, ground: TileGround
@@ -252,25 +250,20 @@ def _slope(wide: TileGround, window: Window) -> NDArray[np.float32]:
     rows, cols = window.slices(wide.window)
     found = []
     for axis in (1, 0):
-        before, after = (np.roll(wide.relief, step, axis)[rows, cols] for step in (_REACH, -_REACH))
+        before, after = (
+            wide.relief[(_moved(rows, by), cols) if axis == 0 else (rows, _moved(cols, by))] for by in (-_REACH, _REACH)
+        )
         here = wide.relief[rows, cols]
         back, on = (here - before) / _REACH, (after - here) / _REACH
         found.append(np.where(back * on > 0, np.where(np.abs(back) < np.abs(on), back, on), 0.0))
     return np.asarray(found, np.float32)
 
 
-def _to_border(camera: Projection, ideal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance to the image's border of ideal positions (..., 2), pixels; negative outside, NaN where there is none."""
-    width, height = camera.size
+def _moved(some: slice, by: int) -> slice:
+    return slice(some.start + by, some.stop + by)
 
-    def distance(xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        # The middle first: half the passes over the pixels.
-        x, y = np.abs(xy[..., 0] - (width - 1) / 2), np.abs(xy[..., 1] - (height - 1) / 2)
-        return np.asarray(np.minimum(width / 2 - x, height / 2 - y))
 
-    near = distance(ideal)
-    if camera.field is not None:
-        # The field moves positions a little; only where that decides, or where the border counts, it is asked.
-        there = np.abs(near) < 2 * _RIM * min(camera.size)
-        near[there] = distance(camera.field(ideal[there]))
-    return near
+def _least(cost: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Place of the least of penalties (images, height, width) at each pixel, and whether it is finite."""
+    best = np.argmin(cost, axis=0) if len(cost) > 1 else np.zeros(cost.shape[1:], np.int64)
+    return best, np.isfinite(cost.min(axis=0) if len(cost) > 1 else cost[0])

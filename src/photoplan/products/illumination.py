@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from photoplan import __version__
 from photoplan.cameras.sun import SunProjection
@@ -31,6 +32,8 @@ from photoplan.terrain.shading import Lighting, surface_slopes
 
 #: Windows along both axes from which parameters are estimated, and their side, pixels.
 _ALONG, _SIDE = 8, 64
+#: Half the distance of two posts at most over which slopes are means, pixels.
+_WIDEST = 64
 #: Pixels of these that are used, at most about.
 _MOST = 30_000
 
@@ -93,14 +96,21 @@ class _Place:
     light: Lighting
 
     def ground(self, window: Window) -> Ground:
-        """What the terrain is like in a window of the picture."""
-        slopes = surface_slopes(self.terrain.surface, self.grid, window)
-        gx, gy = slopes.gradient
+        """What the terrain is like in a window of the picture.
+
+        Slopes have no steps at posts that are further apart than pixels: each is the mean over the distance of two.
+        """
+        surface = self.terrain.surface
+        reach = int(min(0.5 / surface.lattice(self.grid, window).per_pixel, _WIDEST))
+        wide = Window(window.col - reach, window.row - reach, window.width + 2 * reach, window.height + 2 * reach)
+        slopes, at = surface_slopes(surface, self.grid, wide), window.slices(wide)
+        gx, gy = (_mean(each, 2 * reach + 1, axis)[at] for each, axis in zip(slopes.gradient, (1, 0)))
+        heights = np.ascontiguousarray(slopes.heights[at])
         flat = 1 / np.sqrt(1 + gx.astype(float) ** 2 + gy.astype(float) ** 2)
         east, north, up = self.light.directions[0]
-        tile = TileGround.of(MapTarget(self.grid), window, slopes.heights)
-        shadow = hidden_pixels(SunProjection((east, north, up)), tile, self.terrain.surface)
-        return Ground((up - east * gx - north * gy) * flat, (1 + flat) / 2, slopes.heights, shadow)
+        tile = TileGround.of(MapTarget(self.grid), window, heights)
+        shadow = hidden_pixels(SunProjection((east, north, up)), tile, surface)
+        return Ground((up - east * gx - north * gy) * flat, (1 + flat) / 2, heights, shadow)
 
     def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Pixels and which of them count."""
@@ -150,6 +160,18 @@ def correct_illumination(request: IlluminationRequest, events: Events = SILENT) 
     )
     write_grid(request.output, place.grid.placement, dtype, place.reader.bands, nodata, tile, options)
     return report
+
+
+def _mean(values: NDArray[np.floating], length: int, axis: int) -> NDArray[np.floating]:
+    """Means over a length of those that are known, along an axis; NaN stays."""
+    known = np.isfinite(values)
+    if length == 1:
+        return values
+    total, count = (
+        uniform_filter1d(each, length, axis, mode="constant")
+        for each in (np.where(known, values, 0.0).astype(float), known.astype(float))
+    )
+    return np.asarray(np.where(known, total / np.maximum(count, 1e-9), np.nan), np.float32)
 
 
 def _open(request: IlluminationRequest) -> _Place:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_diag, csr_array, eye, kron
+from scipy.sparse import block_diag, csr_array, eye, kron, vstack
 
 from photoplan.adjustment.robust import MEDIAN_1D, cauchy
 from photoplan.radiometry.equations import Band, State
@@ -32,6 +32,8 @@ _LEAST_SLOPE = 0.05
 #: What a table that may not fall weighs beside the observations; their least standard deviation, part of the range.
 _HARD, _FLOOR = 1e4, 0.001
 _ROUNDS, _CONVERGED = 30, 1e-3
+#: Observations whose equations are made at once, at least.
+_AT_ONCE = 120_000
 #: Parts of the ground that are left out in turn, and draws of what was known beforehand.
 _PARTS, _DRAWS = 16, 64
 
@@ -128,7 +130,7 @@ def adjust(band: Band, gauge: Gauge) -> Adjusted:
 
 def _weigh(band: Band, state: State, robust: _Floats, own: bool) -> _Weights:
     """Weights at a state; `own`: whether a reference, or else the images' own mean, holds the ground."""
-    shown, slope, _ = band.predicted(state)
+    shown, slope = band.predicted(state)
     residual = band.grey - shown
     w = band.weight * robust * slope**2
     # The part of its own error that an observation shows beside the others of its group.
@@ -140,9 +142,29 @@ def _weigh(band: Band, state: State, robust: _Floats, own: bool) -> _Weights:
 
 
 def _normals(band: Band, state: State, weights: _Weights) -> _Normals:
-    """Normal equations of observations that have weights; the ground is taken out of them."""
+    """Normal equations of observations that have weights; the ground is taken out of them, cells by cells."""
+    starts = np.flatnonzero(np.diff(band.cell, prepend=-1))
+    firsts = starts[np.unique(np.searchsorted(starts, np.arange(0, len(band.cell), _AT_ONCE)).clip(0, len(starts) - 1))]
+    found, groups = [], []
+    for first, end in zip(firsts, [*firsts[1:].tolist(), len(band.cell)]):
+        rows, of = np.arange(first, end), slice(int(band.group[first:end].min()), int(band.group[first:end].max()) + 1)
+        some = band.some(rows)
+        ground = replace(state, ground=state.ground[of])
+        mine = replace(weights, of=weights.of[rows], ground=weights.ground[of], moved=weights.moved[of])
+        found.append(_normals_of(replace(some, group=some.group - of.start), ground, mine))
+        groups.append(np.arange(of.start, of.stop))
+    N, g = found[0].N, found[0].g
+    for each in found[1:]:
+        N, g = N + each.N, g + each.g
+    alone = np.zeros(len(state.ground))
+    alone[np.concatenate(groups)] = np.concatenate([each.alone for each in found])
+    return _Normals(N, g, alone, csr_array(vstack([each.lost for each in found])))
+
+
+def _normals_of(band: Band, state: State, weights: _Weights) -> _Normals:
+    """The same of some cells."""
     groups = _sums(band.group, len(state.ground))
-    shown, slope, A = band.predicted(state)
+    (shown, slope), A = band.predicted(state), band.design(state)
     residual, w = band.grey - shown, weights.of
     total = np.maximum(groups @ (w * slope**2) + weights.ground, 1e-300)
     pull = groups @ (w * slope * residual) + weights.ground * weights.moved

@@ -46,15 +46,21 @@ class Cells:
         return len(self.cell)
 
     def some(self, rows: NDArray[Any]) -> Cells:
-        """Some rows."""
+        """Some rows; itself, if these are all."""
+        if rows.dtype == np.bool_ and rows.all():
+            return self
         return Cells(*(getattr(self, each.name)[rows] for each in fields(self)))
 
     @classmethod
     def joined(cls, parts: Iterable[Cells]) -> Cells:
         """All rows of many, sorted by cell."""
         every = list(parts)
-        whole = cls(*(np.concatenate([getattr(part, each.name) for part in every]) for each in fields(cls)))
-        return whole.some(np.lexsort((whole.image, whole.cell)))
+
+        def whole(name: str) -> NDArray[Any]:
+            return np.concatenate([getattr(part, name) for part in every])
+
+        order = np.lexsort((whole("image"), whole("cell")))
+        return cls(*(whole(each.name)[order] for each in fields(cls)))
 
     @property
     def shared(self) -> Cells:

@@ -131,12 +131,22 @@ class Band:
         """All images show what they have in the mean."""
         return State(np.tile(self.nodes, (images, 1)), np.zeros((images, self.surfaces.shape[1])), self.own)
 
-    def predicted(self, state: State) -> tuple[_Floats, _Floats, csr_array]:
-        """What the images show (n,), its derivatives by G (n,), and by the unknowns of the images (n, unknowns)."""
+    def predicted(self, state: State) -> tuple[_Floats, _Floats]:
+        """What the images show (n,), and its derivatives by G (n,)."""
+        v, k, part = self._at(state)
+        low, high = state.tables[self.image, k], state.tables[self.image, k + 1]
+        return (low + part * (high - low)) * v, (high - low) / self.step * v
+
+    def _at(self, state: State) -> tuple[_Floats, NDArray[np.int64], _Floats]:
+        """Trends, and where tables are asked: number of the node before, and part of the way to the next."""
         v = np.maximum(1.0 + (self.surfaces * state.trends[self.image]).sum(axis=1), LEAST)
         at = (state.ground[self.group] - self.nodes[0]) / self.step
         k = np.clip(np.floor(at), 0, len(self.nodes) - 2).astype(np.int64)
-        part = at - k
+        return v, k, at - k
+
+    def design(self, state: State) -> csr_array:
+        """Derivatives of what the images show by their unknowns, (n, unknowns)."""
+        v, k, part = self._at(state)
         low, high = state.tables[self.image, k], state.tables[self.image, k + 1]
         table = low + part * (high - low)
         values = np.column_stack([(1 - part) * v, part * v, table[:, None] * self.surfaces])
@@ -145,5 +155,4 @@ class Band:
         columns = np.column_stack([first + k, first + k + 1, first[:, None] + terms]).astype(np.int32)
         starts = np.arange(0, values.size + 1, values.shape[1], dtype=np.int32)
         shape = len(self.grey), len(state.tables) * state.width
-        A = csr_array((values.ravel(), columns.ravel(), starts), shape=shape)
-        return table * v, (high - low) / self.step * v, A
+        return csr_array((values.ravel(), columns.ravel(), starts), shape=shape)

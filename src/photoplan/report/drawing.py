@@ -122,5 +122,5 @@ def round_down(value: float, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> float:
 
 
 def shortened(name: str, most: int = 14) -> str:
-    """A name that fits into a picture."""
-    return name if len(name) <= most else name[: most - 1] + "…"
+    """A name that fits into a picture: its end, since names of a block often begin alike."""
+    return name if len(name) <= most else "…" + name[1 - most :]
