@@ -66,7 +66,8 @@ def correlate(image: NDArray[Any], template: NDArray[Any], weights: NDArray[Any]
     sums = np.zeros((6, columns))
     for r in range(rows):
         first, last = _whole(there, r, height, width, columns)
-        _correlate_row(grey, there, template, weights, r, (0, first, False), least * total, sums, out)
+        # A literal 0 would be a kind of its own to numba, compiled beside the last part's.
+        _correlate_row(grey, there, template, weights, r, (np.int64(0), first, False), least * total, sums, out)
         _correlate_row(grey, there, template, weights, r, (first, last, True), least * total, sums, out)
         _correlate_row(grey, there, template, weights, r, (last, columns, False), least * total, sums, out)
 
