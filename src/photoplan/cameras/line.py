@@ -54,6 +54,10 @@ class LineCamera:
         """The same line on another way."""
         return LineCamera(track, self.look, self.ground)
 
+    def calm(self) -> LineCamera:
+        """The same on a flight without tremor."""
+        return self if self.breaks is None else self.breaks.smooth
+
     @cached_property
     def breaks(self) -> LineTremor | None:
         """What of a turbulent flight changes from line to line; None: the trajectory is smooth."""

@@ -73,6 +73,10 @@ class ChippedLine:
         """The same line on another way."""
         return ChippedLine(tuple(each.along(track) for each in self.chips))
 
+    def calm(self) -> ChippedLine:
+        """The same on a flight without tremor."""
+        return ChippedLine(tuple(each.calm() for each in self.chips))
+
     @cached_property
     def gaps(self) -> tuple[float, ...]:
         """Columns that are missing between chips; below 0: they overlap."""

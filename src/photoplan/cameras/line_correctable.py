@@ -15,6 +15,7 @@ from photoplan.cameras.correctable import ByCorrections, Corrections, prior_rows
 from photoplan.cameras.line import LineCamera
 from photoplan.cameras.line_chips import ChippedLine
 from photoplan.cameras.line_correction import TURNED, LineCorrection, TrackSpline, map_axes, spline_weights
+from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import rotation_vector, skew
 
@@ -138,6 +139,19 @@ class CorrectableLine:
         plain = self.plain.chips[0] if isinstance(self.plain, ChippedLine) else self.plain
         return plain.breaks is not None
 
+    def by_mount(self, track: LineTrack, rows: _Floats, axes: _Floats) -> _Floats:
+        """What the parameters of the mount do to poses at rows (n,), as `TrackSpline` has them: (n, 6, 7).
+
+        axes: east, north and up in those of the body.
+        """
+        speed, turning = _motion(track, rows)
+        J = np.zeros((len(rows), 6, 7))
+        J[:, 3:, :3] = np.eye(3)
+        J[:, :3, 3:6] = axes.T @ track(rows)[1] @ TURNED
+        # A later record: the camera is where it was before.
+        J[:, :3, 6], J[:, 3:, 6] = -speed @ axes, -turning @ TURNED
+        return J
+
     def by_corrections(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> Mapping[str, ByCorrections]:
         """See `Correctable`; whatever moves the camera moves the ground the other way."""
         assert isinstance(camera, LineCamera | ChippedLine)
@@ -150,10 +164,7 @@ class CorrectableLine:
         out: dict[str, ByCorrections] = {}
         n, free = len(xy), self.free
         if len(free):
-            ahead, behind = (track(xy[:, 1] + half) for half in (0.5, -0.5))
-            seconds = (track.time(xy[:, 1] + 0.5) - track.time(xy[:, 1] - 0.5))[:, None]
-            speed = (ahead[0] - behind[0]) / seconds
-            turning = rotation_vector(np.swapaxes(behind[1], 1, 2) @ ahead[1]) / seconds
+            speed, turning = _motion(track, xy[:, 1])
             # A later record: the camera is where it was before.
             late = by_place @ speed[:, :, None] - (by_place @ R @ skew(d)) @ turning[:, :, None]
             J = np.concatenate([by_turn, -by_place @ R @ TURNED, late], axis=2)
@@ -165,3 +176,11 @@ class CorrectableLine:
             columns = (6 * at[:, :, None] + np.arange(6)).reshape(n, 24)
             out[self.keys[1]] = ByCorrections(columns, (J[:, :, None, :] * w[:, None, :, None]).reshape(n, 2, 24))
         return out
+
+
+def _motion(track: LineTrack, rows: _Floats) -> tuple[_Floats, _Floats]:
+    """Speed (n, 3), metres a second, and rate of rotation about the camera's own axes (n, 3), radians a second."""
+    ahead, behind = (track(rows + half) for half in (0.5, -0.5))
+    seconds = (track.time(rows + 0.5) - track.time(rows - 0.5))[:, None]
+    speed = (ahead[0] - behind[0]) / seconds
+    return speed, rotation_vector(np.swapaxes(behind[1], 1, 2) @ ahead[1]) / seconds

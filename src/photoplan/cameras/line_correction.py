@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
-from photoplan.geometry.motion import rotations, times
+from photoplan.geometry.motion import Course, rotations, times
 
 _Floats = NDArray[np.float64]
 #: From the axes of frame images (x along the flight, y to the left, z up) to those of a line camera.
@@ -85,18 +86,51 @@ class LineCorrection:
         """The corrected trajectory."""
         late, known = self.time_offset, (given.known[0] + self.time_offset, given.known[1] + self.time_offset)
         boresight = _turns((TURNED @ self.boresight)[None])
-        axes = map_axes(given)
 
         def positions(t: _Floats) -> _Floats:
             R = rotations(given.attitudes(t - late))
-            S = given.positions(t - late) + R @ (TURNED @ self.lever_arm)
-            return S if self.spline is None else np.asarray(S + self.spline(t)[:, :3] @ axes.T)
+            return np.asarray(given.positions(t - late) + R @ (TURNED @ self.lever_arm))
 
         def attitudes(t: _Floats) -> _Floats:
-            q = times(given.attitudes(t - late), boresight)
-            return q if self.spline is None else times(q, _turns(self.spline(t)[:, 3:] @ TURNED))
+            return times(given.attitudes(t - late), boresight)
 
-        return replace(given, positions=positions, attitudes=attitudes, known=known)
+        mounted = replace(given, positions=positions, attitudes=attitudes, known=known)
+        return mounted if self.spline is None else displaced(mounted, self.spline, map_axes(given))
+
+
+def displaced(given: LineTrack, course: Course, axes: _Floats) -> LineTrack:
+    """A trajectory with something added: east, north, up (`axes`; metres), small rotations about x, y, z (radians)."""
+
+    def positions(t: _Floats) -> _Floats:
+        return np.asarray(given.positions(t) + course(t)[:, :3] @ axes.T)
+
+    def attitudes(t: _Floats) -> _Floats:
+        return times(given.attitudes(t), _turns(course(t)[:, 3:] @ TURNED))
+
+    return replace(given, positions=positions, attitudes=attitudes)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """How exactly a trajectory is known: covariances of its poses over time."""
+
+    times: _Floats
+    """Growing, (k,), seconds as the track counts them; before and after them it is as at the ends."""
+    covariance: _Floats
+    """East, north, up (metres), then small rotations about the camera's x, y, z (radians), (k, 6, 6)."""
+
+    @cached_property
+    def _roots(self) -> _Floats:
+        """Symmetric roots of the covariances: they change over time as smoothly as these."""
+        scale = np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 1e-300))
+        values, axes = np.linalg.eigh(self.covariance / (scale[:, :, None] * scale[:, None, :]))
+        root = (axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ np.swapaxes(axes, 1, 2)
+        return np.asarray(scale[:, :, None] * root)
+
+    def course(self, change: _Floats) -> Course:
+        """What one of six independent errors, or a part of some, (6,), does to poses at times (n,): (n, 6)."""
+        moved = self._roots @ change
+        return lambda t: np.stack([np.interp(t, self.times, column) for column in moved.T], axis=1)
 
 
 def map_axes(track: LineTrack) -> _Floats:

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import CentralCamera
+from photoplan.cameras.base import Camera
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.project.file import load_project, parse_project
 from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.accuracy import SourceErrors, figures_at, in_image, resampling_sigma
-from photoplan.project.cameras import central_without_pixels
+from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.uncertain import height_errors, source_errors
 from photoplan.surfaces.height_errors import HeightErrors, StatedHeightErrors
@@ -168,7 +169,8 @@ def make_budget(request: BudgetRequest) -> Budget:
     if heights == StatedHeightErrors(0.0):
         notes.append("the terrain counts as free of error")
     budgets = tuple(_of_image(project, name, ground, heights, request) for name in names)
-    if any(project.image(name).correlation is None for name in names):
+    posed = [image for image in map(project.any_image, names) if isinstance(image, Image)]
+    if any(image.correlation is None for image in posed):
         notes.append("position and angles count as independent: no correlation is stated")
     return Budget(budgets, tuple(notes))
 
@@ -215,7 +217,9 @@ def _stated(project: Project, request: BudgetRequest) -> tuple[Project, list[str
     given = {name: value for name, value in given.items() if value is not None}
     notes = []
     if given:
-        images = tuple(i.model_copy(update={**given, "correlation": None}) for i in project.images)
+        images = tuple(
+            i.model_copy(update={**given, "correlation": None}) if isinstance(i, Image) else i for i in project.images
+        )
         project = project.model_copy(update={"images": images})
     terrain = request.sigma_terrain
     if terrain is None and request.project is None:
@@ -231,8 +235,8 @@ def _stated(project: Project, request: BudgetRequest) -> tuple[Project, list[str
 def _of_image(
     project: Project, name: str, ground: Ground, heights: HeightErrors, request: BudgetRequest
 ) -> ImageBudget:
-    camera = central_without_pixels(project, name)
-    whole = source_errors(project, project.image(name), ground, camera, in_image(request.kernel, request.tolerance))
+    camera = camera_without_pixels(project, name)
+    whole = source_errors(project, project.any_image(name), ground, camera, in_image(request.kernel, request.tolerance))
     w, h = camera.size
     level = _level(camera, ground, name)
     far = [(w - 1) / 2, (h - 1) / 2]
@@ -269,20 +273,20 @@ def _of_image(
     return ImageBudget(image=name, gsd=float(middle[0]), parts=kept, total=total[at], map=total[9:].reshape(_MAP, _MAP))
 
 
-def _level(camera: CentralCamera, ground: Ground, name: str) -> float:
+def _level(camera: Camera, ground: Ground, name: str) -> float:
     """Height of the ground below an image."""
-    height = float(ground.bare.heights(camera.center[:2]))
+    height = float(ground.bare.heights(camera.vantage.point[:2]))
     if not np.isfinite(height) and ground.bounds is not None:
         low, high = ground.bare.height_range(np.array(ground.bounds))
         height = float(low + high) / 2
-    if not height < camera.center[2]:
+    if not height < camera.vantage.point[2]:
         raise InputError(
-            f"image {name!r}: the ground below it is at {height:.0f} m, the camera at {camera.center[2]:.0f}"
+            f"image {name!r}: the ground below it is at {height:.0f} m, the camera at {camera.vantage.point[2]:.0f}"
         )
     return height
 
 
-def _on_level(camera: CentralCamera, xy: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+def _on_level(camera: Camera, xy: NDArray[np.float64], level: float) -> NDArray[np.float64]:
     """Where image points lie on a level, (n, 2); NaN where they do not."""
     origin, direction = camera.rays(xy, level)
     with np.errstate(divide="ignore", invalid="ignore"):

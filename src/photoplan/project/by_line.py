@@ -5,9 +5,12 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+
 from photoplan.cameras.base import Camera
+from photoplan.cameras.line_correction import displaced, map_axes
 from photoplan.errors import InputError
-from photoplan.io.camera.line.correction import read_line_correction
+from photoplan.io.camera.line.correction import read_line_correction, read_pose_errors
 from photoplan.io.camera.line.file import read_line
 from photoplan.io.camera.line.model import StatedLine
 from photoplan.io.project.line import LineImage
@@ -38,7 +41,16 @@ def line_camera(project: Project, image: LineImage, ground: Ground, size: tuple[
     if image.correction is None:
         return camera
     correction = read_line_correction(project.resolve(image.correction))
-    return camera.along(correction.track(camera.track))
+    track = correction.track(camera.track)
+    if not image.change:
+        return camera.along(track)
+    errors = read_pose_errors(project.resolve(image.correction))
+    if errors is None:
+        raise InputError(
+            f"image {image.name!r}: {image.correction} says nothing of the accuracy of the trajectory; `photoplan "
+            "adjust` writes it, as [accuracy]"
+        )
+    return camera.along(displaced(track, errors.course(np.array(image.change)), map_axes(track))).calm()
 
 
 @lru_cache(maxsize=64)

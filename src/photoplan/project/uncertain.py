@@ -58,8 +58,10 @@ def source_errors(
         moved, cameras = image.moved(change, project.cameras)
         return camera_of(project.model_copy(update={"cameras": cameras}), moved, ground, projection.size)
 
-    causes = (IndependentError(name, at(_STEP * d), at(-_STEP * d), _STEP) for name, d in _deviations(project, image))
-    return SourceErrors(projection, tuple(causes), in_image)
+    known = _deviations(project, image)
+    causes = (IndependentError(name, at(_STEP * d), at(-_STEP * d), _STEP) for name, d in known)
+    # What is moved by nothing is what the others are compared with: tremor that they leave out is in none of them.
+    return SourceErrors(at(0.0 * known[0][1]) if known else projection, tuple(causes), in_image)
 
 
 def _deviations(project: Project, image: ImageEntry) -> tuple[Deviation, ...]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from pydantic import field_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PrivateAttr, field_validator
 
+from photoplan.errors import InputError
 from photoplan.io.camera.line.file import line_files
-from photoplan.io.camera.model import Name
-from photoplan.io.project.image import ImageEntry, InputName, plain_file
+from photoplan.io.camera.model import CameraEntry, Name
+from photoplan.io.project.image import Deviation, ImageEntry, InputName, plain_file
 
 
 class LineImage(ImageEntry):
@@ -23,6 +26,8 @@ class LineImage(ImageEntry):
     """File of corrections of its trajectory, as `photoplan adjust` writes them."""
     mount: Name | None = None
     """Images of one mount share boresight, lever arm and clock in an adjustment; None: those of one file do."""
+
+    _change: tuple[float, ...] = PrivateAttr(default=())
 
     @field_validator("line", "correction")
     @classmethod
@@ -43,6 +48,28 @@ class LineImage(ImageEntry):
     def remarks(self) -> tuple[str, ...]:
         """Its correction."""
         return () if self.correction is None else (f"trajectory is corrected by {self.correction}",)
+
+    def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
+        """See `ImageEntry.deviations`: six parts of what its correction says of the trajectory's poses."""
+        if self.correction is None:
+            raise InputError(
+                f"image {self.name!r}: nothing is known of the accuracy of its trajectory; `photoplan adjust` writes "
+                "it into the file of its `correction`, as [accuracy]"
+            )
+        return tuple(("trajectory", row) for row in np.eye(6))
+
+    def moved(
+        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
+    ) -> tuple[LineImage, Mapping[str, CameraEntry]]:
+        """See `ImageEntry.moved`; on a flight without tremor, which makes no difference to errors."""
+        image = self.model_copy()
+        image._change = tuple(change.tolist())
+        return image, cameras
+
+    @property
+    def change(self) -> tuple[float, ...]:
+        """Parts of the errors of its trajectory by which it is moved; empty: it is as it is."""
+        return self._change
 
     @property
     def described_by(self) -> None:

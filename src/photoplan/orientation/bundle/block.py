@@ -204,6 +204,9 @@ class AdjustedCorrections:
     """Of each owner, (owners, parameters, parameters); NaN without covariance."""
     known: NDArray[np.float64]
     """What each value was known to beforehand: standard deviations; infinite: not at all. As `values`."""
+    joint: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Of knots: the covariances of four that follow each other, from each on, with the first owner of another set of
+    the same images before them, by the key of that set; empty: there is none. (owners − 3, n, n)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from photoplan.adjustment.robust import ENOUGH, variance_factors
+from photoplan.cameras.correctable import Corrections
 from photoplan.errors import GeometryError
 from photoplan.geometry.rotation import rotation_vector
 from photoplan.orientation.bundle.block import (
@@ -330,8 +331,29 @@ def _corrections(solution: Solution, variance: float) -> tuple[AdjustedCorrectio
             known = 1.0 / np.sqrt(weight)
         values = solution.state.corrections(each.key)
         covariance = _covariances(solution, each.key, variance)
-        found.append(AdjustedCorrections(each.key, values, covariance, known.reshape(values.shape)))
+        joint = _joint(solution, each, variance) if each.owner == "knot" else {}
+        found.append(AdjustedCorrections(each.key, values, covariance, known.reshape(values.shape), joint))
     return tuple(found)
+
+
+def _joint(solution: Solution, knots: Corrections, variance: float) -> dict[str, _Floats]:
+    """See `AdjustedCorrections.joint`."""
+    model, out = solution.model, {}
+    kind = model.columns.get(knots.key)
+    if kind is None or solution.inverse is None:
+        return {}
+    for keys in model.keys:
+        other = next((key for key in keys if key != knots.key), "")
+        if knots.key not in keys or other in out:
+            continue
+        beside = model.columns.get(other)
+        before = np.empty(0, np.int64) if beside is None else beside.columns(0)
+        blocks = [
+            solution.inverse.block(np.concatenate([before, *(kind.columns(k + j) for j in range(4))]))
+            for k in range(len(kind.owners) - 3)
+        ]
+        out[other] = np.array(blocks) * variance
+    return out
 
 
 def _strips(solution: Solution, variance: float) -> tuple[AdjustedStrip, ...]:

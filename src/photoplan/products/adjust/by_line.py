@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.line_correctable import CorrectableLine, TrackPriors
-from photoplan.cameras.line_correction import TURNED, LineCorrection, map_axes
+from photoplan.cameras.line_correction import TURNED, LineCorrection, PoseErrors, map_axes, spline_weights
 from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.camera.line.correction import line_correction_text, read_line_correction
 from photoplan.io.project.line import LineImage
@@ -23,6 +23,8 @@ from photoplan.project.ground import Ground
 _Floats = NDArray[np.float64]
 #: Lines at which angles are drawn, at most.
 _DRAWN = 3000
+#: Moments at which it is told how exactly a trajectory without splines is known.
+_JUDGED = 33
 _UNITS = np.repeat([180.0 / np.pi, 1.0, 1.0], [3, 3, 1])
 _CALLED = [*(f"{what} {axis}" for what in ("boresight", "lever arm") for axis in "xyz"), "time offset"]
 
@@ -69,8 +71,31 @@ def _found(image: CorrectableLine, sets: Mapping[str, AdjustedCorrections]) -> F
         found = sets[image.keys[1]]
         sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
         over_time = correction.spline.times, correction.spline.coefficients
-    text = line_correction_text(correction, covariance, sigma)
+    text = line_correction_text(correction, covariance, sigma, _pose_errors(image, correction, sets))
     return FoundCorrection({}, parameters, text, over_time, image.plain.track.time, _angles(image, correction))
+
+
+def _pose_errors(
+    image: CorrectableLine, correction: LineCorrection, sets: Mapping[str, AdjustedCorrections]
+) -> PoseErrors | None:
+    """How exactly the poses are known that come of all corrections together; None: nothing is unknown."""
+    track, axes = correction.track(image.plain.track), map_axes(image.plain.track)
+    spline, mount = image.spline, sets.get(image.keys[0])
+    first, last = track.oriented
+    count = _JUDGED if spline is None else 2 * len(spline.times)
+    rows = np.linspace(first, last, max(2, count))
+    rows = rows[track.is_oriented(rows)]
+    J = [image.by_mount(track, rows, axes)[:, :, image.free]]
+    if spline is None:
+        if mount is None:
+            return None
+        Q = np.broadcast_to(mount.covariance[0], (len(rows), len(image.free), len(image.free)))
+    else:
+        at, w = spline_weights(track.time(rows), spline.first, spline.step, len(spline.coefficients))
+        J.append((w[:, None, :, None] * np.eye(6)[:, None]).reshape(len(rows), 6, 24))
+        Q = sets[image.keys[1]].joint[image.keys[0] if mount is not None else ""][at[:, 0]]
+    A = np.concatenate(J, axis=2)
+    return PoseErrors(track.time(rows), A @ Q @ np.swapaxes(A, 1, 2))
 
 
 def _angles(image: CorrectableLine, correction: LineCorrection) -> tuple[_Floats, _Floats]:

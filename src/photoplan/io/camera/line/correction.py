@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from photoplan.cameras.line_correction import LineCorrection, TrackSpline
+from photoplan.cameras.line_correction import LineCorrection, PoseErrors, TrackSpline
 from photoplan.errors import InputError
 from photoplan.io.camera.line.model import MAX_BYTES
 from photoplan.io.camera.model import Entry, Number, Positive, Triple
@@ -17,6 +17,7 @@ from photoplan.io.plain_files import read_entries
 
 _Floats = NDArray[np.float64]
 _Row = tuple[Number, Number, Number, Number, Number, Number]
+_Triangle = Annotated[tuple[Number, ...], Field(min_length=21, max_length=21)]
 
 
 class _SplineEntries(Entry):
@@ -28,6 +29,15 @@ class _SplineEntries(Entry):
     sigma: tuple[_Row, ...] | None = None
 
 
+class _AccuracyEntries(Entry):
+    """``[accuracy]``: how exactly the corrected trajectory is known."""
+
+    times: Annotated[tuple[Number, ...], Field(min_length=1, max_length=100_000)]
+    covariance: Annotated[tuple[_Triangle, ...], Field(min_length=1, max_length=100_000)]
+
+
+#: Standard deviations beyond which nothing is known of a trajectory, metres and radians.
+_MOST = np.repeat([1e6, 1.0], 3)
 #: What is larger is no error of a mount but another mount, which belongs into the strip.
 _Turn = Annotated[Number, Field(ge=-10.0, le=10.0)]
 
@@ -42,6 +52,39 @@ class CorrectionFile(Entry):
     covariance: Annotated[tuple[Number, ...], Field(max_length=28)] | None = None
     """Of boresight, lever arm and time offset in these units: the lower triangle by rows, 28 numbers."""
     spline: _SplineEntries | None = None
+    accuracy: _AccuracyEntries | None = None
+
+
+def read_pose_errors(path: Path) -> PoseErrors | None:
+    """How exactly a corrected trajectory is known; None: the file does not say.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or an entry is wrong.
+    """
+    found = read_entries(path, CorrectionFile, MAX_BYTES).accuracy
+    if found is None:
+        return None
+    when, C = np.array(found.times), np.zeros((len(found.times), 6, 6))
+    if len(found.covariance) != len(when) or not (np.diff(when) > 0).all():
+        raise InputError(
+            f"{path}: [accuracy]: {len(when)} times, {len(found.covariance)} rows; needed is a row for "
+            "each, later and later"
+        )
+    row, column = np.tril_indices(6)
+    C[:, row, column] = C[:, column, row] = np.array(found.covariance)
+    C *= _units()[:, None] * _units()
+    sigma = np.sqrt(np.maximum(np.diagonal(C, axis1=1, axis2=2), 0.0))
+    bad = np.flatnonzero(
+        (np.linalg.eigvalsh(C / np.maximum(sigma[:, :, None] * sigma[:, None], 1e-300))[:, 0] < -1e-3)
+        | (sigma > _MOST).any(axis=1)
+    )
+    if len(bad):
+        raise InputError(
+            f"{path}: [accuracy]: row {bad[0] + 1} is no covariance of a trajectory; `photoplan adjust` writes it"
+        )
+    return PoseErrors(when, C)
 
 
 def read_line_correction(path: Path) -> LineCorrection:
@@ -63,7 +106,9 @@ def read_line_correction(path: Path) -> LineCorrection:
     return LineCorrection(np.radians(found.boresight_deg), np.array(found.lever_arm_m), found.time_offset_s, spline)
 
 
-def line_correction_text(found: LineCorrection, covariance: _Floats | None, sigma: _Floats | None) -> str:
+def line_correction_text(
+    found: LineCorrection, covariance: _Floats | None, sigma: _Floats | None, errors: PoseErrors | None = None
+) -> str:
     """The file.
 
     Parameters
@@ -73,6 +118,8 @@ def line_correction_text(found: LineCorrection, covariance: _Floats | None, sigm
         Of boresight, lever arm and time offset; radians, metres, seconds.
     sigma : ndarray, shape (k, 6), optional
         Standard deviations of the spline's coefficients; metres, radians.
+    errors : PoseErrors, optional
+        Of what comes of all corrections.
     """
     lines = [
         'format = "photoplan line correction 1"',
@@ -99,6 +146,16 @@ def line_correction_text(found: LineCorrection, covariance: _Floats | None, sigm
         ]
         if sigma is not None and np.isfinite(sigma).all():
             lines += _table("sigma", sigma / _units(), 4)
+    if errors is not None and np.isfinite(errors.covariance).all():
+        row, column = np.tril_indices(6)
+        lines += [
+            "",
+            "# How exactly the corrected trajectory is known: at times (seconds from the image's own zero), the",
+            "# covariance of east, north, up (metres) and small rotations about x, y, z (degrees); lower triangles.",
+            "[accuracy]",
+            f"times = {_list(errors.times)}",
+            *_table("covariance", (errors.covariance / (_units()[:, None] * _units()))[:, row, column], 6),
+        ]
     return "\n".join(lines) + "\n"
 
 
