@@ -149,8 +149,10 @@ class FrameCamera:
         """Directions (..., 3) of the rays of image points (..., 2), as long as it takes to go one metre into depth."""
         t = self._lens.undistort(self.interior.tangent_to_pixel.inverse(xy))
         # Column by column: a product with a matrix this narrow is slower.
-        x, y, z = (t[..., 0] * a[0] + t[..., 1] * a[1] + a[2] for a in self._axes)
-        return np.stack([x, y, z], axis=-1)
+        x, y, out = t[..., 0], t[..., 1], np.empty((*t.shape[:-1], 3))
+        for k, a in enumerate(self._axes):
+            out[..., k] = x * a[0] + y * a[1] + a[2]
+        return out
 
     def derivatives(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN behind the camera."""

@@ -11,6 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import GeometryError, InputError, UsageError
 
 
+def _affine(xy: ArrayLike, a: tuple[float, float, float, float, float, float]) -> NDArray[np.float64]:
+    """Points (..., 2) by a1 to a6 of an affine transformation."""
+    xy = np.asarray(xy, float)
+    x, y, out = xy[..., 0], xy[..., 1], np.empty_like(xy)
+    out[..., 0] = a[0] * x + a[1] * y + a[2]
+    out[..., 1] = a[3] * x + a[4] * y + a[5]
+    return out
+
+
 @dataclass(frozen=True)
 class Affine2D:
     """x' = a1 x + a2 y + a3, y' = a4 x + a5 y + a6 (Ecker 1991, eq. 4.2; Behr 1989, eq. 5.2).
@@ -38,28 +47,26 @@ class Affine2D:
 
     def __call__(self, xy: ArrayLike) -> NDArray[np.float64]:
         """Transform points, shapes (..., 2)."""
-        xy = np.asarray(xy, float)
-        x, y = xy[..., 0], xy[..., 1]
-        out = np.empty_like(xy)
-        out[..., 0] = self.a1 * x + self.a2 * y + self.a3
-        out[..., 1] = self.a4 * x + self.a5 * y + self.a6
-        return out
+        return _affine(xy, (self.a1, self.a2, self.a3, self.a4, self.a5, self.a6))
 
     def inverse(self, xy: ArrayLike) -> NDArray[np.float64]:
         """Points back, shapes (..., 2)."""
-        return (~self)(xy)
+        return _affine(xy, self._inverted)
 
     def derivative(self, xy: ArrayLike) -> NDArray[np.float64]:
         """∂(x', y') / ∂(x, y), shape (..., 2, 2)."""
         J = np.array([[self.a1, self.a2], [self.a4, self.a5]])
         return np.broadcast_to(J, (*np.shape(xy), 2))
 
-    def __invert__(self) -> Affine2D:
+    @property
+    def _inverted(self) -> tuple[float, float, float, float, float, float]:
+        """a1 to a6 of the inverse."""
         d = self.determinant
         a1, a2, a4, a5 = self.a5 / d, -self.a2 / d, -self.a4 / d, self.a1 / d
-        return Affine2D(
-            a1=a1, a2=a2, a3=-(a1 * self.a3 + a2 * self.a6), a4=a4, a5=a5, a6=-(a4 * self.a3 + a5 * self.a6)
-        )
+        return a1, a2, -(a1 * self.a3 + a2 * self.a6), a4, a5, -(a4 * self.a3 + a5 * self.a6)
+
+    def __invert__(self) -> Affine2D:
+        return Affine2D(*self._inverted)
 
     def __matmul__(self, other: Affine2D | Bilinear2D) -> Affine2D | Bilinear2D:
         first, second = (self.a1, self.a2, self.a3), (self.a4, self.a5, self.a6)
