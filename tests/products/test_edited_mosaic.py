@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 
 import numpy as np
 import pytest
 import rasterio
 from products.test_sheets import BOUNDS, regions
 from tools.command import Here
+from tools.forked import Mishap, forked
 from tools.small_block import Block
 
 OPTIONS = ("--resolution", 1, "--tile", 128, "--no-quicklook", "--feather", 20, "--sources", "--bounds", *BOUNDS)
@@ -93,6 +95,26 @@ def test_file_that_somebody_changed_is_not_taken_over(small: Block, capsys: pyte
         assert mosaic.resumed("one", "--overwrite") == 0 and mosaic.files("one") == first
     path.write_bytes(first[0][: len(first[0]) // 2])
     assert mosaic.resumed("one", "--overwrite") < 6 and mosaic.files("one") == first
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="needs fork and signals")
+def test_fault_03_killed_while_an_edit_is_computed(small: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    """The older mosaic stays; the same command computes only what is left of the edit."""
+    mosaic = Mosaic(small, capsys)
+    mosaic.draw(500_380)
+    mosaic.resumed("one")
+    first = mosaic.files("one")
+    mosaic.draw(500_360)
+    out = small.folder / "one"
+    words = ["mosaic", small.project, *OPTIONS, "--seams", mosaic.seams, "--output", out, "--overwrite", "--workers", 1]
+    killed = forked(words, small.folder / "said", Mishap(end_at=1))
+    assert killed.code == -9 and len(killed.tasks) == 1 and mosaic.files("one") == first
+    again = forked(words, small.folder / "said")
+    assert again.code == 0 and "5 of 6 tiles are finished already" in again.err, again.err
+    assert len(again.tasks) == 1 and again.tasks != killed.tasks
+    assert mosaic.resumed("fresh") == 0 and mosaic.files("one") == mosaic.files("fresh") != first
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 
 @pytest.mark.slow
