@@ -13,10 +13,19 @@ from photoplan.cli.options import NEW_FOLDER, PATH, bounds_option, dry_run_optio
 @click.command("surface")
 @click.argument("project", type=PATH)
 @click.option("--resolution", type=float, required=True, metavar="R", help="Distance of the heights, metres.")
+@click.option(
+    "--target",
+    default="map",
+    metavar="WHAT",
+    help="Heights over it: map, wall:X,Y,Z,AZIMUTH[,TILT], or image:NAME[,DISTANCE] [map].",
+)
 @bounds_option
 @images_option()
 @click.option(
-    "--start", default="terrain", metavar="WHAT", help="terrain (the project's), a height, or a file [terrain]."
+    "--start",
+    default="terrain",
+    metavar="WHAT",
+    help="terrain (the project's), a height, or a file [terrain; 0].",
 )
 @click.option("--reach", type=float, metavar="M", help="How far the start may be wrong [a tenth of the flying height].")
 @click.option(
@@ -62,7 +71,7 @@ def command(project: Path, **options: Any) -> None:
     with Telling(how.quiet) as events:
         plan = plan_surface(stated, SurfaceSettings(**options), images or None, force=force, events=events)
         for line in plan.blind:
-            events.talk(f"  sees no terrain and is left out: {line}")
+            events.talk(f"  sees none of it and is left out: {line}")
         if dry_run:
             show_json(plan.json_fields()) if how.as_json else show(plan)
             return

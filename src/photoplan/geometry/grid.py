@@ -202,7 +202,7 @@ class MapGrid:
     height: int
     """Rows."""
     crs: str
-    """Coordinate reference system as a string that pyproj reads (usually `EPSG:…` or WKT)."""
+    """Coordinate reference system as a string that pyproj reads (usually `EPSG:…` or WKT); empty: it is no map."""
 
     def __post_init__(self) -> None:
         check_resolution(self.resolution)
@@ -259,7 +259,7 @@ class MapGrid:
     def placement(self) -> Placement:
         """The same for files, which know other places than maps too."""
         corner = (self.resolution, 0.0, self.left, 0.0, -self.resolution, self.top)
-        return Placement((self.width, self.height), corner, self.crs)
+        return Placement((self.width, self.height), corner, self.crs or None)
 
     def to_map(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Pixel coordinates (column, row) to map X, Y; shapes (..., 2)."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from photoplan import __version__
 from photoplan.errors import UsageError
 from photoplan.geometry.crs import parse_crs
+from photoplan.geometry.frames import Frame
 from photoplan.io.disk import disk_error
 from photoplan.io.gdal import open_raster
 from photoplan.io.naming import give_name, standing
@@ -43,7 +44,7 @@ def check_cloud(path: Path) -> None:
         )
 
 
-def write_cloud(path: Path, heights: Path, sigmas: Path, grey: Path, crs: str) -> int:
+def write_cloud(path: Path, heights: Path, sigmas: Path, grey: Path, crs: str, frame: Frame | None = None) -> int:
     """Write the posts of a surface that have a height.
 
     Parameters
@@ -55,6 +56,8 @@ def write_cloud(path: Path, heights: Path, sigmas: Path, grey: Path, crs: str) -
         Finished rasters, which may still wait for their names; grey values as fine or several times finer: their means.
     crs : str
         Stated in LAS, which can.
+    frame : Frame, optional
+        Of the rasters, where they lie on no map: points are on the ground, their standard deviations along its heights.
 
     Returns
     -------
@@ -72,14 +75,14 @@ def write_cloud(path: Path, heights: Path, sigmas: Path, grey: Path, crs: str) -
         with ExitStack() as opened:
             opened.callback(part.unlink, missing_ok=True)
             files = [opened.enter_context(open_raster(standing(file), "GTiff")) for file in (heights, sigmas, grey)]
-            count = write(part, path, files, crs)
+            count = write(part, path, files, crs, frame)
             give_name(part, path)
     except OSError as error:
         raise disk_error(path, error) from error
     return count
 
 
-def _points(files: Sequence[Any]) -> Iterator[NDArray[Any]]:
+def _points(files: Sequence[Any], frame: Frame | None) -> Iterator[NDArray[Any]]:
     """Points by rows of posts."""
     heights, sigmas, grey = files
     finer = grey.width // heights.width
@@ -93,15 +96,24 @@ def _points(files: Sequence[Any]) -> Iterator[NDArray[Any]]:
         out = np.empty(len(i), _POINT)
         out["x"], out["y"] = heights.transform @ (i + 0.5, row + j + 0.5)
         out["z"], out["sigma"], out["grey"] = z[j, i], sigmas.read(1, window=window)[j, i], means[j, i]
-        yield out
+        yield out if frame is None else _on_ground(out, frame)
 
 
-def _write_ply(part: Path, path: Path, files: Sequence[Any], crs: str) -> int:
+def _on_ground(points: NDArray[Any], frame: Frame) -> NDArray[Any]:
+    """Points of a frame on the ground, and standard deviations there; without those that it does not have."""
+    uvh = np.stack([points[axis] for axis in "xyz"], axis=-1)
+    out = points.copy()
+    out["x"], out["y"], out["z"] = frame(uvh).T
+    out["sigma"] *= np.linalg.norm(frame.jacobian(uvh)[..., 2], axis=-1)
+    return np.asarray(out[np.isfinite(out["z"])])
+
+
+def _write_ply(part: Path, path: Path, files: Sequence[Any], crs: str, frame: Frame | None) -> int:
     count = 0
     with part.open("wb") as file:
         # The count is known at the end: room is left for it.
         file.write(_ply_header(0))
-        for points in _points(files):
+        for points in _points(files, frame):
             file.write(points.tobytes())
             count += len(points)
         file.seek(0)
@@ -122,10 +134,12 @@ def _ply_header(count: int) -> bytes:
     return "\n".join([*lines, ""]).encode()
 
 
-def _write_las(part: Path, path: Path, files: Sequence[Any], crs: str) -> int:
+def _write_las(part: Path, path: Path, files: Sequence[Any], crs: str, frame: Frame | None) -> int:
     import laspy  # type: ignore[import-untyped]  # noqa: PLC0415  # an optional package
 
     left, bottom, *_ = files[0].bounds
+    if frame is not None:
+        left, bottom, _ = frame((left, bottom, 0.0)).tolist()
     unit = 10.0 ** np.floor(np.log10(_UNIT * files[0].res[0]) + 1e-9)
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = np.full(3, unit), np.array([np.floor(left), np.floor(bottom), 0.0])
@@ -134,7 +148,7 @@ def _write_las(part: Path, path: Path, files: Sequence[Any], crs: str) -> int:
     header.add_crs(parse_crs(crs))
     count = 0
     with laspy.open(part, mode="w", header=header, do_compress=path.suffix.lower() == ".laz") as file:
-        for points in _points(files):
+        for points in _points(files, frame):
             record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
             record.x, record.y, record.z = points["x"], points["y"], points["z"]
             record.intensity = np.clip(np.rint(points["grey"]), 0, 65535).astype(np.uint16)

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.cameras.framed import FramedCamera
 from photoplan.engine.run import Made, Output
+from photoplan.geometry.frames import Frame
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.observe import View
 from photoplan.matching.facets.pyramid import Pyramid
@@ -44,6 +46,8 @@ class SurfaceJob:
     """See `SurfaceSettings.start`."""
     residuals: bool = False
     """See `SurfaceSettings.residuals`."""
+    frame: Frame | None = None
+    """Of the target; None: the map."""
 
     @property
     def part(self) -> int:
@@ -57,7 +61,7 @@ class SurfaceJob:
 
     def __call__(self, tile: Tile) -> Made:
         """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""
-        views = [_view(scene, _KEPT // len(self.address.scenes)) for scene in self.address.scenes]
+        views = [_view(scene, _KEPT // len(self.address.scenes), self.frame) for scene in self.address.scenes]
         start = _start(self.address, self.start, self.grid.crs)
         window, m = tile.window, self.scheme.ratio
         shape, finest = (window.height, window.width), (m * window.height, m * window.width)
@@ -99,10 +103,11 @@ class SurfaceJob:
 
 
 @lru_cache(maxsize=256)
-def _view(address: SceneAddress, kept: int) -> View:
+def _view(address: SceneAddress, kept: int, frame: Frame | None) -> View:
     """An image and its pyramid, kept for the next tile."""
     scene = address.open()
-    return View(scene.camera, Pyramid(GreyImage(scene.reader), kept=kept))
+    camera = scene.camera if frame is None else FramedCamera(scene.camera, frame)
+    return View(camera, Pyramid(GreyImage(scene.reader), kept=kept))
 
 
 @lru_cache(maxsize=4)

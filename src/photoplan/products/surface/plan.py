@@ -13,6 +13,7 @@ import numpy as np
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.bounds import MOST_HEIGHT, odd_place
+from photoplan.geometry.frames import Frame
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.names import safe_stem
 from photoplan.io.point_cloud import check_cloud
@@ -21,11 +22,10 @@ from photoplan.io.run_record import run_key
 from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.matching.facets.search import Planes, Search
 from photoplan.plain import pick
-from photoplan.products.orthophoto.look import Looked, extent_text, look_at
+from photoplan.products.orthophoto.look import extent_text
+from photoplan.products.surface.target import Bounds, Seen, frame_of, over_frame, over_map
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.scenes import ScenesAddress
-
-Bounds = tuple[float, float, float, float]
 
 #: Side of a tile of heights; those of grey values are as many times larger as they are finer.
 TILE = 256
@@ -60,10 +60,13 @@ class SurfaceSettings:
 
     resolution: float
     """Distance of the height posts, metres."""
+    target: str = "map"
+    """What heights are over: `map`, `wall:X,Y,Z,AZIMUTH[,TILT]` or `image:NAME[,DISTANCE]`, see `frame_of`."""
     bounds: Bounds | None = None
-    """xmin, ymin, xmax, ymax; None: all that two images see."""
+    """xmin, ymin, xmax, ymax; None: all that two images see, or the image that is the target; a wall needs them."""
     start: str = "terrain"
-    """`terrain` (the project's), a height in metres, or a file of heights."""
+    """`terrain` (the project's), a height in metres, or a file of heights; on a target that is no map a height, for
+    `terrain` 0."""
     reach: float | None = None
     """How far the start may be wrong, metres; None: a tenth of the flying height."""
     search: bool | None = None
@@ -89,6 +92,8 @@ class SurfacePlan:
     """A line for each image that sees none of it."""
     grid: MapGrid
     """Its pixels are the height posts."""
+    frame: Frame | None
+    """Of the target; None: the map."""
     scheme: Scheme
     gsd: float
     """Median ground sampling distance of the images, metres."""
@@ -118,6 +123,7 @@ class SurfacePlan:
             f"{self.height_error:.3g} m of height",
             f"  {s.coarsest + 1} level{'s' * (s.coarsest > 0)}, the coarsest with heights of "
             f"{g.resolution * 2**s.coarsest:g} m; start: {self.settings.start}{self._searched}",
+            *([] if self.frame is None else [f"  target {self.settings.target}: u, v and h instead of X, Y and Z"]),
         ])  # fmt: skip
 
     @property
@@ -135,6 +141,8 @@ class SurfacePlan:
         return {
             **pick(self, "images", "blind", "gsd", "key", height_of_a_pixel="height_error"),
             **pick(self.grid, "bounds", "resolution", "width", "height"),
+            "target": self.settings.target,
+            "frame": self.frame,
             "levels": self.scheme.coarsest + 1,
             "search_levels": 0 if self.scheme.search is None else self.scheme.search.coarsest + 1,
             "grey_resolution": self.grey_grid.resolution,
@@ -176,15 +184,24 @@ def plan_surface(
         raise UsageError(f"images {', '.join(names)}: heights need two images at least")
     check_start(project, settings)
     events.begin("planning", len(names), "images")
-    looked, blind = look_at(project, names, force, events)
+    frame, own = frame_of(project, settings.target)
+    if frame is None:
+        looked, blind = over_map(project, names, force, events)
+    else:
+        bounds = settings.bounds or own
+        if bounds is None:
+            raise UsageError(f"target {settings.target}: a wall has no end; give `bounds`, u and v on it in metres")
+        MapGrid.covering(bounds, settings.resolution, "")
+        settings = replace(settings, bounds=bounds, start="0" if settings.start == "terrain" else settings.start)
+        looked, blind = over_frame(project, names, frame, bounds, float(settings.start), events)
     bounds = _bounds(settings, looked, blind)
-    gsd = float(np.median([one.look.gsd for one in looked]))
+    gsd = float(np.median([one.gsd for one in looked]))
     if settings.resolution < _FINEST * gsd * 0.999:
         raise UsageError(
             f"resolution {settings.resolution:g} m is finer than the images see the ground ({gsd:.3g} m): a height "
             f"needs some pixels; choose {3 * gsd:.2g} m, or {gsd:.2g} m at least"
         )
-    grid = MapGrid.covering(bounds, settings.resolution, project.crs)
+    grid = MapGrid.covering(bounds, settings.resolution, project.crs if frame is None else "")
     if min(grid.width, grid.height) < 2:
         raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
     ratio, base = _facets(settings.resolution / gsd, MOST_RATIO)
@@ -196,6 +213,8 @@ def plan_surface(
             f"{flying:.3g} m"
         )
     reach = settings.reach or _WRONG * flying or _SOME * height_error
+    if frame is not None:
+        reach = _inside(frame, float(settings.start), reach, settings.reach)
     coarsest = _coarsest(reach, looked, height_error, base)
     scheme = Scheme(ratio, coarsest, base, reach)
     wanted = reach > _RELIEF * height_error if settings.search is None else settings.search
@@ -210,10 +229,11 @@ def plan_surface(
         "settings": replace(settings, points=()),
         "scheme": scheme,
         "grid": grid,
+        "frame": frame,
         "facts": ScenesAddress.of(project, used).facts,
     }
     key = run_key("surface", stated, files)
-    return SurfacePlan(project, settings, used, tuple(blind), grid, scheme, gsd, height_error, key)
+    return SurfacePlan(project, settings, used, tuple(blind), grid, frame, scheme, gsd, height_error, key)
 
 
 def check_start(project: Project, settings: SurfaceSettings) -> None:
@@ -243,6 +263,8 @@ def check_start(project: Project, settings: SurfaceSettings) -> None:
     odd = None if number is None else odd_place((0.0, 0.0, number), camera=True)
     if odd is not None:
         raise UsageError(f"start: {odd}")
+    if number is None and settings.target != "map":
+        raise UsageError(f"start {settings.start!r}: on a target that is no map give a height in metres")
     if number is None:
         if not Path(settings.start).exists():
             raise UsageError(f"start {settings.start!r}: is no height and no file; give `terrain`, a height, or a file")
@@ -256,16 +278,25 @@ def _number(text: str) -> float | None:
         return None
 
 
-def _bounds(settings: SurfaceSettings, looked: Sequence[Looked], blind: Sequence[str]) -> Bounds:
+def _inside(frame: Frame, start: float, reach: float, stated: float | None) -> float:
+    """The reach, not farther than the frame goes; one that a user states is refused."""
+    low, high = frame.heights
+    most = min(start - low, high - start)
+    if most <= 0 or (reach > most and stated is not None):
+        raise UsageError(f"start {start:g} m and reach {reach:g} m: its heights go from {low:.3g} to {high:.3g} m")
+    return min(reach, most)
+
+
+def _bounds(settings: SurfaceSettings, looked: Sequence[Seen], blind: Sequence[str]) -> Bounds:
     """The bounds that were chosen, or around all that two images see by their footprints."""
-    seen = [one.look.footprint.bounds for one in looked if one.look.footprint.bounds is not None]
+    seen = [one.bounds for one in looked]
     common = []
     for a, b in combinations(seen, 2):
         low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
         if (low < high).all():
             common.append((*low.tolist(), *high.tolist()))
     if not common:
-        lines = [f"{one.name}: sees {extent_text(one.look.footprint.bounds)}" for one in looked]
+        lines = [f"{one.name}: sees {extent_text(one.bounds)}" for one in looked]
         raise GeometryError(
             "no two images see a common piece of the ground, so there are no heights:\n  "
             + "\n  ".join([*lines, *blind][:12])
@@ -282,12 +313,11 @@ def _bounds(settings: SurfaceSettings, looked: Sequence[Looked], blind: Sequence
     return b
 
 
-def _heights_of_a_pixel(looked: Sequence[Looked], gsd: float) -> tuple[float, float]:
+def _heights_of_a_pixel(looked: Sequence[Seen], gsd: float) -> tuple[float, float]:
     """Heights that part images by one pixel, GSD · H / B: the outermost, and the usual of those that share enough."""
     rates = []
     for one, other in combinations(looked, 2):
-        a, b = one.look.footprint.bounds, other.look.footprint.bounds
-        assert a is not None and b is not None
+        a, b = one.bounds, other.bounds
         low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
         areas = [(c[2] - c[0]) * (c[3] - c[1]) for c in (a, b)]
         if (low < high).all() and float(np.prod(high - low)) > _SHARED * min(areas):
@@ -299,20 +329,20 @@ def _heights_of_a_pixel(looked: Sequence[Looked], gsd: float) -> tuple[float, fl
     return gsd / max(rates), gsd / float(np.median(rates))
 
 
-def _slope(one: Looked, XY: np.ndarray) -> np.ndarray:
+def _slope(one: Seen, XY: np.ndarray) -> np.ndarray:
     """By how much the ground point of a pixel moves on the map per metre of height, at a place, shape (2,)."""
-    low, high = one.look.footprint.height_range
+    low, high = one.heights
     level = (low + high) / 2
-    J = one.scene.camera.derivatives(np.array([*XY, level]))
+    J = one.camera.derivatives(np.array([*XY, level]))
     return np.asarray(-np.linalg.solve(J[:, :2], J[:, 2]))
 
 
-def _flying_height(looked: Sequence[Looked]) -> float:
+def _flying_height(looked: Sequence[Seen]) -> float:
     """Median height of the images above the ground, metres; 0 for satellites, which are too far away for that."""
     heights = []
     for one in looked:
-        low, high = one.look.footprint.height_range
-        vantage = one.scene.camera.vantage
+        low, high = one.heights
+        vantage = one.camera.vantage
         heights.append(float(vantage.point[2]) - (low + high) / 2 if vantage.central else 0.0)
     return float(np.median(heights))
 
@@ -323,10 +353,10 @@ def _facets(pixels: float, most: int) -> tuple[int, int]:
     return max(1, round(pixels / 2**base)), base
 
 
-def _search(looked: Sequence[Looked], pixels: float, height_error: float, reach: float, most: int) -> Search:
+def _search(looked: Sequence[Seen], pixels: float, height_error: float, reach: float, most: int) -> Search:
     """How heights are searched whose facets have so many pixels of usual images along a side; `most` levels."""
-    at = float(np.median([sum(one.look.footprint.height_range) / 2 for one in looked]))
-    vantages = [one.scene.camera.vantage for one in looked]
+    at = float(np.median([sum(one.heights) / 2 for one in looked]))
+    vantages = [one.camera.vantage for one in looked]
     central = all(vantage.central for vantage in vantages)
     ceiling = min(float(vantage.point[2]) for vantage in vantages) if central else math.inf
     ratio, base = _facets(pixels, _CELLS)
@@ -335,9 +365,9 @@ def _search(looked: Sequence[Looked], pixels: float, height_error: float, reach:
     return Search(Planes(cell, at, ceiling), ratio, base, min(level, most), _ROOM * cell)
 
 
-def _coarsest(reach: float, looked: Sequence[Looked], height_error: float, base: int) -> int:
+def _coarsest(reach: float, looked: Sequence[Seen], height_error: float, base: int) -> int:
     """The level on which a start that is wrong by `reach` is wrong by few pixels, or the images have become small."""
     wanted = math.ceil(math.log2(max(1.0, reach / height_error / _CATCH / 2**base)))
-    shortest = min(min(one.scene.camera.size) for one in looked)
+    shortest = min(min(one.camera.size) for one in looked)
     allowed = max(0, math.floor(math.log2(max(1.0, shortest / _LEAST))) - base)
     return int(min(wanted, allowed, _LEVELS))

@@ -133,7 +133,7 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
     for place in (folder, *(path.parent for path in plan.settings.points)):
         make_folder(place)
     address = plan.address
-    job = SurfaceJob(address, plan.grid, plan.scheme, plan.settings.start, plan.settings.residuals)
+    job = SurfaceJob(address, plan.grid, plan.scheme, plan.settings.start, plan.settings.residuals, plan.frame)
     inputs = tuple(str(Path(path).resolve()) for path, _ in address.digests)
     question = Question(versions, inputs, str(folder.resolve()))
     tiles = Tiles.every(plan.grid.window, TILE)
@@ -188,11 +188,13 @@ def _complete(
         "PHOTOPLAN_VERSION": __version__,
         "PHOTOPLAN_IMAGE": ", ".join(plan.images),
         "PHOTOPLAN_KEY": plan.key,
+        "PHOTOPLAN_TARGET": plan.settings.target,
     }
     with together():
         facts, *_ = [file.complete(tags) for file in files.values()]
         for path in plan.settings.points:
-            write_cloud(path, files["heights"].path, files["sigma"].path, files["grey"].path, plan.grid.crs)
+            z, sigma, grey = (files[kind].path for kind in ("heights", "sigma", "grey"))
+            write_cloud(path, z, sigma, grey, plan.project.crs, plan.frame)
         ran = times()
         result = _result(plan, files, ran["seconds"], facts.valid_share, tally)
         scene = plan.address.scenes[0].open()
@@ -206,6 +208,7 @@ def _complete(
             settings=plan.settings,
             scheme=plan.scheme,
             grid=plan.grid,
+            frame=plan.frame,
             heights={"orientation": scene.ground.height_systems[1], "working": scene.ground.working_system},
             project=plan.project.alone(plan.images).model_dump(mode="json", exclude_none=True),
         )

@@ -1,0 +1,152 @@
+"""Frames: coordinates u, v and a height h over something that is no map, and where they are on the ground."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_Doubles = NDArray[np.float64]
+Axes = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+#: Nearest and farthest that is seen along an image, parts and multiples of the distance of its frame.
+_NEAREST, _FARTHEST = 0.25, 50.0
+
+
+class Frame(Hashable, Protocol):
+    """An invertible mapping of space that keeps straight lines straight. A value: hashable, and pickles."""
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """Between which h there is anything; infinite: everywhere."""
+        ...
+
+    def __call__(self, uvh: ArrayLike) -> _Doubles:
+        """Points of the frame (..., 3) to the ground, metres; NaN where there is none."""
+        ...
+
+    def inverse(self, XYZ: ArrayLike) -> _Doubles:
+        """Ground points (..., 3) to the frame; NaN where it has none."""
+        ...
+
+    def jacobian(self, uvh: ArrayLike) -> _Doubles:
+        """Derivative of the ground point by u, v, h, shape (..., 3, 3)."""
+        ...
+
+    def lines(self, origin: _Doubles, direction: _Doubles, height: float) -> tuple[_Doubles, _Doubles]:
+        """Rays of the ground, (..., 3) each, in the frame: a point of each and its unit direction there.
+
+        The point is that at a height where the frame bends distances; NaN where the ray does not get there.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class WallFrame:
+    """u along a wall to the right, v up on it, h in front of it: a rigid motion."""
+
+    origin: tuple[float, float, float]
+    """Ground point of u = v = h = 0."""
+    axes: Axes
+    """Rows: directions of u, v and h on the ground."""
+    heights: tuple[float, float] = (-math.inf, math.inf)
+    """Everywhere."""
+
+    @classmethod
+    def facing(cls, origin: tuple[float, float, float], azimuth: float, tilt: float = 0.0) -> WallFrame:
+        """The frame of a plane by the azimuth of its outward normal, from north by east, and how far that is raised, °.
+
+        u is level and points to the right of who looks at the wall; a wall of azimuth 180° and tilt 90° is the map.
+        """
+        (sa, ca), (st, ct) = (_sine_cosine(angle) for angle in (azimuth, tilt))
+        normal, right = (sa * ct, ca * ct, st), (-ca, sa, 0.0)
+        x, y, z = (float(c) + 0.0 for c in np.cross(normal, right))
+        return cls(origin, (right, (x, y, z), normal))
+
+    def __call__(self, uvh: ArrayLike) -> _Doubles:
+        """Points of the frame (..., 3) to the ground."""
+        return np.asarray(np.asarray(uvh, float) @ np.array(self.axes) + self.origin)
+
+    def inverse(self, XYZ: ArrayLike) -> _Doubles:
+        """Ground points (..., 3) to the frame."""
+        return np.asarray((np.asarray(XYZ, float) - self.origin) @ np.array(self.axes).T)
+
+    def jacobian(self, uvh: ArrayLike) -> _Doubles:
+        """Derivative of the ground point, the same everywhere, shape (..., 3, 3)."""
+        return np.broadcast_to(np.array(self.axes).T, (*np.shape(uvh), 3))
+
+    def lines(self, origin: _Doubles, direction: _Doubles, height: float) -> tuple[_Doubles, _Doubles]:
+        """Their origins and directions in the frame."""
+        return self.inverse(origin), direction @ np.array(self.axes).T
+
+
+@dataclass(frozen=True)
+class ImageFrame:
+    """Along the rays of a central image: u, v on its plane at a distance D, and h even in parallax.
+
+    XYZ = C + Rᵀ (u, v, −D) / (1 + h / D): a projective mapping that takes the image's centre to infinity. Near h = 0 a
+    metre of h is a metre towards the image; planes of constant h across its axis differ by constant parallax.
+    """
+
+    origin: tuple[float, float, float]
+    """Projection centre C."""
+    axes: Axes
+    """Rows: directions of the image's axes on the ground, the third one against its view."""
+    distance: float
+    """D, metres along the axis."""
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """From 50 times the distance to a quarter of it."""
+        return tuple(self.distance * (1 / part - 1) for part in (_FARTHEST, _NEAREST))  # type: ignore[return-value]
+
+    def __call__(self, uvh: ArrayLike) -> _Doubles:
+        """Points of the frame (..., 3) to the ground; NaN at and beyond infinity, h ≤ −D."""
+        uvh = np.asarray(uvh, float)
+        nearer = self._nearer(uvh)
+        p = np.concatenate([uvh[..., :2], np.full_like(uvh[..., 2:], -self.distance)], axis=-1) / nearer
+        return np.asarray(p @ np.array(self.axes) + self.origin)
+
+    def inverse(self, XYZ: ArrayLike) -> _Doubles:
+        """Ground points (..., 3) to the frame; NaN at and behind the image's centre."""
+        p = (np.asarray(XYZ, float) - self.origin) @ np.array(self.axes).T
+        nearer = self.distance / np.where(p[..., 2:] < 0, -p[..., 2:], np.nan)
+        return np.concatenate([p[..., :2] * nearer, self.distance * (nearer - 1)], axis=-1)
+
+    def jacobian(self, uvh: ArrayLike) -> _Doubles:
+        """Derivative of the ground point, shape (..., 3, 3)."""
+        uvh = np.asarray(uvh, float)
+        nearer = self._nearer(uvh)[..., None]
+        J = np.zeros((*uvh.shape, 3))
+        J[..., 0, 0] = J[..., 1, 1] = 1.0
+        J[..., :2, 2] = -uvh[..., :2] / (self.distance * nearer[..., 0])
+        J[..., 2, 2] = 1.0 / nearer[..., 0, 0]
+        return np.asarray(np.array(self.axes).T @ (J / nearer))
+
+    def lines(self, origin: _Doubles, direction: _Doubles, height: float) -> tuple[_Doubles, _Doubles]:
+        """Their points at a height and directions there; NaN where they begin beyond it."""
+        towards = np.array(self.axes)[2]
+        depth = self.distance / (1.0 + height / self.distance) if height > -self.distance else np.nan
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = -(depth + (origin - self.origin) @ towards) / (direction @ towards)
+            points = self.inverse(origin + np.where(along > 0, along, np.nan)[..., None] * direction)
+            ways = np.linalg.solve(self.jacobian(points), direction[..., None])[..., 0]
+            return points, ways / np.linalg.norm(ways, axis=-1, keepdims=True)
+
+    def _nearer(self, uvh: _Doubles) -> _Doubles:
+        """How many times nearer than the distance points lie, shape (..., 1)."""
+        nearer = 1.0 + uvh[..., 2:] / self.distance
+        return np.where(nearer > 0, nearer, np.nan)
+
+
+def _sine_cosine(degrees: float) -> tuple[float, float]:
+    """Exact for quarters of a circle."""
+    quarter, rest = divmod(degrees, 90.0)
+    s, c = math.sin(math.radians(rest)), math.cos(math.radians(rest))
+    for _ in range(int(quarter) % 4):
+        s, c = c, -s
+    return s, c

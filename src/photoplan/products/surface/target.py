@@ -1,0 +1,170 @@
+"""What a surface lies over: a map, a wall, or what an image sees; and which images see it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from photoplan.cameras.base import Camera
+from photoplan.cameras.base import project as project_points
+from photoplan.cameras.framed import FramedCamera
+from photoplan.errors import GeometryError, UsageError
+from photoplan.events import Events
+from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
+from photoplan.io.project.model import Project
+from photoplan.plan.footprint import image_border
+from photoplan.products.orthophoto.look import look_at
+from photoplan.project.scene import Scene, map_order, open_scene
+
+Bounds = tuple[float, float, float, float]
+
+#: Points along a side of a target that are projected to see which images show it.
+_POINTS = 33
+#: Metres over which an image's projection is taken apart; from a straight line it differs by less than this part.
+_APART, _STRAIGHT = 1024.0, 1e-6
+_FORMS = "`map`, `wall:X,Y,Z,AZIMUTH[,TILT]` or `image:NAME[,DISTANCE]`"
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What an image sees of a target."""
+
+    name: str
+    camera: Camera
+    """In the target's coordinates."""
+    bounds: Bounds
+    """Of everything that it sees there."""
+    heights: tuple[float, float]
+    """Between which that lies."""
+    gsd: float
+    """Its mean ground sampling distance, metres."""
+
+
+def over_map(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Seen], list[str]]:
+    """Images that see terrain, and a line for each that sees none; see `look_at`."""
+    looked, blind = look_at(project, names, force, events)
+    prints = [(one, one.look.footprint) for one in looked]
+    seen = [
+        Seen(one.name, one.scene.camera, print_.bounds, print_.height_range, one.look.gsd)
+        for one, print_ in prints
+        if print_.bounds is not None
+    ]
+    return seen, blind
+
+
+def over_frame(
+    project: Project, names: Sequence[str], frame: Frame, bounds: Bounds, height: float, events: Events
+) -> tuple[list[Seen], list[str]]:
+    """Images that see a part of a target at a height, and a line for each that sees none.
+
+    Raises
+    ------
+    GeometryError
+        The rays of an image are not straight on the ground, or meet in no point.
+    """
+    u, v = (np.linspace(bounds[k], bounds[k + 2], _POINTS) for k in (0, 1))
+    uvh = np.stack([*np.meshgrid(u, v), np.full((_POINTS, _POINTS), height)], axis=-1).reshape(-1, 3)
+    seen, blind = {}, []
+    for name in (names[place] for place in map_order(project, names)):
+        camera = FramedCamera(straight(open_scene(project, name), name), frame)
+        at = project_points(camera, uvh)
+        # From behind nothing of a wall is seen.
+        _, way = camera.rays(at, height)
+        inside = ((at > -0.5) & (at < np.array(camera.size) - 0.5)).all(axis=1) & (way[:, 2] < 0)
+        events.done()
+        if not inside.any():
+            blind.append(f"{name}: shows nothing of the target inside the bounds at the height {height:g}")
+            continue
+        low, high = uvh[inside, :2].min(axis=0).tolist(), uvh[inside, :2].max(axis=0).tolist()
+        areas = np.abs(np.linalg.det(camera.derivatives(uvh[inside])[..., :2]))
+        seen[name] = Seen(name, camera, (*low, *high), (height, height), float(np.mean(areas**-0.5)))
+    return [seen[name] for name in names if name in seen], blind
+
+
+def straight(scene: Scene, name: str) -> Camera:
+    """The camera of a scene, whose rays are straight on the ground and meet in a point.
+
+    Raises
+    ------
+    GeometryError
+        They are not, or do not.
+    """
+    camera = scene.camera
+    try:
+        camera.rays(np.zeros((1, 2)))
+    except UsageError:
+        way = "it is a line or satellite image; leave it out with `images`"
+        if camera.vantage.central:
+            way = 'state earth_curvature = "none" and no refraction in [orientation]; on a wall neither counts'
+        raise GeometryError(
+            f"image {name!r}: its rays are not straight on the ground, so it sees a map only: {way}"
+        ) from None
+    return camera
+
+
+def frame_of(project: Project, text: str) -> tuple[Frame | None, Bounds | None]:
+    """The frame of a target as a user states it, and the bounds that it has by itself; None: it is the map, has none.
+
+    Raises
+    ------
+    UsageError
+        It is none, or says too little.
+    GeometryError, InputError
+        Of an image: it cannot be a target, or cannot be opened.
+    """
+    kind, _, rest = text.partition(":")
+    if text == "map":
+        return None, None
+    if kind == "wall":
+        numbers = _numbers(rest)
+        if len(numbers) not in (4, 5) or not (abs(numbers[3]) <= 360 and abs(sum(numbers[4:])) <= 90):
+            raise UsageError(
+                f"target {text}: give `wall:X,Y,Z,AZIMUTH[,TILT]`: a point of the wall in the project's CRS, the "
+                "azimuth of its outward normal from north by east, and by how much that is raised (-90 to 90), degrees"
+            )
+        x, y, z, azimuth = numbers[:4]
+        return WallFrame.facing((x, y, z), azimuth, *numbers[4:]), None
+    if kind != "image" or not rest:
+        raise UsageError(f"target {text}; give {_FORMS}")
+    name, _, last = rest.rpartition(",")
+    if not name or any(image.name == rest for image in project.images):
+        return _along(project, rest, None, text)
+    return _along(project, name, next(iter(_numbers(last)), math.nan), text)
+
+
+def _numbers(text: str) -> list[float]:
+    """Finite numbers between commas; none if any of them is none."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        return []
+    return numbers if all(math.isfinite(n) for n in numbers) else []
+
+
+def _along(project: Project, name: str, distance: float | None, text: str) -> tuple[Frame, Bounds]:
+    """The frame of an image, and the bounds of its picture."""
+    scene = open_scene(project, project.any_image(name).name)
+    camera = straight(scene, name)
+    center = camera.vantage.point
+    # Of a camera in a plane picture (x·w, y·w, w) are linear in XYZ, and w is the depth.
+    L, twice = (camera.project_homogeneous(center + length * np.eye(3)).T / length for length in (_APART, _APART / 2))
+    if not (np.isfinite(L).all() and np.abs(L - twice).max() <= _STRAIGHT * np.abs(L).max()):
+        raise GeometryError(f"target {text}: a fisheye image of more than 126° lies in no plane; choose another one")
+    normal = -L[2] / np.linalg.norm(L[2])
+    right = L[0] - (L[0] @ normal) * normal
+    right /= np.linalg.norm(right)
+    axes = np.array([right, np.cross(normal, right), normal])
+    if distance is None:
+        low, high = scene.footprint.height_range
+        distance = float((center[2] - (low + high) / 2) / normal[2]) if normal[2] > 0 else math.nan
+        if not distance > 0:
+            raise UsageError(f"target {text}: the axis of the image meets no terrain; say `image:{name},DISTANCE`")
+    if not 0 < distance < math.inf:
+        raise UsageError(f"target {text}: give a positive distance, metres: `image:NAME,DISTANCE`")
+    frame = ImageFrame(tuple(center.tolist()), tuple(map(tuple, axes.tolist())), distance)  # type: ignore[arg-type]
+    p = camera.rays(image_border(camera.size))[1] @ axes.T
+    uv = p[:, :2] / np.where(p[:, 2:] < 0, -p[:, 2:], np.nan) * distance
+    return frame, (*np.nanmin(uv, axis=0).tolist(), *np.nanmax(uv, axis=0).tolist())
