@@ -39,6 +39,8 @@ class LineCamera:
     track: LineTrack
     look: LineLook
     ground: BodyGround
+    like: LineTremor | None = None
+    """What is known of how a flight shakes that differs from this one by next to nothing: it need not be looked for."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -63,7 +65,7 @@ class LineCamera:
         """What of a turbulent flight changes from line to line; None: the trajectory is smooth."""
         if not self.track.per_line:
             return None
-        return smoothed(self)
+        return smoothed(self) if self.like is None else self.like.again(self)
 
     @cached_property
     def sight(self) -> LineSight:

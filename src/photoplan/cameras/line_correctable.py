@@ -132,7 +132,11 @@ class CorrectableLine:
         """See `Correctable`."""
         track = self.correction(values).track(self.plain.track)
         # Calm flights are as smooth between the lines as the record; poses of all lines would be made at every step.
-        return self.plain.along(track if self._shaken else replace(track, per_line=False))
+        if not self._shaken:
+            return self.plain.along(replace(track, per_line=False))
+        if isinstance(self.plain, LineCamera):
+            return replace(self.plain, track=track, like=self.plain.breaks)
+        return self.plain.along(track)
 
     @cached_property
     def _shaken(self) -> bool:
