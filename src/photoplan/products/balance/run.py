@@ -28,6 +28,7 @@ from photoplan.io.tables import write_table
 from photoplan.plain import pick
 from photoplan.products.balance.reference import Reference, open_reference
 from photoplan.products.balance.sample import Survey, sample, survey
+from photoplan.products.one_colour import one_colour_told
 from photoplan.products.run import BASE_MEMORY, refuse_inputs
 from photoplan.project.scene import input_files
 from photoplan.radiometry.balance import Balanced, Pairs, balance, even_images, pairs_of
@@ -261,10 +262,7 @@ def _usable(
     even = even_images(cells, len(found.names), limits[1] - limits[0])
     for k in np.flatnonzero(even):
         grey = float(np.median(cells.pixels[cells.image == k]))
-        notes.append(
-            f"left out: {found.names[k]!r} has the grey value {grey:.0f} everywhere; look at its file, or take the "
-            "image out of the project"
-        )
+        notes.append(f"left out: {one_colour_told(found.names[k], grey)}")
     return cells.some(~even[cells.image]), even
 
 

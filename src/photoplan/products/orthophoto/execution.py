@@ -15,18 +15,21 @@ from photoplan.cameras.base import tremor_of
 from photoplan.engine.execute import OutputName, RenderJob
 from photoplan.engine.executors import Workers, open_workers
 from photoplan.engine.run import Kept, Runner, Tally, Work
-from photoplan.errors import TilesFailed
+from photoplan.errors import PhotoplanError, TilesFailed
+from photoplan.events import Events
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm, bands_of
 from photoplan.io.kept_tiles import KeptTiles
 from photoplan.io.naming import standing, together, when_named
 from photoplan.io.product import ProductFacts, ProductFile, is_product
+from photoplan.io.project.model import Project
 from photoplan.io.quicklook import refuse_foreign_overview, write_overview
 from photoplan.io.run_record import input_entry, record_path, write_run_record
 from photoplan.io.virtual import refuse_foreign_virtual
 from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.accuracy import BANDS, radial_error
 from photoplan.plan.tiles import Tiles
+from photoplan.products.one_colour import one_colour, one_colour_told
 from photoplan.products.orthophoto.finished import (
     ProductResult,
     all_files,
@@ -41,7 +44,7 @@ from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, painting
 from photoplan.products.orthophoto.stack import stack_index, write_stack
 from photoplan.products.run import Run, clock, question, refuse_inputs
 from photoplan.project.restored import RestoreStep
-from photoplan.project.scene import Scene, input_files
+from photoplan.project.scene import Scene, input_files, open_scene
 from photoplan.project.scenes import Scenes, ScenesAddress
 
 #: Names and units of the bands of an accuracy raster.
@@ -98,6 +101,8 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     make_folder(folder)
     if kept:
         run.events.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
+    if plan.settings.choice is not None:
+        _tell_of_one_colour([p for p in plan.products if p.plan.name not in kept], plan.project, run.events)
     run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))
     asked = question(_pixel_files(plan), folder)
     with open_workers(run.executor, run.workers, asked, run.events) as workers:
@@ -114,6 +119,17 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
             + "\n  ".join(failed)
         )
     return results
+
+
+def _tell_of_one_colour(products: Sequence[OrthoProduct], project: Project, events: Events) -> None:
+    """Name the images of mosaics that would paint one grey value."""
+    for name in dict.fromkeys(name for product in products for name in product.images):
+        try:
+            grey = one_colour(open_scene(project, name).reader)
+        except PhotoplanError:
+            continue  # Tiles ask again, and say what is wrong with the file.
+        if grey is not None:
+            events.talk(f"note: {one_colour_told(name, grey)}")
 
 
 def _work(

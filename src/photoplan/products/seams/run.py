@@ -28,6 +28,7 @@ from photoplan.io.regions import read_regions, write_regions
 from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
 from photoplan.products.balance.sample import Survey, survey
+from photoplan.products.one_colour import one_colour_told
 from photoplan.products.orthophoto.shown import shown
 from photoplan.products.run import BASE_MEMORY, question
 from photoplan.project.scene import SceneAddress, input_files
@@ -189,8 +190,7 @@ def _odd(found: Survey, images: Sequence[tuple[Layer, ...] | float | None], stor
     alone = without_overlap([each if isinstance(each, tuple) else () for each in images], store, shape)
     for name, each, apart in zip(found.names, images, alone):
         if isinstance(each, float):
-            notes.append(f"left out: {name!r} has the grey value {each:.0f} everywhere; look at its file, or take the "
-                         "image out of the project")  # fmt: skip
+            notes.append(f"left out: {one_colour_told(name, each)}")
         elif apart:
             notes.append(f"no overlap with other images: {name!r}; if it should have one, look at its orientation")
     return tuple(notes)
