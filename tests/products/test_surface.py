@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from tools.facet_scene import CONTRAST, GROUND, GSD, Scene, write_scene
 from tools.sketched import drawn
 from tools.small_block import X0, Y0
 
+from photoplan.products.surface.findings import findings
 from photoplan.products.surface.spread import counted, median
 
 CLOUDS = (".las", ".laz", ".ply")
@@ -209,3 +212,12 @@ def test_the_median_of_tiles_is_counted_in_classes() -> None:
     counts = np.sum([counted(part) for part in sigmas], axis=0).tolist()
     assert median(counts) == pytest.approx(np.nanmedian(sigmas), rel=0.02)
     assert median(counted(np.full((2, 2), np.nan))) is None
+
+
+def test_pixels_of_reduced_images_are_those_that_count() -> None:
+    told = []
+    for base in (0, 3):
+        plan: Any = SimpleNamespace(scheme=SimpleNamespace(base=base), settings=SimpleNamespace(name="surface"))
+        told.append(findings(plan, {"a": 5.0}, 8.0, 2.0, 0.0, 0.5, 0.0))
+    assert len(told[0]) == 3 and "had not settled" in told[0][1] and "hardly any texture" in told[0][2]
+    assert len(told[1]) == 1 and "the relief is finer than" in told[1][0] and "finer than" not in told[0][0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from tools.small_block import X0, Y0
 
 from photoplan.geometry.frames import WallFrame
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
+from photoplan.report import maps
 
 KINDS = ("", "_sigma", "_count", "_fit", "_grey", "_grey_sigma")
 HALF, STEP = 12.0, 1.5
@@ -94,12 +96,28 @@ def test_the_scene_stood_up_is_a_wall(scene: Scene, on_map: Path, tmp_path: Path
     uvh = np.add(WALL.inverse(found["xyz"]), (X, Y, GROUND))
     off = uvh[:, 2] - scene.heights(uvh[:, 0], uvh[:, 1])
     assert len(found) == 256 and np.sqrt(np.mean(off**2)) < 0.05 * scene.height_of_a_pixel
+    assert b"sigma of the height over the target" in (tmp_path / "w.ply").read_bytes()[:300]
     # It is no terrain: nothing says where it lies on the map.
     project = turned.with_name("terrain.toml")
     stated = scene.path.read_text().replace(f"height = {GROUND}", f'file = "{tmp_path}/surface.tif"')
     project.write_text(stated)
     said = inside("ortho", project, "--images", "i2", "--resolution", 0.5, "--output", tmp_path / "o", "--no-quicklook")
-    assert said.code == 3 and "no CRS" in said.err, said.err
+    assert said.code == 3 and f"heights over {ON_WALL}, which is no map" in said.err, said.err
+    project.write_text(stated.replace('surface.tif"', 'surface.tif"\ncrs = "EPSG:32633"'))
+    said = inside("ortho", project, "--images", "i2", "--resolution", 0.5, "--output", tmp_path / "o", "--no-quicklook")
+    assert said.code == 3 and "which is no map" in said.err, said.err
+
+
+def test_a_picture_names_what_is_along_its_axes(on_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+
+    def kept(figure: Any) -> bytes:
+        drawn.extend(ax.get_xlabel() + ax.get_ylabel() for ax in figure.axes)
+        return b""
+
+    monkeypatch.setattr(maps, "png", kept)
+    maps.draw_surface(on_map / "surface.tif", tmp_path / "s.png", ("u", "v"))
+    assert drawn == ["u [m]v [m]", "u [m]", "u [m]", "m", "m"]
 
 
 def test_heights_along_an_image_are_the_ground(scene: Scene, tmp_path: Path) -> None:
@@ -130,15 +148,23 @@ def test_targets_that_are_none(scene: Scene) -> None:
         (["--target", "wall:1,2,3,nan"], 2, "azimuth"),
         (["--target", ON_WALL], 2, "a wall has no end; give --bounds"),
         (["--target", ON_WALL, *around(0, 0)], 3, "no two images see"),
-        (["--target", "wall:0,0,0,0,-90", *around(-X, -Y)], 3, "no two images see"),
+        (["--target", "wall:0,0,0,0,-90", *around(-X, -Y)], 3, "all images stand behind the target"),
         (["--target", "image:none"], 3, "image 'none' is not in the project"),
-        (["--target", "image:i2,-5"], 2, "positive distance"),
-        (["--target", "image:i2,x"], 2, "positive distance"),
+        (["--target", "wall:1e300,2,3,4", *around(0, 0)], 2, "lies on no map"),
+        (["--target", f"wall:{Y0},{X0},140,4", *around(0, 0)], 2, "X and Y in the right order"),
+        (["--target", "image:i2,-5"], 2, "give a distance from 0.001"),
+        (["--target", "image:i2,x"], 2, "give a distance from 0.001"),
+        (["--target", "image:i2,1e300"], 2, "give a distance from 0.001"),
+        (["--target", "image:i2", "--bounds", 0.1, 0.1, 0.4, 0.4], 2, "bounds 0.10 0.10 0.40 0.40 hold 1 × 1"),
         (["--target", "image:i2", "--start", "a.tif"], 2, "on a target that is no map give a height"),
         (["--target", "image:i2,200", "--start", -far], 2, "its heights go from"),
     ):
         said = surface(scene.path, *words, "--dry-run")
         assert said.code == code and text in said.err, (words, said.err)
+    level = scene.path.with_name("level.toml")
+    level.write_text(re.sub(r"angles = .*", "angles = [90.0, 0.0, 0.0]", scene.path.read_text()))
+    said = surface(level, "--target", "image:i2", "--dry-run")
+    assert said.code == 2 and "meets no terrain; say `image:i2,DISTANCE`" in said.err, said.err
     bent = scene.path.with_name("bent.toml")
     bent.write_text(scene.path.read_text().replace("[orientation]", '[orientation]\nearth_curvature = "strict"'))
     said = surface(bent, "--target", "image:i2", "--dry-run")

@@ -81,7 +81,7 @@ def command(project: Path, **options: Any) -> None:
             told = None if report is None else report.write(surface_page(plan, result))
             picture = None
             if how.quicklook and has_matplotlib():
-                picture = draw_surface(result.path, result.path.with_suffix(".png"))
+                picture = draw_surface(result.path, result.path.with_suffix(".png"), plan.axes)
         if how.as_json:
             show_json(result, report=told)
         else:

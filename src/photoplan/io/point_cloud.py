@@ -112,21 +112,22 @@ def _write_ply(part: Path, path: Path, files: Sequence[Any], crs: str, frame: Fr
     count = 0
     with part.open("wb") as file:
         # The count is known at the end: room is left for it.
-        file.write(_ply_header(0))
+        file.write(_ply_header(0, frame))
         for points in _points(files, frame):
             file.write(points.tobytes())
             count += len(points)
         file.seek(0)
-        file.write(_ply_header(count))
+        file.write(_ply_header(count, frame))
     return count
 
 
-def _ply_header(count: int) -> bytes:
+def _ply_header(count: int, frame: Frame | None) -> bytes:
     kinds = {"<f8": "double", "<f4": "float"}
+    along = "Z" if frame is None else "the height over the target"
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment photoplan {__version__}; X east, Y north, Z up, sigma of Z, metres; grey value",
+        f"comment photoplan {__version__}; X east, Y north, Z up, sigma of {along}, metres; grey value",
         f"element vertex {count:012d}",
         *(f"property {kinds[_POINT[name].str]} {name}" for name in _POINT.names or ()),
         "end_header",

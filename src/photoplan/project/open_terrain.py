@@ -9,6 +9,7 @@ import numpy as np
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.crs import CrsStep, crs_step, require_projected_metres, same_crs
+from photoplan.io.surface_file import target_of
 from photoplan.io.terrain.known_ranges import KnownRanges
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.reader import TerrainReader
@@ -117,6 +118,12 @@ def _open_raster(path: Path, crs: str | None, option: str) -> OpenTerrain:
     info = reader.info
     assert info.to_map is not None
     found = info.crs or crs
+    target = target_of(info.path, info.driver) if info.crs is None else None
+    if target is not None:
+        raise InputError(
+            f"{path}: heights over {target}, which is no map and no terrain; let `photoplan surface` write them as "
+            "points, too, and build a terrain of these"
+        )
     if found is None:
         raise InputError(f"{path}: no CRS; state it {option}, it is not guessed")
     if info.metres_per_unit not in (None, 1.0):

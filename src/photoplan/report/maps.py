@@ -39,9 +39,11 @@ _SIDE_OF_THREE = 700
 _NAMED = 0.005
 
 
-def _on_map(ax: Any, title: str, ylabel: str | None = "Y [m]", **limits: tuple[float, float]) -> None:
+def _on_map(
+    ax: Any, title: str, xlabel: str = "X [m]", ylabel: str | None = "Y [m]", **limits: tuple[float, float]
+) -> None:
     """Coordinates of the map along the axes, and a title."""
-    ax.set(aspect="equal", title=title, xlabel="X [m]", ylabel=ylabel, **limits)
+    ax.set(aspect="equal", title=title, xlabel=xlabel, ylabel=ylabel, **limits)
     ax.ticklabel_format(useOffset=False, style="plain")
     ax.tick_params(axis="x", labelrotation=30)
 
@@ -135,13 +137,15 @@ def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:
     return path
 
 
-def draw_surface(heights: Path, picture: Path) -> Path:
+def draw_surface(heights: Path, picture: Path, coordinates: tuple[str, str] = ("X", "Y")) -> Path:
     """Draw the files of a surface as one PNG; replaces an older one.
 
     Parameters
     ----------
     heights : Path
         NAME.tif; NAME_sigma.tif and NAME_grey.tif stand beside it.
+    coordinates : tuple of str
+        Names of what is along the axes.
 
     Raises
     ------
@@ -174,7 +178,7 @@ def draw_surface(heights: Path, picture: Path) -> Path:
         fig.colorbar(shown, ax=axes[2], shrink=0.8, extend="both", label="m")
         for ax, title in zip(axes, ("heights", "grey values", "standard deviation of the heights")):
             ax.grid(visible=False)
-            _on_map(ax, title, ylabel=None)
-        axes[0].set_ylabel("Y [m]")
+            _on_map(ax, title, f"{coordinates[0]} [m]", ylabel=None)
+        axes[0].set_ylabel(f"{coordinates[1]} [m]")
         write_atomically(picture, png(fig))
     return picture

@@ -43,7 +43,7 @@ def surface_page(plan: SurfacePlan, result: SurfaceResult) -> str:
             table(["images", "heights", "median, m", "90 %, m"], [cells(row) for row in _rows(sigma, count)]),
         ]),
         section("How the pixels fit", [
-            figure(_draw_fit(fit, extent), "Residuals on the map",
+            figure(_draw_fit(fit, extent, plan.axes), "Residuals by place",
                    "Root mean square of the standardised residuals around each height; 1 is expected. Where it is over "
                    f"{MISFIT:g}, the height may be wrong: an edge that is rounded, something that moved, or a region "
                    "that went wrong."),
@@ -60,7 +60,8 @@ def surface_page(plan: SurfacePlan, result: SurfaceResult) -> str:
             ]),
         ]),
     ]  # fmt: skip
-    return page(f"Surface {plan.settings.name}", f"{result.path.name}: {', '.join(plan.images)}", parts)
+    over = "" if plan.frame is None else f"u, v and h over {plan.settings.target}, "
+    return page(f"Surface {plan.settings.name}", f"{result.path.name}: {over}{', '.join(plan.images)}", parts)
 
 
 def _texture(grey: _Doubles, shape: tuple[int, int]) -> _Doubles:
@@ -107,7 +108,7 @@ def _draw_classes(sigma: _Doubles, count: _Doubles, texture: _Doubles) -> bytes:
 
 
 @styled
-def _draw_fit(fit: _Doubles, extent: tuple[float, float, float, float]) -> bytes:
+def _draw_fit(fit: _Doubles, extent: tuple[float, float, float, float], coordinates: tuple[str, str]) -> bytes:
     left, bottom, right, top = extent
     fig = figure_of(8.4, float(np.clip(7.0 * (top - bottom) / (right - left), 2.6, 9.0)))
     ax = fig.subplots()
@@ -115,7 +116,7 @@ def _draw_fit(fit: _Doubles, extent: tuple[float, float, float, float]) -> bytes
                       interpolation="nearest")  # fmt: skip
     fig.colorbar(shown, ax=ax, shrink=0.8, extend="both", label="residuals, standard deviations")
     ax.grid(visible=False)
-    ax.set(aspect="equal", xlabel="X, m", ylabel="Y, m")
+    ax.set(aspect="equal", xlabel=f"{coordinates[0]}, m", ylabel=f"{coordinates[1]}, m")
     ax.ticklabel_format(useOffset=False, style="plain")
     return png(fig)
 
@@ -124,9 +125,11 @@ def _draw_fit(fit: _Doubles, extent: tuple[float, float, float, float]) -> bytes
 def _draw_residuals(plan: SurfacePlan, path: Any) -> bytes:
     bands, (left, bottom, right, top) = read_reduced(path, max_side=_SIDE // 3)
     shown = min(len(bands), _PICTURES)
-    rows, tall = -(-shown // 3), float(np.clip(2.8 * (top - bottom) / (right - left), 1.2, 5.0))
+    columns = min(3, shown)
+    rows = -(-shown // columns)
+    tall = float(np.clip(8.4 / columns * (top - bottom) / (right - left), 1.2, 5.0))
     fig = figure_of(9.0, rows * (tall + 0.3))
-    axes = fig.subplots(rows, 3, squeeze=False).reshape(-1)
+    axes = fig.subplots(rows, columns, squeeze=False).reshape(-1)
     for ax, band, name in zip(axes, bands, plan.images):
         picture = ax.imshow(band, cmap="RdBu_r", vmin=-3, vmax=3, interpolation="nearest")
         ax.set_title(name if len(name) < 28 else "…" + name[-26:], fontsize=8)

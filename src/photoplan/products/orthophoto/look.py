@@ -166,5 +166,8 @@ def _sees_no_terrain(scene: Scene, name: str) -> str:
 
 
 def extent_text(bounds: tuple[float, float, float, float] | None) -> str:
-    """Bounds as a message shows them."""
-    return "everywhere" if bounds is None else " ".join(f"{b:.0f}" for b in bounds)
+    """Bounds as a message shows them: whole metres, or finer where they are narrower than 10 m."""
+    if bounds is None:
+        return "everywhere"
+    side = min(1e3, max(1e-6, min(bounds[2] - bounds[0], bounds[3] - bounds[1])))
+    return " ".join(f"{b:.{max(0, math.ceil(1 - math.log10(side)))}f}" for b in bounds)

@@ -48,10 +48,11 @@ def findings(
             "shows something else. `photoplan tie` and `photoplan adjust` orient anew; `images` leaves it out"
         )
     elif contrast > 0 and usual > _NOISY * contrast:
+        coarse = ", the relief is finer than `resolution`" if plan.scheme.base else ""
         lines.append(
             f"sigma0 is {usual / contrast:.0%} of the contrast of the ground: images do not show the same, or no "
-            "texture. Orientations are wrong (`photoplan tie`, `photoplan adjust`), or the start was too far away "
-            "(`start`, `reach`)"
+            f"texture. Orientations are wrong (`photoplan tie`, `photoplan adjust`){coarse}, or the start was too far "
+            "away (`start`, `reach`)"
         )
     if misfit_share > _MISFITS:
         lines.append(
@@ -63,9 +64,11 @@ def findings(
             f"{astray:.1%} of the posts have no height since it would lie farther from the start than 1.5 times "
             "`reach`: give a larger one if the start is that wrong; if not, the images contradict the start there"
         )
-    if correction > _MOVING:
+    # Reduced images are all that a coarse surface sees: their pixels count.
+    pixel = 2**plan.scheme.base
+    if correction > _MOVING * pixel:
         lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; `resolution` helps")
-    if sigma_px is not None and sigma_px > _VAGUE:
+    if sigma_px is not None and sigma_px > _VAGUE * pixel:
         lines.append(
             f"the median standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "
             "images do not determine follows its surroundings; mask it by the standard deviations, or choose a coarser "

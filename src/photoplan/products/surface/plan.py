@@ -13,7 +13,7 @@ import numpy as np
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.bounds import MOST_HEIGHT, odd_place
-from photoplan.geometry.frames import Frame
+from photoplan.geometry.frames import Frame, ImageFrame
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.names import safe_stem
 from photoplan.io.point_cloud import check_cloud
@@ -79,6 +79,11 @@ class SurfaceSettings:
     name: str = "surface"
     """Of the product, and of its files without the extension."""
 
+    @property
+    def seen(self) -> str:
+        """What images see, as messages call it."""
+        return "ground" if self.target == "map" else "target"
+
 
 @dataclass(frozen=True, eq=False)
 class SurfacePlan:
@@ -108,6 +113,11 @@ class SurfacePlan:
         return ScenesAddress.of(self.project, self.images)
 
     @property
+    def axes(self) -> tuple[str, str]:
+        """Names of what is along the edges of its files."""
+        return ("X", "Y") if self.frame is None else ("u", "v")
+
+    @property
     def grey_grid(self) -> MapGrid:
         """Pixels of the grey values."""
         g, m = self.grid, self.scheme.ratio
@@ -116,6 +126,7 @@ class SurfacePlan:
     def __str__(self) -> str:
         g, s = self.grid, self.scheme
         reduced = f", images reduced by {2**s.base}" if s.base else ""
+        far = f" at {self.frame.distance:.4g} m" if isinstance(self.frame, ImageFrame) else ""
         return "\n".join([
             f"surface of {len(self.images)} images: {g.width} × {g.height} heights of {g.resolution:g} m, grey values "
             f"of {g.resolution / s.ratio:.3g} m",
@@ -123,7 +134,7 @@ class SurfacePlan:
             f"{self.height_error:.3g} m of height",
             f"  {s.coarsest + 1} level{'s' * (s.coarsest > 0)}, the coarsest with heights of "
             f"{g.resolution * 2**s.coarsest:g} m; start: {self.settings.start}{self._searched}",
-            *([] if self.frame is None else [f"  target {self.settings.target}: u, v and h instead of X, Y and Z"]),
+            *([] if self.frame is None else [f"  target {self.settings.target}{far}: u, v, h instead of X, Y, Z"]),
         ])  # fmt: skip
 
     @property
@@ -198,8 +209,8 @@ def plan_surface(
     gsd = float(np.median([one.gsd for one in looked]))
     if settings.resolution < _FINEST * gsd * 0.999:
         raise UsageError(
-            f"resolution {settings.resolution:g} m is finer than the images see the ground ({gsd:.3g} m): a height "
-            f"needs some pixels; choose {3 * gsd:.2g} m, or {gsd:.2g} m at least"
+            f"resolution {settings.resolution:g} m is finer than the images see the {settings.seen} ({gsd:.3g} m): a "
+            f"height needs some pixels; choose {3 * gsd:.2g} m, or {gsd:.2g} m at least"
         )
     grid = MapGrid.covering(bounds, settings.resolution, project.crs if frame is None else "")
     if min(grid.width, grid.height) < 2:
@@ -298,7 +309,7 @@ def _bounds(settings: SurfaceSettings, looked: Sequence[Seen], blind: Sequence[s
     if not common:
         lines = [f"{one.name}: sees {extent_text(one.bounds)}" for one in looked]
         raise GeometryError(
-            "no two images see a common piece of the ground, so there are no heights:\n  "
+            f"no two images see a common piece of the {settings.seen}, so there are no heights:\n  "
             + "\n  ".join([*lines, *blind][:12])
         )
     around = np.array(common)

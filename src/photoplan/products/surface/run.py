@@ -21,6 +21,7 @@ from photoplan.io.naming import together
 from photoplan.io.point_cloud import write_cloud
 from photoplan.io.product import ProductFile, check_output
 from photoplan.io.run_record import input_entry, versions, write_run_record
+from photoplan.io.surface_file import TARGET
 from photoplan.plain import pick
 from photoplan.plan.tiles import Tiles
 from photoplan.products.run import BASE_MEMORY, Run, clock, refuse_inputs
@@ -188,7 +189,7 @@ def _complete(
         "PHOTOPLAN_VERSION": __version__,
         "PHOTOPLAN_IMAGE": ", ".join(plan.images),
         "PHOTOPLAN_KEY": plan.key,
-        "PHOTOPLAN_TARGET": plan.settings.target,
+        TARGET: plan.settings.target,
     }
     with together():
         facts, *_ = [file.complete(tags) for file in files.values()]

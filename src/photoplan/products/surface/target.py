@@ -13,6 +13,7 @@ from photoplan.cameras.base import project as project_points
 from photoplan.cameras.framed import FramedCamera
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import Events
+from photoplan.geometry.bounds import HIGHEST_FLIGHT, area_fault, odd_place
 from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
 from photoplan.io.project.model import Project
 from photoplan.plan.footprint import image_border
@@ -25,6 +26,8 @@ Bounds = tuple[float, float, float, float]
 _POINTS = 33
 #: Metres over which an image's projection is taken apart; from a straight line it differs by less than this part.
 _APART, _STRAIGHT = 1024.0, 1e-6
+#: Nearest of what an image shows, metres.
+_NEAR = 0.001
 _FORMS = "`map`, `wall:X,Y,Z,AZIMUTH[,TILT]` or `image:NAME[,DISTANCE]`"
 
 
@@ -63,11 +66,11 @@ def over_frame(
     Raises
     ------
     GeometryError
-        The rays of an image are not straight on the ground, or meet in no point.
+        The rays of an image are not straight on the ground, or meet in no point; or all images stand behind the target.
     """
     u, v = (np.linspace(bounds[k], bounds[k + 2], _POINTS) for k in (0, 1))
     uvh = np.stack([*np.meshgrid(u, v), np.full((_POINTS, _POINTS), height)], axis=-1).reshape(-1, 3)
-    seen, blind = {}, []
+    seen, blind, behind = {}, [], 0
     for name in (names[place] for place in map_order(project, names)):
         camera = FramedCamera(straight(open_scene(project, name), name), frame)
         at = project_points(camera, uvh)
@@ -76,11 +79,19 @@ def over_frame(
         inside = ((at > -0.5) & (at < np.array(camera.size) - 0.5)).all(axis=1) & (way[:, 2] < 0)
         events.done()
         if not inside.any():
-            blind.append(f"{name}: shows nothing of the target inside the bounds at the height {height:g}")
+            stands = frame.inverse(camera.camera.vantage.point)
+            behind += bool(stands[2] <= height)
+            here = ", from u {:.6g}, v {:.6g}, h {:.6g}".format(*stands) if np.isfinite(stands).all() else ""
+            blind.append(f"{name}: shows nothing of the target inside the bounds at the height {height:g}{here}")
             continue
         low, high = uvh[inside, :2].min(axis=0).tolist(), uvh[inside, :2].max(axis=0).tolist()
         areas = np.abs(np.linalg.det(camera.derivatives(uvh[inside])[..., :2]))
         seen[name] = Seen(name, camera, (*low, *high), (height, height), float(np.mean(areas**-0.5)))
+    if behind == len(names):
+        raise GeometryError(
+            f"all images stand behind the target at the height {height:g}: the azimuth of a wall is that of its "
+            "outward normal, towards them\n  " + "\n  ".join(blind[:12])
+        )
     return [seen[name] for name in names if name in seen], blind
 
 
@@ -123,9 +134,13 @@ def frame_of(project: Project, text: str) -> tuple[Frame | None, Bounds | None]:
         if len(numbers) not in (4, 5) or not (abs(numbers[3]) <= 360 and abs(sum(numbers[4:])) <= 90):
             raise UsageError(
                 f"target {text}: give `wall:X,Y,Z,AZIMUTH[,TILT]`: a point of the wall in the project's CRS, the "
-                "azimuth of its outward normal from north by east, and by how much that is raised (-90 to 90), degrees"
+                "azimuth of its outward normal from north by east (-360 to 360), and by how much that is raised (-90 "
+                "to 90), degrees"
             )
         x, y, z, azimuth = numbers[:4]
+        odd = odd_place((x, y, z), camera=False) or area_fault(project.crs, (x, y))
+        if odd is not None:
+            raise UsageError(f"target {text}: {odd}")
         return WallFrame.facing((x, y, z), azimuth, *numbers[4:]), None
     if kind != "image" or not rest:
         raise UsageError(f"target {text}; give {_FORMS}")
@@ -160,10 +175,12 @@ def _along(project: Project, name: str, distance: float | None, text: str) -> tu
     if distance is None:
         low, high = scene.footprint.height_range
         distance = float((center[2] - (low + high) / 2) / normal[2]) if normal[2] > 0 else math.nan
-        if not distance > 0:
+        if not _NEAR <= distance <= HIGHEST_FLIGHT:
             raise UsageError(f"target {text}: the axis of the image meets no terrain; say `image:{name},DISTANCE`")
-    if not 0 < distance < math.inf:
-        raise UsageError(f"target {text}: give a positive distance, metres: `image:NAME,DISTANCE`")
+    if not _NEAR <= distance <= HIGHEST_FLIGHT:
+        raise UsageError(
+            f"target {text}: give a distance from {_NEAR:g} to {HIGHEST_FLIGHT:g} m: `image:NAME,DISTANCE`"
+        )
     frame = ImageFrame(tuple(center.tolist()), tuple(map(tuple, axes.tolist())), distance)  # type: ignore[arg-type]
     p = camera.rays(image_border(camera.size))[1] @ axes.T
     uv = p[:, :2] / np.where(p[:, 2:] < 0, -p[:, 2:], np.nan) * distance
