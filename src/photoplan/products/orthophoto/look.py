@@ -169,5 +169,6 @@ def extent_text(bounds: tuple[float, float, float, float] | None) -> str:
     """Bounds as a message shows them: whole metres, or finer where they are narrower than 10 m."""
     if bounds is None:
         return "everywhere"
-    side = min(1e3, max(1e-6, min(bounds[2] - bounds[0], bounds[3] - bounds[1])))
-    return " ".join(f"{b:.{max(0, math.ceil(1 - math.log10(side)))}f}" for b in bounds)
+    sides = [side for side in (bounds[2] - bounds[0], bounds[3] - bounds[1]) if 1e-6 < side < 10.0]
+    digits = max(0, math.ceil(1 - math.log10(min(sides, default=10.0))))
+    return " ".join(f"{b:.{digits}f}" for b in bounds)
