@@ -364,6 +364,11 @@ def test_large_pictures_are_decoded_once(tmp_path: Path, name: str, monkeypatch:
         if valid is not None:
             np.testing.assert_array_equal(valid, direct[i][1])
     assert len(calls) == 1
+    # A look at the upper border reads that alone.
+    top = RasterReader(make(tmp_path / f"other_{name}", pixels, "JPEG" if name.endswith("jpg") else "PNG"))
+    found, _ = top.read(Window(100, 0, 40, 50))
+    np.testing.assert_array_equal(found, direct[0][0][:, :50, 100:140])
+    assert calls[1:] == [(top.info, Window(100, 0, 40, 50))]
 
 
 def test_threads_share_one_decoding() -> None:

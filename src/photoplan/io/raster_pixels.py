@@ -205,6 +205,8 @@ def decoded_picture(key: tuple[Any, ...], make: Callable[[], DecodedPicture]) ->
 
 _SMALL = 16 << 20
 """Decoded bytes up to which a picture is left to GDAL's block cache."""
+_TOP = 64
+"""Upper rows of a picture that are decoded for themselves: it costs next to nothing."""
 
 
 def missing_blocks(info: RasterInfo) -> MissingBlocks | None:
@@ -250,7 +252,7 @@ def read_pixels(
     count = len(info.colour_bands)
     if overview is not None:
         stored, valid = _from_file(info, window, overview[0])
-    elif _decode_once(info):
+    elif window.stop[1] > _TOP and _decode_once(info):
         state = info.path.stat()
         picture = decoded_picture((info.path, state.st_mtime_ns, state.st_ino), partial(_decode, info))
         stored, valid = picture.read(window), None

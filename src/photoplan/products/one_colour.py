@@ -21,7 +21,7 @@ def one_colour(reader: Reader) -> float | None:
     """The grey value that all valid pixels of an image have in all bands; None: they differ, or none is valid."""
     width, height = reader.size
     whole, found = Window(0, 0, width, height), None
-    # At the upper border, since some compressed files are decoded from there on.
+    # At the upper border: large pictures that are decoded from there on are not decoded as a whole for it.
     first = Window(max(0, (width - _FIRST) // 2), 0, _FIRST, _FIRST) & whole
     for window in chain([first], whole.tiles(_NEXT)):
         pixels, valid = reader.read(window)
