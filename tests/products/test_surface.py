@@ -18,6 +18,7 @@ from tools.small_block import X0, Y0
 
 from photoplan.products.surface.findings import findings
 from photoplan.products.surface.spread import counted, median
+from photoplan.report import surface as report
 
 CLOUDS = (".las", ".laz", ".ply")
 BOUNDS = (X0 - 18, Y0 - 30, X0 + 18, Y0 + 30)
@@ -221,3 +222,13 @@ def test_pixels_of_reduced_images_are_those_that_count() -> None:
         told.append(findings(plan, {"a": 5.0}, 8.0, 2.0, 0.0, 0.5, 0.0))
     assert len(told[0]) == 3 and "had not settled" in told[0][1] and "hardly any texture" in told[0][2]
     assert len(told[1]) == 1 and "the relief is finer than" in told[1][0] and "finer than" not in told[0][0]
+
+
+def test_labels_of_a_report_keep_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(report, "png", drawn.append)
+    one_level: Any = SimpleNamespace(sigma0={"a": 2.0}, corrections=(0.2,))
+    report._draw_adjustment(one_level)
+    axes = drawn[0].axes[1]
+    assert axes.get_xticks().tolist() == [0]
+    assert {f"{tick:.0e}"[0] for tick in axes.get_yticks(minor=True)} == {"2", "5"}

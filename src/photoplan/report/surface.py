@@ -60,7 +60,7 @@ def surface_page(plan: SurfacePlan, result: SurfaceResult) -> str:
             ]),
         ]),
     ]  # fmt: skip
-    over = "" if plan.frame is None else f"u, v and h over {plan.settings.target}, "
+    over = "" if plan.frame is None else f"u, v and h over {plan.settings.target}; "
     return page(f"Surface {plan.settings.name}", f"{result.path.name}: {over}{', '.join(plan.images)}", parts)
 
 
@@ -157,7 +157,7 @@ def _draw_adjustment(result: SurfaceResult) -> bytes:
     right.plot(levels, [max(c, 1e-4) for c in result.corrections[::-1]], "o-", color=BLUE)
     _plain_log(right)
     right.invert_xaxis()
-    right.xaxis.set_major_locator(mpl.ticker.MaxNLocator(integer=True))
+    right.set_xticks(levels)
     right.set(xlabel="level, coarse to fine", ylabel="last correction, px of parallax")
     return png(fig)
 
@@ -166,4 +166,6 @@ def _plain_log(axes: Any) -> None:
     """A logarithmic axis whose labels are plain numbers."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
+    # A label for each of 2 to 9 would lie on its neighbours.
+    axes.yaxis.set_minor_locator(mpl.ticker.LogLocator(subs=(2, 5)))
     axes.yaxis.set_minor_formatter("{x:.2g}")
