@@ -20,6 +20,9 @@ from photoplan.io.gdal import GDAL_ERRORS, gdal_settings, open_raster
 from photoplan.io.storage import BlockCoder
 from photoplan.io.tile_log import TileLog, checksum_of
 
+#: Bytes that a record's tiles may unpack to, those of a million tiles; a damaged record may promise any number.
+_MOST = 256 << 20
+
 
 @dataclass(frozen=True, eq=False)
 class KeptTiles:
@@ -62,7 +65,7 @@ class KeptTiles:
         """What `told` said of a file; nothing if there is no such record."""
         try:
             text = json.loads(self.record.read_text(encoding="utf-8"))["tiles"][name]
-            found = json.loads(zlib.decompress(base64.b64decode(text)))
+            found = json.loads(zlib.decompressobj().decompress(base64.b64decode(text), _MOST))
             for index, key, checksum, moved, count, figures in found:
                 yield int(index), str(key), int(checksum), int(moved), int(count), dict(figures)
         except (OSError, ValueError, KeyError, TypeError, RecursionError, zlib.error):
