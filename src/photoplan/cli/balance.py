@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import NEW_FOLDER, PATH, ending, images_option
-from photoplan.cli.output import say, show, show_json
+from photoplan.cli.output import can_draw, say, show, show_json, talking
 
 if TYPE_CHECKING:
     from photoplan.products.balance.run import BalanceReport
@@ -37,11 +37,10 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     from photoplan.io.naming import together
     from photoplan.products.balance.run import BalanceRequest, balance_project
     from photoplan.report.balance import draw_balance
-    from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture
 
     request = BalanceRequest(**options)
-    wanted = not no_picture and not request.dry_run and has_matplotlib()
+    wanted = can_draw(not no_picture and not request.dry_run, talking(quiet))
     place = request.folder / "balance.png" if wanted else None
     drawing = open_picture(place, [request.project], overwrite=request.overwrite)
     with together():

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import PATH, POSITIVE, ending
-from photoplan.cli.output import show, show_json
+from photoplan.cli.output import can_draw, show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.dtm.build import BuildReport, BuildRequest
@@ -74,8 +74,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     page = open_build_report(request.output, wanted, request.overwrite)
     with together():
         with Telling(quiet) as events:
-            if page is None and wanted is None:
-                events.talk("no report: it needs matplotlib (pip install 'photoplan[report]')")
+            can_draw(page is None and wanted is None, events.talk, "report")
             built = dtm_build(request, events)
         report, warning = None, ""
         if page is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import LISTED, PATH, ending
-from photoplan.cli.output import show, show_json
+from photoplan.cli.output import can_draw, show, show_json, talking
 
 if TYPE_CHECKING:
     from photoplan.products.illumination import IlluminationReport
@@ -33,12 +33,11 @@ def command(as_json: bool, quiet: bool, no_picture: bool, correct: tuple[str, ..
     from photoplan.cli.telling import Telling
     from photoplan.io.naming import together
     from photoplan.products.illumination import IlluminationRequest, correct_illumination
-    from photoplan.report.drawing import has_matplotlib
     from photoplan.report.illumination import draw_light
     from photoplan.report.page import open_picture
 
     request = IlluminationRequest(correct=correct or ("c",), **options)
-    wanted = not no_picture and not request.dry_run and has_matplotlib()
+    wanted = can_draw(not no_picture and not request.dry_run, talking(quiet))
     place = request.output.with_suffix(".png") if wanted else None
     drawing = open_picture(place, [request.picture, request.terrain], overwrite=request.overwrite)
     picture: Path | None = None

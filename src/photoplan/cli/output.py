@@ -74,6 +74,16 @@ def talking(quiet: bool) -> Callable[[str], None]:
     return (lambda text: None) if quiet else say
 
 
+def can_draw(wanted: bool, talk: Callable[[str], None], what: str = "picture") -> bool:
+    """Whether what is wanted can be drawn; `talk` says how, where matplotlib is missing."""
+    from photoplan.report.drawing import has_matplotlib
+
+    if wanted and not has_matplotlib():
+        talk(f"no {what}: it needs matplotlib (pip install 'photoplan[report]')")
+        return False
+    return wanted
+
+
 def _spelled(text: object) -> str:
     context = click.get_current_context(silent=True)
     return spelled(str(text), context.command, context.find_root().command) if context else str(text)

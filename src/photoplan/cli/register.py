@@ -31,16 +31,15 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     Both have the same pixels, or places on one map. Each vector, in pixels of FIRST, says how far from its expected
     place the content of a patch lies in SECOND, with its standard deviation.
     """
-    from photoplan.cli.output import say, show, show_json
+    from photoplan.cli.output import can_draw, say, show, show_json, talking
     from photoplan.cli.telling import Telling
     from photoplan.io.naming import together
     from photoplan.products.register.run import RegisterRequest, register
-    from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture
     from photoplan.report.register import draw_vectors
 
     request = RegisterRequest(**options)
-    wanted = not no_picture and not request.dry_run and has_matplotlib()
+    wanted = can_draw(not no_picture and not request.dry_run, talking(quiet))
     place: Path | None = request.output.with_suffix(".png") if wanted else None
     drawing = open_picture(place, [request.first, request.second], overwrite=request.overwrite)
     with together():

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.output import show_json
+from photoplan.cli.output import can_draw, show_json
 from photoplan.cli.telling import Telling
 from photoplan.errors import TilesFailed
 from photoplan.io.project.model import Project
@@ -109,31 +109,30 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
 
 def _tell_accuracy(results: list[ProductResult], draw: bool, events: Telling) -> None:
     """Figures of each product's accuracy, and a picture where pictures can be made."""
-    from photoplan.report.drawing import has_matplotlib
     from photoplan.report.maps import draw_accuracy
 
-    for result in results:
-        found = result.accuracy
-        if found is not None:
-            raster = result.path.with_name(f"{result.path.stem}_accuracy.tif")
-            picture = f", drawn in {draw_accuracy(raster)}" if draw and has_matplotlib() else ""
-            figures = f"median {found['median']:.3g} m, 95 % of the pixels below {found['p95']:.3g} m"
-            events.talk(f"standard deviation of position: {figures}: {raster}{picture}")
+    known = [(result.path, result.accuracy) for result in results if result.accuracy is not None]
+    draw = bool(known) and can_draw(draw, events.talk)
+    for path, found in known:
+        raster = path.with_name(f"{path.stem}_accuracy.tif")
+        picture = f", drawn in {draw_accuracy(raster)}" if draw else ""
+        figures = f"median {found['median']:.3g} m, 95 % of the pixels below {found['p95']:.3g} m"
+        events.talk(f"standard deviation of position: {figures}: {raster}{picture}")
 
 
 def _draw_sources(results: list[ProductResult], events: Telling) -> None:
     """A picture of each mosaic's regions, where pictures can be made."""
     from photoplan.io.polygons import read_features
-    from photoplan.report.drawing import has_matplotlib
     from photoplan.report.maps import draw_regions
 
-    for result in results if has_matplotlib() else ():
+    draw = bool(results) and can_draw(True, events.talk)
+    for result in results:
         regions = seams_path(result.path)
         painted = len(result.painted or {})
         shapes = {item.name: item.geometry for item in read_features(regions, "Polygon").items}
         title = f"{result.path.name}: what each of {painted} images paints, of {len(result.images)} that see the ground"
-        picture = draw_regions(regions.with_suffix(".png"), shapes, title)
-        events.talk(f"regions: {regions}, drawn in {picture}")
+        picture = f", drawn in {draw_regions(regions.with_suffix('.png'), shapes, title)}" if draw else ""
+        events.talk(f"regions: {regions}{picture}")
 
 
 def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from photoplan.cli.options import PATH, ending, images_option
-from photoplan.cli.output import say, show, show_json
+from photoplan.cli.output import can_draw, say, show, show_json, talking
 
 
 @click.command("seams")
@@ -27,7 +27,6 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     from photoplan.cli.telling import Telling
     from photoplan.io.naming import together
     from photoplan.products.seams.run import SeamsRequest, make_seams
-    from photoplan.report.drawing import has_matplotlib
     from photoplan.report.maps import draw_regions
 
     request = SeamsRequest(**options)
@@ -35,7 +34,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     with together():
         with Telling(quiet) as events:
             found = make_seams(request, events)
-        if found.path is not None and found.shapes and not no_picture and has_matplotlib():
+        if found.path is not None and found.shapes and can_draw(not no_picture, talking(quiet)):
             picture = draw_regions(found.path.with_suffix(".png"), found.shapes, "Images of the mosaic")
     if as_json:
         show_json(found, picture=picture)

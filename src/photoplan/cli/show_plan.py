@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from photoplan.cli.output import show, show_json
+from photoplan.cli.output import can_draw, show, show_json
 from photoplan.cli.running import How
 from photoplan.events import Events
 from photoplan.products.orthophoto.plan import OrthoPlan
@@ -40,10 +40,9 @@ def show_plan(
 
 def _draw(plan: OrthoPlan, squares: PlanSquares, picture: Path, how: How, events: Events) -> None:
     """A picture of the squares of a plan's first product, or of all objects where each has its own."""
-    from photoplan.report.drawing import has_matplotlib
     from photoplan.report.maps import draw_squares
 
-    if how.quicklook and has_matplotlib():
+    if can_draw(how.quicklook, events.talk):
         # Products of images show the same objects again and again.
         own = (squares.columns["product"] == squares.columns["product"][0]) | plan.of_objects
         title = f"{own.sum()} squares of {len(set(squares.columns['object'][own]))} objects"

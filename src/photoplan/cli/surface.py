@@ -52,13 +52,12 @@ def command(project: Path, **options: Any) -> None:
     continues a run that was interrupted.
     """
     from photoplan.cli import running
-    from photoplan.cli.output import show, show_json
+    from photoplan.cli.output import can_draw, show, show_json
     from photoplan.cli.telling import Telling
     from photoplan.io.naming import together
     from photoplan.io.project.file import load_project
     from photoplan.products.surface.plan import SurfaceSettings, plan_surface
     from photoplan.products.surface.run import make_surface
-    from photoplan.report.drawing import has_matplotlib
     from photoplan.report.maps import draw_surface
     from photoplan.report.page import open_report
     from photoplan.report.surface import surface_page
@@ -80,7 +79,7 @@ def command(project: Path, **options: Any) -> None:
             result = make_surface(plan, folder or stated.folder / "products", how.run(events))
             told = None if report is None else report.write(surface_page(plan, result))
             picture = None
-            if how.quicklook and has_matplotlib():
+            if can_draw(how.quicklook, events.talk):
                 picture = draw_surface(result.path, result.path.with_suffix(".png"), plan.axes)
         if how.as_json:
             show_json(result, report=told)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import PATH, ending, images_option
-from photoplan.cli.output import say, show, show_json
+from photoplan.cli.output import can_draw, say, show, show_json, talking
 
 if TYPE_CHECKING:
     from photoplan.products.tie.run import TieReport
@@ -34,13 +34,12 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     from photoplan.cli.telling import Telling
     from photoplan.io.naming import together
     from photoplan.products.tie.run import TieRequest, find_ties
-    from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture
     from photoplan.report.tie import draw_ties
 
     options["refine"] = not options.pop("no_refine")
     options["use_orientation"] = not options.pop("ignore_orientation")
-    wanted = not options.pop("no_picture") and not options["dry_run"] and has_matplotlib()
+    wanted = can_draw(not options.pop("no_picture") and not options["dry_run"], talking(quiet))
     request = TieRequest(**options)
     place = request.table.with_suffix(".png") if wanted else None
     drawing = open_picture(place, [request.project], overwrite=request.overwrite)
