@@ -18,7 +18,7 @@ from photoplan.geometry.grid import Window
 from photoplan.plan.tiles import Tile
 from photoplan.products.view import job, make
 from photoplan.products.view.camera import CameraRequest
-from photoplan.products.view.content import Scene
+from photoplan.products.view.content import ViewScene
 
 #: Side of the tiles, pixels.
 TILE = 128
@@ -43,7 +43,7 @@ def main(case, out):
         found = job.matrix_bands(view.target, seen.part(*window.slices(around)))
         if found is not None:
             places[:, *window.slices(view.target.window)] = found[0][:3]
-        scene = Scene.of(view.target, Tile(0, window), lambda asked: seen, view.surface, "bicubic")
+        scene = ViewScene.of(view.target, Tile(0, window), lambda asked: seen, view.surface, "bicubic")
         picture[:, *window.slices(view.target.window)] = job.colours_of(scene, view, address.look)
 
     with ThreadPoolExecutor(2) as pool:

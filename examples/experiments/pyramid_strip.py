@@ -11,7 +11,14 @@ from photoplan.geometry.grid import Window
 from photoplan.kernels.patch_match import sample_spline, spline_coefficients
 from photoplan.matching.facets.pyramid import Pyramid
 from photoplan.matching.grey import GreyImage
-from photoplan.matching.register import FOUND, Displacements, PatchSettings, Transfer, contradicting, match_grid
+from photoplan.matching.register import (
+    FOUND,
+    PatchDisplacements,
+    PatchSettings,
+    PixelTransfer,
+    contradicting,
+    match_grid,
+)
 
 Array = NDArray[np.float64]
 
@@ -126,7 +133,7 @@ class Outcome:
     """Pyramid first, then rectified."""
     after: Array
     """Rectified first, then the pyramid."""
-    found: Displacements
+    found: PatchDisplacements
     shape: tuple[int, int]
 
     @property
@@ -170,10 +177,12 @@ def run(strip: Strip, ground: Array | None = None, span: int = 11, radius: int =
     rows, columns = (np.arange(12, n - 12, spacing) for n in after.shape)
     pair = GreyImage(Pixels(after.astype(np.float32))), GreyImage(Pixels(before.astype(np.float32)))
     at = np.stack([v.ravel() for v in np.meshgrid(columns, rows)], axis=1)
-    parts = [match_grid(pair, Transfer(), part, PatchSettings(radius, 2.0)) for part in _parts(at)]
-    joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Displacements.__dataclass_fields__}
+    parts = [match_grid(pair, PixelTransfer(), part, PatchSettings(radius, 2.0)) for part in _parts(at)]
+    joined = {
+        name: np.concatenate([getattr(p, name) for p in parts]) for name in PatchDisplacements.__dataclass_fields__
+    }
     shape = len(rows), len(columns)
-    return Outcome(before, after, contradicting(Displacements(**joined), shape), shape)
+    return Outcome(before, after, contradicting(PatchDisplacements(**joined), shape), shape)
 
 
 def _parts(at: NDArray[np.int64]) -> list[NDArray[np.int64]]:

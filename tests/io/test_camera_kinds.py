@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 from dataclasses import fields
 from pathlib import Path
 from typing import get_args
@@ -89,3 +90,11 @@ def test_a_described_lens_has_the_coefficients_of_the_lens_that_computes(entry: 
 def test_no_file_is_longer_than_400_lines() -> None:
     long = {str(file.relative_to(ROOT)): len(file.read_text().splitlines()) for file in ROOT.rglob("*.py")}
     assert {name: lines for name, lines in long.items() if lines > 400} == {}
+
+
+def test_a_class_name_has_one_meaning() -> None:
+    homes: dict[str, list[str]] = {}
+    for file in ROOT.rglob("*.py"):
+        for name in re.findall(r"^class ([A-Z]\w*)", file.read_text(), re.MULTILINE):
+            homes.setdefault(name, []).append(str(file.relative_to(ROOT)))
+    assert {name: files for name, files in homes.items() if len(files) > 1} == {}

@@ -17,9 +17,9 @@ from photoplan.matching.register import (
     MISSING,
     TEXTURELESS,
     UNLIKE,
-    Displacements,
+    PatchDisplacements,
     PatchSettings,
-    Transfer,
+    PixelTransfer,
     contradicting,
     match_grid,
 )
@@ -81,7 +81,7 @@ def test_errors_are_small_and_as_large_as_stated(
         image(picture(grid(), snr, 1, finest, alike)),
         image(1.3 * picture(grid() - shift, snr, 2, finest, alike) - 10),
     )
-    found = contradicting(match_grid(pair, Transfer(), AT, PatchSettings()), SHAPE)
+    found = contradicting(match_grid(pair, PixelTransfer(), AT, PatchSettings()), SHAPE)
     assert (found.state == FOUND).all()
     error = found.moved - shift
     rms, normalised = np.sqrt((error**2).mean()), np.sqrt((error**2 / found.sigma**2).mean())
@@ -99,7 +99,7 @@ def test_the_second_image_may_be_turned_and_of_another_resolution() -> None:
     # Content of pixel p of the first image lies at L (p + moved) + t.
     back = (grid(520) - t) @ np.linalg.inv(L).T - moved
     pair = image(picture(grid(), 50, 1, 5.0)), image(picture(back, 50, 2, 5.0))
-    found = match_grid(pair, Transfer(tuple(L.ravel()), tuple(t)), AT, PatchSettings())
+    found = match_grid(pair, PixelTransfer(tuple(L.ravel()), tuple(t)), AT, PatchSettings())
     good = found.state == FOUND
     error = found.moved[good] - moved
     assert good.mean() > 0.95 and np.sqrt((error**2).mean()) < 0.01
@@ -114,7 +114,7 @@ def test_what_cannot_be_matched_is_named() -> None:
     first[flat], second[flat] = 100 + noise[0][flat], 100 + noise[1][flat]
     second[new] = 120 + CONTRAST * values(grid(), 4.0, seed=99)[new]
     second[gone] = np.nan
-    found = contradicting(match_grid((image(first), image(second)), Transfer(), AT, PatchSettings()), SHAPE)
+    found = contradicting(match_grid((image(first), image(second)), PixelTransfer(), AT, PatchSettings()), SHAPE)
 
     def states(part: tuple[slice, slice], edge: int = 14) -> set[int]:
         row, col = part
@@ -133,7 +133,7 @@ def test_a_vector_that_contradicts_its_neighbours_is_apart() -> None:
     moved = 0.002 * AT + np.random.default_rng(1).normal(0, 0.01, (n, 2))
     wrong = 7 * SHAPE[1] + 7
     moved[wrong] += (0.4, 0.0)
-    found = Displacements(
+    found = PatchDisplacements(
         at=AT,
         moved=moved,
         covariance=np.broadcast_to(1e-4 * np.eye(2), (n, 2, 2)),

@@ -9,7 +9,7 @@ from tools.photos import at
 
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.intersection import REASONS, Intersected, Rays, intersect
+from photoplan.orientation.intersection import REASONS, Intersected, MeasuredRays, intersect
 
 SIGMA = 5e-5
 
@@ -21,14 +21,14 @@ def block(rng: np.random.Generator, count: int = 5) -> list[Pose]:
     ]
 
 
-def rays_of(poses: list[Pose], X: np.ndarray, rng: np.random.Generator, sigma: float = SIGMA) -> Rays:
+def rays_of(poses: list[Pose], X: np.ndarray, rng: np.random.Generator, sigma: float = SIGMA) -> MeasuredRays:
     image, point, t = [], [], []
     for k, pose in enumerate(poses):
         p = pose.to_camera(X)
         image.append(np.full(len(X), k))
         point.append(np.arange(len(X)))
         t.append(p[:, :2] / -p[:, 2:] + rng.normal(0, 1, (len(X), 2)) * sigma)
-    return Rays(np.concatenate(image), np.concatenate(point), np.concatenate(t), np.full((1, 2), SIGMA))
+    return MeasuredRays(np.concatenate(image), np.concatenate(point), np.concatenate(t), np.full((1, 2), SIGMA))
 
 
 def ground(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_fault_17_one_wrong_ray_is_found_or_the_point_is_refused(count: int) -> 
     size = 10 ** rng.uniform(-2.5, 0.0, 500)
     angle = rng.uniform(0, 2 * np.pi, 500)
     t[wrong] += size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    found = intersect(poses, Rays(rays.image, rays.point, t, rays.sigma))
+    found = intersect(poses, MeasuredRays(rays.image, rays.point, t, rays.sigma))
     good = found.reason == 0
     assert good.mean() > {3: 0.75, 4: 0.95, 5: 0.97}[count]
     assert (~found.used[wrong][good]).mean() > 0.99
@@ -87,7 +87,7 @@ def test_fault_17_an_error_that_any_ray_could_have_is_not_guessed() -> None:
     t = rays.tangents.copy()
     wrong = rng.integers(0, 3, 200) * 200 + np.arange(200)
     t[wrong, 0] += 0.01
-    found = intersect(poses, Rays(rays.image, rays.point, t, rays.sigma))
+    found = intersect(poses, MeasuredRays(rays.image, rays.point, t, rays.sigma))
     assert (found.reason == 4).mean() > 0.97
     assert found.counts()["rays do not meet"] > 190
 
@@ -100,7 +100,7 @@ def test_many_rays_lose_several() -> None:
     t = rays.tangents.copy()
     wrong = np.concatenate([k * 40 + np.arange(40) for k in (2, 7, 19)])
     t[wrong] += 0.02
-    found = intersect(poses, Rays(rays.image, rays.point, t, rays.sigma))
+    found = intersect(poses, MeasuredRays(rays.image, rays.point, t, rays.sigma))
     assert not found.used[wrong].any()
     assert (found.reason == 0).all()
     assert (found.rays >= 21).all()
@@ -111,7 +111,7 @@ def test_fault_16_points_that_are_not_determined() -> None:
     t = np.array([[0.1, 0.1], [0.1, 0.0], [0.0995, 0.0], [0.0, 0.0], [0.3, 0.0], [0.1, 0.0], [-0.5, 0.3], [np.nan, 0]])
     image = np.array([0, 0, 1, 0, 2, 0, 2, 2])
     point = np.array([0, 1, 1, 2, 2, 3, 3, 0])
-    found = intersect(poses, Rays(image, point, t, np.full((1, 2), SIGMA)), 5)
+    found = intersect(poses, MeasuredRays(image, point, t, np.full((1, 2), SIGMA)), 5)
     said = [REASONS[k] for k in found.reason]
     assert said[0] == "fewer than two rays"
     assert said[1] == "rays nearly parallel"
@@ -128,7 +128,7 @@ def test_fault_16_points_that_are_not_determined() -> None:
 
 
 def test_no_rays_no_points() -> None:
-    empty = Rays(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.ones((1, 2)))
+    empty = MeasuredRays(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.ones((1, 2)))
     found = intersect([], empty)
     assert isinstance(found, Intersected) and len(found.XYZ) == 0
 

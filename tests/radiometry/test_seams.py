@@ -13,14 +13,14 @@ from scipy.ndimage import gaussian_filter
 from photoplan.errors import PhotoplanError
 from photoplan.io.result_log import ResultLog
 from photoplan.radiometry import seams
-from photoplan.radiometry.seams import Parts, _Level
-from photoplan.radiometry.shown import Memory, Shown, layers_of
+from photoplan.radiometry.seams import SeamParts, _Level
+from photoplan.radiometry.shown import ArrayMemory, Shown, layers_of
 
 
 def find_seams(
-    images: list[Shown], weight: NDArray[np.float32], fixed: NDArray[np.uint16] | None = None, **options: Parts
+    images: list[Shown], weight: NDArray[np.float32], fixed: NDArray[np.uint16] | None = None, **options: SeamParts
 ) -> tuple[NDArray[np.uint16], float, float]:
-    store = Memory()
+    store = ArrayMemory()
     return seams.find_seams([layers_of(each, store) for each in images], store, weight, fixed, **options)
 
 
@@ -31,9 +31,9 @@ def test_an_expansion_is_the_best_of_all_subsets(seed: int) -> None:
     images = [
         Shown(0, 0, random.uniform(0, 100, (1, 3, 3)).astype(np.float32), random.random((3, 3)) < 0.9) for _ in range(3)
     ]
-    store, weight = Memory(), random.uniform(1, 3, (3, 3)).astype(np.float32)
+    store, weight = ArrayMemory(), random.uniform(1, 3, (3, 3)).astype(np.float32)
     layers = [layers_of(each, store)[0] for each in images]
-    level = _Level(layers, store, weight, np.zeros((3, 3), np.uint16), Parts())
+    level = _Level(layers, store, weight, np.zeros((3, 3), np.uint16), SeamParts())
     labels, part = level.start().astype(np.int32), level.part((0, 0, 3, 3), 0)
     for image in range(3):
         free = labels > 0
@@ -152,12 +152,12 @@ def test_parts_of_a_map_cost_no_more_than_the_whole() -> None:
             values[:, y : y + 15, x : x + 15] += random.normal(0, 50)
         images.append(Shown(row, col, values.astype(np.float32), np.ones(size, bool)))
     weight = np.ones(whole.shape[1:], np.float32)
-    store = Memory()
+    store = ArrayMemory()
     level = _Level([layers_of(each, store)[0] for each in images], store, weight, np.zeros(weight.shape, np.uint16),
-                   Parts())  # fmt: skip
-    one, many = (find_seams(images, weight, parts=each)[0] for each in (Parts(1000), Parts(40, 12)))
+                   SeamParts())  # fmt: skip
+    one, many = (find_seams(images, weight, parts=each)[0] for each in (SeamParts(1000), SeamParts(40, 12)))
     assert level.total(many) < 1.01 * level.total(one) < 0.9 * level.total(level.start())
-    assert len(Parts(40, 12).of(weight.shape)) == 30 and len(np.unique(many)) > 4
+    assert len(SeamParts(40, 12).of(weight.shape)) == 30 and len(np.unique(many)) > 4
 
 
 def test_arrays_wait_on_the_disk(tmp_path: Path) -> None:
@@ -178,8 +178,8 @@ def test_arrays_wait_on_the_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (320, 320), (321, 1000), (2000, 1500)])
-@pytest.mark.parametrize("parts", [Parts(), Parts(40, 12), Parts(30, 45)])
-def test_parts_that_are_solved_at_once_do_not_touch(shape: tuple[int, int], parts: Parts) -> None:
+@pytest.mark.parametrize("parts", [SeamParts(), SeamParts(40, 12), SeamParts(30, 45)])
+def test_parts_that_are_solved_at_once_do_not_touch(shape: tuple[int, int], parts: SeamParts) -> None:
     boxes, groups = parts.of(shape), parts.apart(shape)
     assert sorted(k for group in groups for k in group) == list(range(len(boxes)))
     for group in groups[:4]:

@@ -13,7 +13,7 @@ from photoplan.cameras.risen import EarthBend
 from photoplan.kernels.jit import COMPILED
 from photoplan.kernels.strokes import draw_strokes
 from photoplan.surfaces.seen import SeenSurface
-from photoplan.surfaces.seen_lines import Lines, SeenLines, Sight
+from photoplan.surfaces.seen_lines import Lines, LinesOfSight, SeenLines
 from photoplan.targets.panorama import Panorama
 from photoplan.targets.view import FrameBundle, ViewTarget
 
@@ -32,8 +32,8 @@ BENDS = {"flat": 0.0, "round": 4e-5, "panorama": 0.0}
 WAYS = (((-200, -260), (250, 40), (-120, 270)), ((-270, 200), (-340, 0), (280, 120)))
 
 
-def sight(name: str) -> Sight:
-    return Sight(TARGETS[name], SeenSurface(TERRAIN, BOUNDS))
+def sight(name: str) -> LinesOfSight:
+    return LinesOfSight(TARGETS[name], SeenSurface(TERRAIN, BOUNDS))
 
 
 def lines() -> Lines:

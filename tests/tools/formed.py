@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.quality.formation.model import FormedImage, Frame, ImageModel, exposed, frame_light
+from photoplan.quality.formation.model import FormedFrame, FormedImage, ImageModel, exposed, frame_light
 
 _Array = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ class ArrayScene:
 def form_image(model: ImageModel, scene: Any, frame: int = 0, exposure: float = 1.0, gain: float = 1.0) -> FormedImage:
     """One image of a scene; an array is taken as one with one cell per pixel."""
     scene = ArrayScene(scene) if isinstance(scene, np.ndarray) else scene
-    return exposed(model, frame_light(model, scene, frame).whole(), Frame(frame, exposure, gain))
+    return exposed(model, frame_light(model, scene, frame).whole(), FormedFrame(frame, exposure, gain))
 
 
 def form_series(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from photoplan.radiometry.adjust import Adjusted
+from photoplan.radiometry.adjust import AdjustedBand
 from photoplan.radiometry.cells import Cells, cells_of
 from photoplan.radiometry.tone import Tone, powers_of, surface
 
@@ -45,7 +45,7 @@ class Truth:
         terms = [tuple((i, j, float(c)) for (i, j), c in zip(POWERS, trend)) for trend in self.trends]
         return {k: (Tone(tuple(grey[k].tolist()), tuple(ends.tolist()), terms[k]),) for k in range(len(grey))}
 
-    def trend_errors(self, made: Adjusted) -> NDArray[np.float64]:
+    def trend_errors(self, made: AdjustedBand) -> NDArray[np.float64]:
         """Rms error of the trend over each image, (images,)."""
         x, y = np.meshgrid(np.linspace(0, IMAGE - 1, 9), np.linspace(0, IMAGE - 1, 9))
         shapes = surface(x, y, (IMAGE, IMAGE), POWERS).reshape(-1, len(POWERS))

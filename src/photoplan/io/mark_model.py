@@ -84,7 +84,7 @@ class DotCross(_Free):
     rotation: Number = 0.0
 
 
-class MarkPart(_MarkEntry):
+class MarkPartEntry(_MarkEntry):
     """A polygon of one tone."""
 
     outline: Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)]
@@ -96,7 +96,7 @@ class Polygon(_MarkEntry):
     """Anything, from polygons; each covers those before it."""
 
     type: Literal["polygon"]
-    parts: Annotated[tuple[MarkPart, ...], Field(min_length=1, max_length=200)]
+    parts: Annotated[tuple[MarkPartEntry, ...], Field(min_length=1, max_length=200)]
     background: Tone | None = None
     """Tone elsewhere; left out: not compared."""
     window: Box | None = None

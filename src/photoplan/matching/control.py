@@ -42,7 +42,7 @@ class FoundPatch:
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class AgreeingPoints:
     """Which points of an image agree with one correction of its orientation."""
 
     keep: NDArray[np.bool_]
@@ -179,7 +179,9 @@ def find_patch(patch: Array, picture: Array, least: float = 0.7) -> FoundPatch |
     return FoundPatch((float(r[0]), float(r[1])), r[[9, 10, 10, 11]].reshape(2, 2), float(r[CORRELATION]))
 
 
-def agree(camera: CentralCamera, XYZ: Array, xy: Array, covariances: tuple[Array, Array], reach: float) -> Agreement:
+def agree(
+    camera: CentralCamera, XYZ: Array, xy: Array, covariances: tuple[Array, Array], reach: float
+) -> AgreeingPoints:
     """Which points obey one small change of the camera's position and direction.
 
     A change of the orientation moves the points of an image smoothly; what a wrong match does is its own. Six unknowns
@@ -202,7 +204,7 @@ def agree(camera: CentralCamera, XYZ: Array, xy: Array, covariances: tuple[Array
     n = len(XYZ)
     gap = xy - project(camera, XYZ)
     if n < LEAST:
-        return Agreement(np.zeros(n, bool), gap, (float("nan"), float("nan")), _FACTOR)
+        return AgreeingPoints(np.zeros(n, bool), gap, (float("nan"), float("nan")), _FACTOR)
     middle = np.median(gap, axis=0)
     delta = np.zeros(6)
     residual, scale = gap - middle, 0.0
@@ -224,7 +226,7 @@ def agree(camera: CentralCamera, XYZ: Array, xy: Array, covariances: tuple[Array
     factor = _factor(camera, XYZ, residual, covariances, keep) if keep.sum() >= LEAST else _FACTOR
     if keep.sum() < LEAST:
         keep = np.zeros(n, bool)
-    return Agreement(keep, residual, (float(middle[0]), float(middle[1])), factor)
+    return AgreeingPoints(keep, residual, (float(middle[0]), float(middle[1])), factor)
 
 
 def _moved(camera: CentralCamera, XYZ: Array, delta: Array) -> tuple[Array, Array]:

@@ -42,7 +42,7 @@ _ENOUGH = 3
 
 
 @dataclass(frozen=True)
-class Transfer:
+class PixelTransfer:
     """Where a pixel of the first image is expected in the second one: L xy + t."""
 
     linear: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
@@ -80,7 +80,7 @@ class PatchSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Displacements:
+class PatchDisplacements:
     """Patches and where they were found."""
 
     at: NDArray[np.int64]
@@ -121,8 +121,8 @@ class SmoothedImage:
 
 
 def match_grid(
-    pair: tuple[Grey, Grey], transfer: Transfer, at: NDArray[np.int64], settings: PatchSettings
-) -> Displacements:
+    pair: tuple[Grey, Grey], transfer: PixelTransfer, at: NDArray[np.int64], settings: PatchSettings
+) -> PatchDisplacements:
     """Find patches of the first image in the second one.
 
     Parameters
@@ -165,7 +165,9 @@ def match_grid(
     with np.errstate(invalid="ignore"):
         uncertain = np.sqrt(covariance[:, [0, 1], [0, 1]]).max(axis=1, initial=0.0) > settings.sigma
     state[uncertain & (state == FOUND)] = UNCERTAIN
-    return Displacements(at=at, moved=moved, covariance=covariance, correlation=correlation, state=state, factor=factor)
+    return PatchDisplacements(
+        at=at, moved=moved, covariance=covariance, correlation=correlation, state=state, factor=factor
+    )
 
 
 def _promised(templates: _Floats, round_patch: NDArray[np.bool_]) -> _Floats:
@@ -200,7 +202,7 @@ class _Tile:
     """First pixel of the spline in the second image."""
 
     @classmethod
-    def of(cls, other: Grey, transfer: Transfer, at: NDArray[np.int64], around: int) -> _Tile:
+    def of(cls, other: Grey, transfer: PixelTransfer, at: NDArray[np.int64], around: int) -> _Tile:
         """The part around patches."""
         low, high = at.min(axis=0) - around, at.max(axis=0) + around + 1
         x, y = np.arange(low[0], high[0], dtype=float), np.arange(low[1], high[1], dtype=float)
@@ -260,14 +262,14 @@ def _factors(
     return noise_factors(columns, np.nan_to_num(templates), round_patch, _SMOOTHING)
 
 
-def contradicting(found: Displacements, shape: tuple[int, int]) -> Displacements:
+def contradicting(found: PatchDisplacements, shape: tuple[int, int]) -> PatchDisplacements:
     """A whole grid, (rows, columns) of `shape`, in which vectors that contradict their neighbours are APART."""
     state = found.state.copy()
     state[_apart(found, shape)] = APART
     return replace(found, state=state)
 
 
-def _apart(found: Displacements, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _apart(found: PatchDisplacements, shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Which vectors contradict their neighbours, (n,)."""
     rows, columns = shape
     apart = np.zeros((rows, columns), bool)

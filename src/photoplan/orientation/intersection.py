@@ -24,7 +24,7 @@ _MANY = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Rays:
+class MeasuredRays:
     """Measurements of points in oriented images."""
 
     image: NDArray[np.int64]
@@ -45,10 +45,10 @@ class Rays:
         if len(self.point) != m or not (self.sigma > 0).all():
             raise UsageError("rays need one point each and positive standard deviations")
 
-    def at(self, index: ArrayLike) -> Rays:
+    def at(self, index: ArrayLike) -> MeasuredRays:
         """The rays at `index` (mask or numbers)."""
         k = np.asarray(index)
-        return Rays(self.image[k], self.point[k], self.tangents[k], self.sigma[k])
+        return MeasuredRays(self.image[k], self.point[k], self.tangents[k], self.sigma[k])
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,12 @@ class _Cameras:
 
 
 def intersect(
-    poses: Sequence[Pose], rays: Rays, count: int | None = None, *, critical: float = 4.0, min_angle: float = 0.0035
+    poses: Sequence[Pose],
+    rays: MeasuredRays,
+    count: int | None = None,
+    *,
+    critical: float = 4.0,
+    min_angle: float = 0.0035,
 ) -> Intersected:
     """Points where rays meet, by least squares of the image coordinates.
 
@@ -128,7 +133,7 @@ def intersect(
     return found
 
 
-def _cleaned(cameras: _Cameras, rays: Rays, n: int, critical: float, min_angle: float) -> Intersected:
+def _cleaned(cameras: _Cameras, rays: MeasuredRays, n: int, critical: float, min_angle: float) -> Intersected:
     """Points of all rays; then rays that do not fit leave, one of a point at a time."""
     used = np.ones(len(rays.point), bool)
     found, worst, size = _solved(cameras, rays, n, min_angle)
@@ -157,7 +162,9 @@ def _cleaned(cameras: _Cameras, rays: Rays, n: int, critical: float, min_angle: 
     return replace(found, used=used)
 
 
-def _leaving(cameras: _Cameras, rays: Rays, worst: Array, critical: float, min_angle: float) -> NDArray[np.bool_]:
+def _leaving(
+    cameras: _Cameras, rays: MeasuredRays, worst: Array, critical: float, min_angle: float
+) -> NDArray[np.bool_]:
     """Which rays of points that do not fit have to leave: none or one of each point."""
     leaving = np.zeros(len(rays.point), bool)
     _, first, count = np.unique(rays.point, return_index=True, return_counts=True)
@@ -187,7 +194,7 @@ def _leaving(cameras: _Cameras, rays: Rays, worst: Array, critical: float, min_a
     return leaving
 
 
-def _solved(cameras: _Cameras, rays: Rays, n: int, min_angle: float) -> tuple[Intersected, Array, Array]:
+def _solved(cameras: _Cameras, rays: MeasuredRays, n: int, min_angle: float) -> tuple[Intersected, Array, Array]:
     """Points (n,), largest normalised residual of each ray (m,) and of each point (n,)."""
     R, C = cameras.R[rays.image], cameras.centers[rays.image]
     at = rays.point
@@ -225,7 +232,7 @@ def _solved(cameras: _Cameras, rays: Rays, n: int, min_angle: float) -> tuple[In
     )
 
 
-def _nearest(R: Array, C: Array, rays: Rays, n: int, number: NDArray[np.int64]) -> tuple[Array, Array]:
+def _nearest(R: Array, C: Array, rays: MeasuredRays, n: int, number: NDArray[np.int64]) -> tuple[Array, Array]:
     """Points nearest to all their rays (n, 3), and the smallest eigenvalue of the rays' spread (n,)."""
     d = np.einsum("mij,mj->mi", R, bearings(rays.tangents))
     across = np.eye(3) - d[:, :, None] * d[:, None, :]
@@ -236,7 +243,7 @@ def _nearest(R: Array, C: Array, rays: Rays, n: int, number: NDArray[np.int64]) 
     return X, np.asarray(spread, float)
 
 
-def _residuals(R: Array, C: Array, rays: Rays, X: Array) -> tuple[Array, Array, Array]:
+def _residuals(R: Array, C: Array, rays: MeasuredRays, X: Array) -> tuple[Array, Array, Array]:
     """Computed minus measured tangents (m, 2) and derivatives (m, 2, 3) in units of σ, and depths (m,)."""
     p = np.einsum("mji,mj->mi", R, X[rays.point] - C)
     depth = -p[:, 2]

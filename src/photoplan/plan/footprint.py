@@ -58,7 +58,7 @@ class Footprint:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ImageExtent:
     """What an image can show of each level: how far it extends from the camera's vantage in some directions.
 
     Straight rays cross levels at places that move linearly with the level, so an extent, the largest of many such
@@ -77,7 +77,7 @@ class View:
     """What lies further than this from the vantage, along any direction, does not count, metres."""
 
     @classmethod
-    def of(cls, camera: Camera, low: float, high: float, far: float = math.inf) -> View | None:
+    def of(cls, camera: Camera, low: float, high: float, far: float = math.inf) -> ImageExtent | None:
         """The view between two levels, cut off `far` from the vantage; None: no ray gets there."""
         vantage = camera.vantage
         center = vantage.point
@@ -204,7 +204,7 @@ def covered_tiles(camera: Camera, terrain: Ranged, grid: MapGrid, side: int, see
     ranges = terrain.height_range(boxes)
     if not np.isfinite(ranges).any():
         return every.only(())
-    view = View.of(camera, float(np.nanmin(ranges)), float(np.nanmax(ranges)))
+    view = ImageExtent.of(camera, float(np.nanmin(ranges)), float(np.nanmax(ranges)))
     return every.only(() if view is None else every.indices[view.sees(boxes, ranges)])
 
 
@@ -241,7 +241,7 @@ def _seen(camera: Camera, terrain: Terrain, bounds: Bounds | None) -> Bounds | N
             (low, high), whole = terrain.height_range(near), True
         if not low < z:
             return None
-        view = View.of(camera, low, high, min(away, FLATTEST * (z - low)) if vantage.central else away)
+        view = ImageExtent.of(camera, low, high, min(away, FLATTEST * (z - low)) if vantage.central else away)
         cut = near if view is None else _common(near, view.bounds)
         if view is None or not _holds(cut):
             return None
@@ -256,7 +256,7 @@ def _seen(camera: Camera, terrain: Terrain, bounds: Bounds | None) -> Bounds | N
     return near
 
 
-def _closely(view: View, terrain: Terrain, bounds: Bounds) -> Bounds | None:
+def _closely(view: ImageExtent, terrain: Terrain, bounds: Bounds) -> Bounds | None:
     """Bounds of the boxes that can be seen, and of what can be seen of them; refined while they shrink much."""
     for _ in range(_LOOKS):
         x, y = np.linspace(bounds[0], bounds[2], _BOXES + 1), np.linspace(bounds[1], bounds[3], _BOXES + 1)

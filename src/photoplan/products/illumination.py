@@ -25,7 +25,7 @@ from photoplan.plan.visibility import hidden_pixels
 from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.project.restored import kept_nodata
-from photoplan.radiometry.illumination import Ground, LightModel, estimate
+from photoplan.radiometry.illumination import LightModel, LitGround, estimate
 from photoplan.radiometry.tone import fitted
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.shading import Lighting, surface_slopes
@@ -61,7 +61,7 @@ class IlluminationReport:
     path: Path | None
     """None after a dry run."""
     model: LightModel
-    sample: Ground
+    sample: LitGround
     """Of the pixels that parameters are estimated from, (n,)."""
     before: NDArray[np.float64]
     """Their grey values, (bands, n)."""
@@ -95,7 +95,7 @@ class _Place:
     grid: MapGrid
     light: Lighting
 
-    def ground(self, window: Window) -> Ground:
+    def ground(self, window: Window) -> LitGround:
         """What the terrain is like in a window of the picture.
 
         Slopes have no steps at posts that are further apart than pixels: each is the mean over the distance of two.
@@ -110,7 +110,7 @@ class _Place:
         east, north, up = self.light.directions[0]
         tile = TileGround.of(MapTarget(self.grid), window, heights)
         shadow = hidden_pixels(SunProjection((east, north, up)), tile, surface)
-        return Ground((up - east * gx - north * gy) * flat, (1 + flat) / 2, heights, shadow)
+        return LitGround((up - east * gx - north * gy) * flat, (1 + flat) / 2, heights, shadow)
 
     def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Pixels and which of them count."""
@@ -189,7 +189,7 @@ def _open(request: IlluminationRequest) -> _Place:
     return _Place(reader, terrain, grid, light)
 
 
-def _sample(place: _Place, events: Events) -> tuple[NDArray[np.float64], Ground, NDArray[np.int64]]:
+def _sample(place: _Place, events: Events) -> tuple[NDArray[np.float64], LitGround, NDArray[np.int64]]:
     """Grey values (bands, n), ground (n,) and window (n,) of pixels all over the picture."""
     width, height = place.grid.width, place.grid.height
     # Windows do not overlap: pixels that several have would leave nothing out with any of them.
@@ -206,10 +206,10 @@ def _sample(place: _Place, events: Events) -> tuple[NDArray[np.float64], Ground,
         ground = place.ground(window)
         use = valid & np.isfinite(ground.cos_i)
         values.append(pixels[:, use].astype(float))
-        grounds.append([getattr(ground, each.name)[use] for each in fields(Ground)])
+        grounds.append([getattr(ground, each.name)[use] for each in fields(LitGround)])
         parts.append(np.full(int(use.sum()), number))
         events.done()
     every = np.concatenate(parts)
     some = np.arange(0, len(every), max(1, len(every) // _MOST))
-    joined = Ground(*(np.concatenate(column)[some] for column in zip(*grounds)))
+    joined = LitGround(*(np.concatenate(column)[some] for column in zip(*grounds)))
     return np.concatenate(values, axis=1)[:, some], joined, every[some]

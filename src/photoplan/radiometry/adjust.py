@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, csr_array, eye, kron, vstack
 
 from photoplan.adjustment.robust import MEDIAN_1D, cauchy
-from photoplan.radiometry.equations import Band, State
+from photoplan.radiometry.equations import Band, BandState
 from photoplan.radiometry.solve import Solved
 
 _Floats = NDArray[np.float64]
@@ -49,11 +49,11 @@ class Gauge:
 
 
 @dataclass(frozen=True, eq=False)
-class Adjusted:
+class AdjustedBand:
     """Result for one band."""
 
-    state: State
-    sigmas: State
+    state: BandState
+    sigmas: BandState
     """Standard deviations of tables and trends, beside the gauge; of the ground none."""
     sigma: float
     """Standard deviation of a quantile of an image in a cell, grey values."""
@@ -89,7 +89,7 @@ class _Normals:
     """What that loses with theirs, (groups, unknowns)."""
 
 
-def adjust(band: Band, gauge: Gauge) -> Adjusted:
+def adjust(band: Band, gauge: Gauge) -> AdjustedBand:
     """Tables and trends of one band.
 
     Parameters
@@ -116,7 +116,7 @@ def adjust(band: Band, gauge: Gauge) -> Adjusted:
         solved = Solved.of(N, H)
         step = solved.step(found.g + prior.T @ (wanted - prior @ x) + hard * (rising.T @ missing), held - H @ x)
         state = state.with_vector(x + step)
-        state = State(state.tables, state.trends, state.ground + found.alone - found.lost @ step)
+        state = BandState(state.tables, state.trends, state.ground + found.alone - found.lost @ step)
         falling = np.diff(state.tables, axis=1) < _LEAST_SLOPE * band.step * (1 - 1e-6)
         done = float(np.abs(step).max()) < _CONVERGED * span and not (falling & ~flat).any()
         if done or rounds == _ROUNDS:
@@ -124,11 +124,11 @@ def adjust(band: Band, gauge: Gauge) -> Adjusted:
         flat |= falling
     weights = _weigh(band, state, robust, gauge.fixed is None)
     variance = _without_parts(band, state, weights, solved, N) + _of_prior(solved, prior)
-    sigmas = State(state.tables, state.trends, np.full(len(state.ground), np.nan)).with_vector(np.sqrt(variance))
-    return Adjusted(state, sigmas, weights.sigma, rounds, float((robust < 0.5).mean()))
+    sigmas = BandState(state.tables, state.trends, np.full(len(state.ground), np.nan)).with_vector(np.sqrt(variance))
+    return AdjustedBand(state, sigmas, weights.sigma, rounds, float((robust < 0.5).mean()))
 
 
-def _weigh(band: Band, state: State, robust: _Floats, own: bool) -> _Weights:
+def _weigh(band: Band, state: BandState, robust: _Floats, own: bool) -> _Weights:
     """Weights at a state; `own`: whether a reference, or else the images' own mean, holds the ground."""
     shown, slope = band.predicted(state)
     residual = band.grey - shown
@@ -141,7 +141,7 @@ def _weigh(band: Band, state: State, robust: _Floats, own: bool) -> _Weights:
     return _Weights(band.weight * robust / sigma**2, share, moved, robust, sigma)
 
 
-def _normals(band: Band, state: State, weights: _Weights) -> _Normals:
+def _normals(band: Band, state: BandState, weights: _Weights) -> _Normals:
     """Normal equations of observations that have weights; the ground is taken out of them, cells by cells."""
     starts = np.flatnonzero(np.diff(band.cell, prepend=-1))
     firsts = starts[np.unique(np.searchsorted(starts, np.arange(0, len(band.cell), _AT_ONCE)).clip(0, len(starts) - 1))]
@@ -161,7 +161,7 @@ def _normals(band: Band, state: State, weights: _Weights) -> _Normals:
     return _Normals(N, g, alone, csr_array(vstack([each.lost for each in found])))
 
 
-def _normals_of(band: Band, state: State, weights: _Weights) -> _Normals:
+def _normals_of(band: Band, state: BandState, weights: _Weights) -> _Normals:
     """The same of some cells."""
     groups = _sums(band.group, len(state.ground))
     (shown, slope), A = band.predicted(state), band.design(state)
@@ -174,7 +174,7 @@ def _normals_of(band: Band, state: State, weights: _Weights) -> _Normals:
     return _Normals(N, B.T @ residual - lost.T @ pull, pull / total, lost)
 
 
-def _held(band: Band, state: State, sigma: float) -> tuple[_Floats, _Floats]:
+def _held(band: Band, state: BandState, sigma: float) -> tuple[_Floats, _Floats]:
     """What ground lacks to the reference, or else to what its images show in the mean, and what that weighs."""
     share = np.bincount(band.group, band.weight) / np.bincount(band.group)
     if not band.referred:
@@ -200,7 +200,7 @@ def _sums(of: NDArray[np.int64], count: int) -> csr_array:
     return csr_array(parts, shape=(count, len(of)))
 
 
-def _prior(band: Band, state: State) -> tuple[csr_array, _Floats]:
+def _prior(band: Band, state: BandState) -> tuple[csr_array, _Floats]:
     """What is known of an image beforehand, as equations of weight one, the same for all."""
     (images, nodes), terms = state.tables.shape, state.trends.shape[1]
     bend = np.diff(np.eye(nodes), 2, axis=0) / (_BEND * np.ptp(band.nodes))
@@ -211,7 +211,7 @@ def _prior(band: Band, state: State) -> tuple[csr_array, _Floats]:
     return csr_array(kron(eye(images), whole)), np.tile(wanted, images)
 
 
-def _gauge(band: Band, state: State, gauge: Gauge) -> tuple[_Floats, _Floats]:
+def _gauge(band: Band, state: BandState, gauge: Gauge) -> tuple[_Floats, _Floats]:
     """Conditions H x = held on the unknowns of the images."""
     (images, nodes), width = state.tables.shape, state.width
     rows: list[_Floats] = []
@@ -230,7 +230,7 @@ def _gauge(band: Band, state: State, gauge: Gauge) -> tuple[_Floats, _Floats]:
     return np.array(rows).reshape(-1, images * width), np.array(held)
 
 
-def _rising(band: Band, state: State, flat: NDArray[np.bool_]) -> tuple[csr_array, _Floats]:
+def _rising(band: Band, state: BandState, flat: NDArray[np.bool_]) -> tuple[csr_array, _Floats]:
     """Tables that may not fall: their rises as rows, and what these lack."""
     (images, _), width = state.tables.shape, state.width
     image, k = np.nonzero(flat)
@@ -240,7 +240,7 @@ def _rising(band: Band, state: State, flat: NDArray[np.bool_]) -> tuple[csr_arra
     return rows, _LEAST_SLOPE * band.step - np.diff(state.tables, axis=1)[image, k]
 
 
-def _without_parts(band: Band, state: State, weights: _Weights, solved: Solved, N: csr_array) -> _Floats:
+def _without_parts(band: Band, state: BandState, weights: _Weights, solved: Solved, N: csr_array) -> _Floats:
     """Variances of the unknowns by what they become without a part of the ground (Quenouille 1956, Tukey 1958).
 
     What lies near each other errs together; so parts are blocks of cells, drawn by lot, where there are enough.

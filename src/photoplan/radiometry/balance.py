@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from photoplan.radiometry.adjust import Adjusted, Gauge, adjust
+from photoplan.radiometry.adjust import AdjustedBand, Gauge, adjust
 from photoplan.radiometry.cells import Cells, neighbours
 from photoplan.radiometry.equations import Band
 from photoplan.radiometry.ratio import factors
@@ -43,7 +43,7 @@ class Balanced:
     """Standard deviations of what the tables' grey values become, in the same order."""
     parts: NDArray[np.int64]
     """Images of one number hang together by what they show."""
-    bands: tuple[Adjusted, ...]
+    bands: tuple[AdjustedBand, ...]
     """What each band's adjustment found."""
     contrast: tuple[float, ...]
     """Local contrast of the block after the adjustment, per band, before a common factor made it what it was."""
@@ -195,7 +195,7 @@ def pairs_of(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.i
     return Pairs(pair, count * cells.pixels.shape[2], found[0], found[1], cells.place[first], maps[0], maps[1])
 
 
-def _tone(nodes: _Floats, found: Adjusted, image: int, powers: Sequence[tuple[int, int]]) -> Tone:
+def _tone(nodes: _Floats, found: AdjustedBand, image: int, powers: Sequence[tuple[int, int]]) -> Tone:
     """The tone of an image: its table the other way, with equal steps of grey between entries."""
     table = Tone(tuple(found.state.tables[image].tolist()), tuple(nodes.tolist()))
     grey = np.linspace(nodes[0], nodes[-1], ENTRIES)
@@ -268,7 +268,7 @@ def _beyond(
     return bool(beyond.mean(axis=(0, 2)).max(initial=0.0) > _BEYOND)
 
 
-def _sigmas(nodes: _Floats, found: Adjusted, image: int, before: Tone, after: Tone) -> tuple[float, ...]:
+def _sigmas(nodes: _Floats, found: AdjustedBand, image: int, before: Tone, after: Tone) -> tuple[float, ...]:
     """Standard deviations of a table's entries, scaled by what came after the adjustment."""
     shown = np.interp(before.becomes, nodes, found.sigmas.tables[image])
     return tuple((shown * np.gradient(np.asarray(after.becomes), np.asarray(after.grey))).tolist())

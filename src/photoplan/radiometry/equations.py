@@ -22,7 +22,7 @@ _Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class BandState:
     """Unknowns of all images of one band."""
 
     tables: _Floats
@@ -42,7 +42,7 @@ class State:
         """Those of all images, (images · width,)."""
         return np.concatenate([self.tables, self.trends], axis=1).ravel()
 
-    def with_vector(self, vector: _Floats) -> State:
+    def with_vector(self, vector: _Floats) -> BandState:
         """The same ground with other images."""
         each = vector.reshape(len(self.tables), self.width)
         nodes = self.tables.shape[1]
@@ -115,7 +115,7 @@ class Band:
         """Whether there is a reference."""
         return bool(np.isfinite(self.reference).any())
 
-    def beside_reference(self, state: State) -> _Floats:
+    def beside_reference(self, state: BandState) -> _Floats:
         """What the cell of each group lacks to its reference in the mean, (groups,); NaN where there is none."""
         group_cell = np.empty(len(self.reference), np.int64)
         group_cell[self.group] = self.cell
@@ -127,24 +127,24 @@ class Band:
         """Mean grey value of the images of each group, (groups,)."""
         return np.asarray(np.bincount(self.group, self.grey) / np.bincount(self.group))
 
-    def start(self, images: int) -> State:
+    def start(self, images: int) -> BandState:
         """All images show what they have in the mean."""
-        return State(np.tile(self.nodes, (images, 1)), np.zeros((images, self.surfaces.shape[1])), self.own)
+        return BandState(np.tile(self.nodes, (images, 1)), np.zeros((images, self.surfaces.shape[1])), self.own)
 
-    def predicted(self, state: State) -> tuple[_Floats, _Floats]:
+    def predicted(self, state: BandState) -> tuple[_Floats, _Floats]:
         """What the images show (n,), and its derivatives by G (n,)."""
         v, k, part = self._at(state)
         low, high = state.tables[self.image, k], state.tables[self.image, k + 1]
         return (low + part * (high - low)) * v, (high - low) / self.step * v
 
-    def _at(self, state: State) -> tuple[_Floats, NDArray[np.int64], _Floats]:
+    def _at(self, state: BandState) -> tuple[_Floats, NDArray[np.int64], _Floats]:
         """Trends, and where tables are asked: number of the node before, and part of the way to the next."""
         v = np.maximum(1.0 + (self.surfaces * state.trends[self.image]).sum(axis=1), LEAST)
         at = (state.ground[self.group] - self.nodes[0]) / self.step
         k = np.clip(np.floor(at), 0, len(self.nodes) - 2).astype(np.int64)
         return v, k, at - k
 
-    def design(self, state: State) -> csr_array:
+    def design(self, state: BandState) -> csr_array:
         """Derivatives of what the images show by their unknowns, (n, unknowns)."""
         v, k, part = self._at(state)
         low, high = state.tables[self.image, k], state.tables[self.image, k + 1]

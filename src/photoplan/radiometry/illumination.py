@@ -41,7 +41,7 @@ _LEAST = 500
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class LitGround:
     """What a place is like, beside its colour; arrays of one shape."""
 
     cos_i: NDArray[np.floating]
@@ -95,7 +95,7 @@ class LightModel:
             if set(pair) <= set(self.corrections):
                 raise UsageError(f"{pair[0]} and {pair[1]} are two models of one thing; name one of them")
 
-    def factor(self, ground: Ground, band: BandLight) -> _Floats:
+    def factor(self, ground: LitGround, band: BandLight) -> _Floats:
         """By what a grey value without haze is multiplied; 1 in shadow, and where the sun does not shine."""
         if not {"cosine", "c"} & set(self.corrections):
             return np.ones(ground.cos_i.shape)
@@ -106,11 +106,11 @@ class LightModel:
             factor = np.clip(level / lit, 1 / MOST, MOST)
         return np.where(ground.lit & (lit > 0), factor, 1.0)
 
-    def haze(self, ground: Ground, band: BandLight) -> _Floats:
+    def haze(self, ground: LitGround, band: BandLight) -> _Floats:
         """By how much path radiance is more than at the mean height, grey values."""
         return np.asarray(band.haze_by_height * np.nan_to_num(ground.height - self.height) / 100.0)
 
-    def corrected(self, values: NDArray[np.floating], ground: Ground) -> _Floats:
+    def corrected(self, values: NDArray[np.floating], ground: LitGround) -> _Floats:
         """Grey values (bands, ...) after correction; where there is no terrain they stay."""
         known = np.isfinite(ground.cos_i)
         out = [
@@ -121,7 +121,7 @@ class LightModel:
 
 
 def estimate(
-    values: _Floats, ground: Ground, part: NDArray[np.int64], corrections: Sequence[str], cos_z: float
+    values: _Floats, ground: LitGround, part: NDArray[np.int64], corrections: Sequence[str], cos_z: float
 ) -> LightModel:
     """Parameters of the corrections that are named.
 
@@ -174,7 +174,7 @@ def estimate(
     return LightModel(empty.corrections, cos_z, empty.height, tuple(bands))
 
 
-def _estimate(model: LightModel, grey: _Floats, ground: Ground, use: NDArray[np.bool_]) -> _Floats:
+def _estimate(model: LightModel, grey: _Floats, ground: LitGround, use: NDArray[np.bool_]) -> _Floats:
     """m, d or a, haze, haze by height of one band from some pixels."""
     haze = np.zeros(2)
     if "haze" in model.corrections:

@@ -22,7 +22,7 @@ _ROUNDS, _STEPS = 12, 64
 _BLIND = 50.0
 
 
-class Part:
+class SeamPart:
     """What some images show of a part.
 
     Parameters

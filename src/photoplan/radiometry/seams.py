@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from photoplan.radiometry.seam_part import Part
-from photoplan.radiometry.shown import Layer, Store, quads
+from photoplan.radiometry.seam_part import SeamPart
+from photoplan.radiometry.shown import ArrayStore, SeamLayer, quads
 
 _Floats = NDArray[np.float32]
 _Mask = NDArray[np.bool_]
@@ -43,7 +43,7 @@ _PAIRS, _ROWS = 64, 8
 
 
 @dataclass(frozen=True)
-class Parts:
+class SeamParts:
     """How a map is cut: sides of parts, and how far they reach into their neighbours, pixels."""
 
     side: int = 320
@@ -67,15 +67,15 @@ class Parts:
         return [[i * cols + j for i in range(row, rows, step) for j in range(col, cols, step)] for row, col in starts]
 
 
-PARTS = Parts()
+PARTS = SeamParts()
 
 
 def find_seams(
-    images: Sequence[Sequence[Layer]],
-    store: Store,
+    images: Sequence[Sequence[SeamLayer]],
+    store: ArrayStore,
     weight: _Floats,
     fixed: _Labels | None = None,
-    parts: Parts = PARTS,
+    parts: SeamParts = PARTS,
     run: Run = map,
 ) -> tuple[_Labels, float, float]:
     """The image of each pixel.
@@ -122,12 +122,12 @@ def find_seams(
     return labels, level.difference(level.start()), level.difference(labels)
 
 
-def without_overlap(images: Sequence[Sequence[Layer]], store: Store, shape: tuple[int, int]) -> list[bool]:
+def without_overlap(images: Sequence[Sequence[SeamLayer]], store: ArrayStore, shape: tuple[int, int]) -> list[bool]:
     """For each image with layers on a map whether no other shows what it shows, on pixels four times as large."""
     counts = np.zeros([-(-n // 4) + 1 for n in shape], np.uint16)
     whole = 0, 0, *counts.shape
 
-    def seen(layer: Layer) -> tuple[tuple[slice, slice], _Mask]:
+    def seen(layer: SeamLayer) -> tuple[tuple[slice, slice], _Mask]:
         box, values = layer.window(store, whole)
         return _slices(box), ~np.isnan(values[..., -1])
 
@@ -147,14 +147,14 @@ class _Level:
     """Images on pixels of one size, part by part."""
 
     def __init__(
-        self, layers: Sequence[Layer | None], store: Store, weight: _Floats, fixed: _Labels, parts: Parts
+        self, layers: Sequence[SeamLayer | None], store: ArrayStore, weight: _Floats, fixed: _Labels, parts: SeamParts
     ) -> None:
         self.shape, self._weight, self._fixed, self._store = weight.shape, weight, fixed, store
         self._layers, self._parts, self._apart = layers, parts.of(weight.shape), parts.apart(weight.shape)
         self._boxes = np.array([(0, 0, 0, 0) if each is None else each.box for each in layers], np.int64)
         self.usual = self._usual()
 
-    def part(self, box: _Box, rim: int) -> Part:
+    def part(self, box: _Box, rim: int) -> SeamPart:
         """What images show of a box with a rim."""
         row, col, height, width = wide = grown(box, rim, self.shape)
         r, c, h, w = self._boxes.T
@@ -165,7 +165,7 @@ class _Level:
             assert layer is not None
             found.append(layer.window(self._store, wide))
         at = np.s_[row : row + height, col : col + width]
-        return Part((row, col), images, found, self._weight[at], self._fixed[at], self.usual)
+        return SeamPart((row, col), images, found, self._weight[at], self._fixed[at], self.usual)
 
     def start(self) -> _Labels:
         """Each pixel has the image whose border is furthest."""
@@ -260,7 +260,7 @@ class _Level:
         return layer.window(self._store, box)[1][0]
 
 
-def _layer(layers: Sequence[Layer], depth: int) -> Layer | None:
+def _layer(layers: Sequence[SeamLayer], depth: int) -> SeamLayer | None:
     """Of an image on pixels of a size; None: it is too small for them."""
     return layers[depth] if depth < len(layers) else None
 

@@ -18,7 +18,7 @@ _SMOOTH = 6.0
 _COLOUR, _STRENGTH = 0.15, 0.5
 
 
-class Store(Protocol):
+class ArrayStore(Protocol):
     """Where arrays wait; used by several threads."""
 
     def keep(self, values: _Floats, /) -> int:
@@ -30,7 +30,7 @@ class Store(Protocol):
         ...
 
 
-class Memory:
+class ArrayMemory:
     """A store that ends with the process."""
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class Layer:
+class SeamLayer:
     """An image on pixels of one size, in a store: features, and (1 − distance from the border)² or NaN."""
 
     at: int
@@ -82,7 +82,7 @@ class Layer:
     depth: int
     """Features and one."""
 
-    def window(self, store: Store, box: tuple[int, int, int, int]) -> tuple[tuple[int, int, int, int], _Floats]:
+    def window(self, store: ArrayStore, box: tuple[int, int, int, int]) -> tuple[tuple[int, int, int, int], _Floats]:
         """What of it lies in a box of the map: its own box, and its pixels."""
         (row, col, height, width), (top, left, rows, cols) = self.box, box
         i, j = max(row, top), max(col, left)
@@ -94,33 +94,33 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
-class Features:
-    """An image on pixels of one size, see `Layer`."""
+class SeamFeatures:
+    """An image on pixels of one size, see `SeamLayer`."""
 
     row: int
     col: int
     values: _Floats
     """(height, width, depth)."""
 
-    def kept(self, store: Store) -> Layer:
+    def kept(self, store: ArrayStore) -> SeamLayer:
         """The same in a store."""
         height, width, depth = self.values.shape
-        return Layer(store.keep(self.values), (self.row, self.col, height, width), depth)
+        return SeamLayer(store.keep(self.values), (self.row, self.col, height, width), depth)
 
 
-def layers_of(image: Shown, store: Store) -> tuple[Layer, ...]:
+def layers_of(image: Shown, store: ArrayStore) -> tuple[SeamLayer, ...]:
     """An image on its own pixels, on those twice as large and so on till it has one."""
     return tuple(each.kept(store) for each in features_of(image))
 
 
-def features_of(image: Shown) -> tuple[Features, ...]:
+def features_of(image: Shown) -> tuple[SeamFeatures, ...]:
     """The same before it is kept."""
     found = []
     while True:
         height, width = image.valid.shape
         place = np.where(image.valid, _from_middle(image.valid), np.nan)
         values = np.concatenate([_detail(image), place[..., None]], axis=-1).astype(np.float32)
-        found.append(Features(image.row, image.col, values))
+        found.append(SeamFeatures(image.row, image.col, values))
         if max(height, width) < 3:
             return tuple(found)
         image = image.halved()

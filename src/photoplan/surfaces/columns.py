@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from photoplan.kernels.profiles import LEFT, Columns, Fan, Shown, begin_columns, follow_columns
 from photoplan.kernels.raycast import MISS, OVER
 from photoplan.kernels.raywalk import begin_lines, next_part
-from photoplan.surfaces.rays import Cache, Part, Parts, over_parts
+from photoplan.surfaces.rays import Cache, TerrainPart, TerrainParts, over_parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class _Columns:
         low = np.where(low == np.inf, low, -np.inf)
         next_part(low, high, first, self.columns[1], np.full(len(self.fan[3]), OVER), which, places)
 
-    def over(self, part: Part, group: NDArray[np.int64]) -> None:
+    def over(self, part: TerrainPart, group: NDArray[np.int64]) -> None:
         frame = (*part.corner, *part.mesh, part.datum)
         follow_columns(part.posts, part.pyramid, part.faces, frame, self.fan, self.columns, self.shown, group)
 
@@ -42,7 +42,7 @@ class _Columns:
 
 
 def follow_fan(
-    parts: Parts,
+    parts: TerrainParts,
     center: NDArray[np.float64],
     ends: NDArray[np.float64],
     rise: tuple[NDArray[np.float64], NDArray[np.float64]],

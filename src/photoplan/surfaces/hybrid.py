@@ -16,7 +16,7 @@ from photoplan.kernels.hybrid import sample_hybrid, scan_faces
 from photoplan.kernels.sample_grid import sample_lattice
 from photoplan.surfaces.carried import box_points, carried_positions
 from photoplan.surfaces.lattice import Lattice
-from photoplan.surfaces.rays import NO_FACES, Hits, Part, carried_hits
+from photoplan.surfaces.rays import NO_FACES, Hits, TerrainPart, carried_hits
 from photoplan.surfaces.units import MeshFaces, Unit, UnitSource
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
@@ -277,13 +277,13 @@ class HybridParts:
         """Bounds of a unit."""
         return np.asarray(self.surface.source.ranges[row, column])
 
-    def part(self, column: int, row: int) -> Part | None:
+    def part(self, column: int, row: int) -> TerrainPart | None:
         """A unit; None if it is empty."""
         unit = self.surface.source.unit(column, row)
         if unit is None:
             return None
         faces = NO_FACES if unit.faces is None else (*_plain(unit.faces, "heights", unit.datum), _frame(unit))
-        return Part((unit.left, unit.top), (unit.width, unit.width), unit.heights, unit.datum, faces)
+        return TerrainPart((unit.left, unit.top), (unit.width, unit.width), unit.heights, unit.datum, faces)
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Heights at points of the model's CRS."""

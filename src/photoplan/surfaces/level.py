@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.lattice import Lattice
-from photoplan.surfaces.rays import Hits, Part, follow
+from photoplan.surfaces.rays import Hits, TerrainPart, follow
 from photoplan.targets.base import Target
 
 
@@ -72,9 +72,9 @@ class LevelParts:
         """The height, twice."""
         return np.full(2, self.surface.height)
 
-    def part(self, column: int, row: int) -> Part:
+    def part(self, column: int, row: int) -> TerrainPart:
         """The mesh."""
-        return Part(self.corner, self.step, np.zeros((2, 2), np.float32), self.surface.height)
+        return TerrainPart(self.corner, self.step, np.zeros((2, 2), np.float32), self.surface.height)
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """The height at points."""

@@ -17,7 +17,7 @@ from photoplan.surfaces.carried import box_points, carried_positions
 from photoplan.surfaces.columns import follow_fan
 from photoplan.surfaces.grid_ranges import GridRanges, HeightGrid, RangeStore
 from photoplan.surfaces.lattice import Lattice
-from photoplan.surfaces.rays import Cache, Hits, Part, carried_hits
+from photoplan.surfaces.rays import Cache, Hits, TerrainPart, carried_hits
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
@@ -286,7 +286,7 @@ class RasterParts:
         posts = np.stack([col - 1, row - 1, col + self.side, row + self.side], axis=1)
         return self.surface._ranges.of(np.clip(posts, 0, np.tile(self.surface.grid.size, 2)), learn)
 
-    def part(self, column: int, row: int) -> Part | None:
+    def part(self, column: int, row: int) -> TerrainPart | None:
         """A part; None if it has no ground."""
         s, side = self.surface, self.side
         (columns, rows), col, top = s.grid.size, column * side - 1, row * side - 1
@@ -300,7 +300,7 @@ class RasterParts:
         if any(beyond) or col < 0 or top < 0:
             posts = np.pad(posts, ((upper - top, int(beyond[0])), (left - col, int(beyond[1]))), mode="edge")
         corner = s.origin[0] + col * s.mesh[0], s.origin[1] - top * s.mesh[1]
-        return Part(corner, s.mesh, posts)
+        return TerrainPart(corner, s.mesh, posts)
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Heights at points of the grid's CRS."""

@@ -62,7 +62,7 @@ class Hits:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class TerrainPart:
     """Posts of a part of the terrain, ready for rays."""
 
     corner: tuple[float, float]
@@ -86,12 +86,12 @@ class Part:
         return 4 * self.posts.nbytes + self.faces[0].nbytes + self.faces[1].nbytes + self.faces[2].nbytes
 
 
-Cache = OrderedDict[tuple[int, int], "Part | None"]
+Cache = OrderedDict[tuple[int, int], "TerrainPart | None"]
 """Parts that were used last. Threads may share one: two that want one part at once both make it."""
 Carry = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-class Parts(Protocol):
+class TerrainParts(Protocol):
     """Terrain in rectangular parts, row by row from north to south."""
 
     @property
@@ -117,7 +117,7 @@ class Parts(Protocol):
         """Bounds of a part, found out now if they were not known, shape (2,): NaN: no ground."""
         ...
 
-    def part(self, column: int, row: int) -> Part | None:
+    def part(self, column: int, row: int) -> TerrainPart | None:
         """A part; None if it has no ground."""
         ...
 
@@ -169,7 +169,7 @@ def bent(paths: NDArray[np.float64], bend: float) -> NDArray[np.float64]:
     return out
 
 
-def follow(parts: Parts, paths: ArrayLike, bend: float = 0.0, cache: Cache | None = None) -> Hits:
+def follow(parts: TerrainParts, paths: ArrayLike, bend: float = 0.0, cache: Cache | None = None) -> Hits:
     """First hits of rays over terrain in parts, with parts that are kept from the last time; see `Terrain.first_hit`.
 
     Raises
@@ -197,7 +197,7 @@ def follow(parts: Parts, paths: ArrayLike, bend: float = 0.0, cache: Cache | Non
 
 
 def carried_hits(
-    parts: Parts,
+    parts: TerrainParts,
     paths: NDArray[np.float64],
     carry: Carry | None,
     bend: float,
@@ -242,7 +242,7 @@ class Walk(Protocol):
         """Fill in the part that each of some rays has to be followed over next: see `kernels.raywalk.next_part`."""
         ...
 
-    def over(self, part: Part, group: NDArray[np.int64]) -> None:
+    def over(self, part: TerrainPart, group: NDArray[np.int64]) -> None:
         """Follow some rays over a part."""
         ...
 
@@ -255,7 +255,7 @@ class Walk(Protocol):
 class _Rays:
     """One piece of all rays, as far as the first hit: see `kernels.raywalk`."""
 
-    parts: Parts
+    parts: TerrainParts
     lines: NDArray[np.float64]
     rays: NDArray[np.float64]
     states: NDArray[np.int64]
@@ -270,7 +270,7 @@ class _Rays:
     ) -> None:
         next_part(*ranges, first, self.rays, self.states, which, places)
 
-    def over(self, part: Part, group: NDArray[np.int64]) -> None:
+    def over(self, part: TerrainPart, group: NDArray[np.int64]) -> None:
         hits, states = self.hits, self.states
         asks = follow_part(part.posts, part.pyramid, part.faces, (*part.corner, *part.mesh, part.datum),
                            self.lines, self.rays, states, hits.result, hits.normal, group)  # fmt: skip
@@ -284,7 +284,7 @@ class _Rays:
 
 
 def over_parts(
-    parts: Parts, box: tuple[float, float, float, float], which: NDArray[np.int64], walk: Walk, cache: Cache
+    parts: TerrainParts, box: tuple[float, float, float, float], which: NDArray[np.int64], walk: Walk, cache: Cache
 ) -> None:
     """Follow rays from part to part inside lowest x, y and highest x, y, counted in parts; parts may be kept."""
     window = _window(parts, box)
@@ -310,7 +310,7 @@ def over_parts(
         which = which[(places >= 0) & walk.going(which)]
 
 
-def _window(parts: Parts, box: tuple[float, float, float, float]) -> Window:
+def _window(parts: TerrainParts, box: tuple[float, float, float, float]) -> Window:
     """The parts that rays between lowest x, y and highest x, y, counted in parts, may touch."""
     columns = round((parts.inside[2] - parts.corner[0]) / parts.step[0] + 0.4999999)
     rows = round((parts.corner[1] - parts.inside[1]) / parts.step[1] + 0.4999999)
@@ -328,7 +328,7 @@ def _groups(which: NDArray[np.int64], places: NDArray[np.int64]) -> Iterator[tup
         yield which[order[start:end]], int(ordered[start])
 
 
-def _kept(parts: Parts, at: tuple[int, int], cache: Cache) -> Part | None:
+def _kept(parts: TerrainParts, at: tuple[int, int], cache: Cache) -> TerrainPart | None:
     """A part, from the cache if it is there; parts used longest ago are forgotten."""
     with suppress(KeyError):
         cache.move_to_end(at)
@@ -340,7 +340,7 @@ def _kept(parts: Parts, at: tuple[int, int], cache: Cache) -> Part | None:
     return part
 
 
-def _before(parts: Parts, lines: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.int64]:
+def _before(parts: TerrainParts, lines: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.int64]:
     """Whether there was ground just before the places at t: the state of rays that are below ground there."""
     back = lines[:, 3:5] / (np.hypot(lines[:, 3], lines[:, 4])[:, None] + 1e-300) * _BEFORE
     ground = parts.heights(lines[:, :2] + t[:, None] * lines[:, 3:5] - back)

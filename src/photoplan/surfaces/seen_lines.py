@@ -66,7 +66,7 @@ class SeenPoints:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class LinesOfSight:
     """What asks whether places are seen in a view."""
 
     target: ViewTarget

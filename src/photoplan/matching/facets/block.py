@@ -48,7 +48,7 @@ _QUIET = 1e-4
 
 
 @dataclass(eq=False)
-class Block:
+class FacetBlock:
     """A level of a block while it is adjusted."""
 
     facets: Facets

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from photoplan.geometry.grid import Window
 from photoplan.kernels.facets_grey import OFFSETS, add_grey, sample_grey
 from photoplan.kernels.facets_residuals import add_residuals, sample_slopes
-from photoplan.matching.facets.block import Block, means_around, smoothed, solved_exactly
+from photoplan.matching.facets.block import FacetBlock, means_around, smoothed, solved_exactly
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
@@ -19,7 +19,7 @@ _PATCH = 17
 _LEAST = 0.1
 
 
-def grey_places(block: Block, window: Window, margin: int) -> _Doubles:
+def grey_places(block: FacetBlock, window: Window, margin: int) -> _Doubles:
     """Places of the grey values of a window, which begins `margin` posts inside a block, in columns and rows of its
     posts; shape (m · rows, m · columns, 2)."""
     m = block.facets.ratio
@@ -28,7 +28,7 @@ def grey_places(block: Block, window: Window, margin: int) -> _Doubles:
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
-def grey_sigmas(block: Block, at: _Doubles, height_variances: _Doubles) -> _Floats:
+def grey_sigmas(block: FacetBlock, at: _Doubles, height_variances: _Doubles) -> _Floats:
     """Standard deviations of grey values at places (n, m, 2) of a grid.
 
     Errors of the pixels are drawn and carried through the normal equations: what comes out has the covariance of the
@@ -70,7 +70,7 @@ def grey_sigmas(block: Block, at: _Doubles, height_variances: _Doubles) -> _Floa
     return np.sqrt(times * single + beside**2 * height_variances).astype(np.float32)
 
 
-def fit(block: Block) -> _Doubles:
+def fit(block: FacetBlock) -> _Doubles:
     """Root mean square of the standardised residuals around each post, shape (rows, columns); NaN without pixels.
 
     1 is what is expected: squares are divided by the redundancy, what grey values and height take of the pixels.
@@ -84,7 +84,7 @@ def fit(block: Block) -> _Doubles:
         return np.where(sums[..., 0] > 0, np.sqrt(squares / free), np.nan)
 
 
-def edge_variances(block: Block) -> _Doubles:
+def edge_variances(block: FacetBlock) -> _Doubles:
     """Variances of heights beside edges, shape (rows, columns), m²; 0 elsewhere.
 
     Where neighbours part by more parallax than lies between them, not all images see the facet that joins them (a
@@ -102,7 +102,7 @@ def edge_variances(block: Block) -> _Doubles:
     return out
 
 
-def residual_pictures(block: Block) -> list[_Floats]:
+def residual_pictures(block: FacetBlock) -> list[_Floats]:
     """Mean standardised residual of each view's pixels in every grey value's cell, shape (m · rows, m · columns); NaN
     without pixels. The first cell is that of the first post less half a facet."""
     m, pictures = block.facets.ratio, []
@@ -114,7 +114,7 @@ def residual_pictures(block: Block) -> list[_Floats]:
     return pictures
 
 
-def standardised(block: Block) -> list[_Floats]:
+def standardised(block: FacetBlock) -> list[_Floats]:
     """Residuals of every view's pixels, the surface's grey value less theirs, in their standard deviations; NaN: not
     used."""
     grey, weights = block.observed()

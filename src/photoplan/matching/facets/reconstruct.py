@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.matching.facets.block import Block
+from photoplan.matching.facets.block import FacetBlock
 from photoplan.matching.facets.curvature import Roughness
 from photoplan.matching.facets.judged import edge_variances, fit, grey_places, grey_sigmas, residual_pictures
 from photoplan.matching.facets.observe import MARGIN, Facets, Sight, View, facets_of, look
@@ -112,7 +112,7 @@ def reconstruct(
     Found or None
         None: fewer than two images see any of it, or the start knows no height here.
     """
-    block: Block | None = None
+    block: FacetBlock | None = None
     found: Searched | None = None
     reach = scheme.reach
     if scheme.search is not None:
@@ -147,7 +147,9 @@ def reconstruct(
     return made if found is None else _doubting(made, found, window, scheme)
 
 
-def _opened(views: Sequence[View], level: int, facets: Facets, heights: _Doubles, before: Block | None) -> Block | None:
+def _opened(
+    views: Sequence[View], level: int, facets: Facets, heights: _Doubles, before: FacetBlock | None
+) -> FacetBlock | None:
     """A block at the start of a level; None if fewer than two views see it."""
     span = float(heights.min()), float(heights.max())
     sights: list[Sight] = []
@@ -164,7 +166,7 @@ def _opened(views: Sequence[View], level: int, facets: Facets, heights: _Doubles
     if len(sights) < 2:
         return None
     transfers, sigmas = _radiometry(own, sights, facets, before)
-    block = Block(facets, sights, transfers, heights, Roughness.uniform(facets.shape, 1.0), sigmas)
+    block = FacetBlock(facets, sights, transfers, heights, Roughness.uniform(facets.shape, 1.0), sigmas)
     block.views, block.scale = own, block.parallax()
     # Loose until it is estimated: from a stiff start, what does not fit would be taken for noise. Curvatures over twice
     # the distance are larger than those to be estimated.
@@ -176,7 +178,7 @@ def _opened(views: Sequence[View], level: int, facets: Facets, heights: _Doubles
     return block
 
 
-def _lifted(block: Block, reach: float) -> _Doubles:
+def _lifted(block: FacetBlock, reach: float) -> _Doubles:
     """The start, lifted or lowered as a whole by what fits best within its reach."""
     pixel = 1.0 / block.scale
     count = min(_MOST_TRIALS, int(np.ceil(reach / (_TRIAL * pixel) - 0.5)))
@@ -189,14 +191,14 @@ def _lifted(block: Block, reach: float) -> _Doubles:
     return lifted[best if misfits[best] < _BETTER * misfits[0] else 0]
 
 
-def _room(view: View, facets: Facets, span: tuple[float, float], before: Block | None) -> float:
+def _room(view: View, facets: Facets, span: tuple[float, float], before: FacetBlock | None) -> float:
     """How far the surface may still move on a level, metres."""
     distance = abs(float(view.camera.vantage.point[2]) - sum(span) / 2)
     return _ROOM * facets.pitch / facets.ratio + (_FAR * distance if before is None else 0.0)
 
 
 def _radiometry(
-    views: Sequence[View], sights: Sequence[Sight], facets: Facets, before: Block | None
+    views: Sequence[View], sights: Sequence[Sight], facets: Facets, before: FacetBlock | None
 ) -> tuple[list[Transfer], _Doubles]:
     """Transfer parameters and noise of the level before; of views that it did not have, guesses."""
     guesses = first_guess(sights, facets)
@@ -227,7 +229,7 @@ def _limits(
     return np.nan_to_num(begun - room, nan=-np.inf), np.nan_to_num(begun + room, nan=np.inf)
 
 
-def _finer(block: Block, facets: Facets, start: Callable[[_Doubles], _Doubles]) -> _Doubles:
+def _finer(block: FacetBlock, facets: Facets, start: Callable[[_Doubles], _Doubles]) -> _Doubles:
     """Heights of the level before at the posts of finer facets, bilinear, with what the start has between its posts;
     beyond the border those of the border.
 
@@ -239,7 +241,7 @@ def _finer(block: Block, facets: Facets, start: Callable[[_Doubles], _Doubles]) 
 
 
 def _found(
-    block: Block, views: Sequence[View], window: Window, moves: tuple[float, ...], residuals: bool = False
+    block: FacetBlock, views: Sequence[View], window: Window, moves: tuple[float, ...], residuals: bool = False
 ) -> Found:
     """What a block holds of its window."""
     variance = block.variances()

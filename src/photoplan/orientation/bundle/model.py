@@ -27,7 +27,7 @@ _Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Parts:
+class RowParts:
     """Where the kinds of observations stand in the vector of rows."""
 
     image: slice
@@ -94,13 +94,13 @@ class Model:
     """What is known beforehand: key and parameter of the unknown, value, standard deviation."""
 
     @cached_property
-    def parts(self) -> Parts:
+    def parts(self) -> RowParts:
         """Where the kinds of observations stand."""
         smooth = sum(each.known.shape[0] for each in self.sets)
         known = len(self.known), smooth
         sizes = (2 * len(self.image), len(self.ground), 3 * len(self.position), 3 * len(self.attitude), *known)
         ends = np.cumsum(sizes).tolist()
-        return Parts(*(slice(end - size, end) for end, size in zip(ends, sizes)))
+        return RowParts(*(slice(end - size, end) for end, size in zip(ends, sizes)))
 
     @property
     def rows(self) -> int:

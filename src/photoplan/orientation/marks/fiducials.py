@@ -15,7 +15,7 @@ from photoplan.orientation.marks.found import FiducialResult, LocatedMark, Marks
 from photoplan.orientation.marks.layout import TURNS, MarkLayout, MarkPlacement, ScanTurn
 from photoplan.orientation.marks.locate import LEAST_CORRELATION, Location
 from photoplan.orientation.marks.measure import Measured, measure_marks
-from photoplan.orientation.marks.search import Scan, Search, pixel_sizes, search_placements
+from photoplan.orientation.marks.search import MarkSearch, Scan, pixel_sizes, search_placements
 
 TIE = 0.03
 """Correlation per mark below which two ways of turning the scan fit equally well."""
@@ -129,12 +129,12 @@ def _search(
     notes: list[str] = []
     if known.pixel_mm is not None:
         found = search_placements(
-            Search(scan=scan, layout=layout, turns=turns, negatives=negatives, scale_tolerance=STATED_TOLERANCE),
+            MarkSearch(scan=scan, layout=layout, turns=turns, negatives=negatives, scale_tolerance=STATED_TOLERANCE),
             [known.pixel_mm],
         )
         if not everywhere or (found and _convincing(found[0], layout)):
             return found, notes
-    wide = search_placements(Search(scan, layout, turns, negatives), pixel_sizes(layout, scan.size))
+    wide = search_placements(MarkSearch(scan, layout, turns, negatives), pixel_sizes(layout, scan.size))
     if known.pixel_mm is not None and not (wide and _convincing(wide[0], layout)):
         return found or wide, []
     if known.pixel_mm is not None and abs(math.log(wide[0].pixel_mm / known.pixel_mm)) > STATED_TOLERANCE:
@@ -352,7 +352,7 @@ def _better_turn(scan: Scan, layout: MarkLayout, known: FiducialSearch, measured
     )
     if not excluded:
         return None
-    search = Search(
+    search = MarkSearch(
         scan=scan,
         layout=layout,
         turns=excluded,

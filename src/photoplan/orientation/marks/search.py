@@ -47,7 +47,7 @@ class Scan(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class MarkSearch:
     """What is sought in which scan."""
 
     scan: Scan
@@ -74,7 +74,7 @@ def pixel_sizes(layout: MarkLayout, size: tuple[int, int]) -> tuple[float, ...]:
     return tuple(short * w / min(size) for w in sorted(wider, key=lambda w: abs(math.log(w / USUAL))))
 
 
-def search_placements(search: Search, pixels_mm: Sequence[float]) -> list[MarkPlacement]:
+def search_placements(search: MarkSearch, pixels_mm: Sequence[float]) -> list[MarkPlacement]:
     """The best placement for every turn and tone, best first.
 
     Parameters
@@ -125,7 +125,7 @@ def _side(pattern: MarkPattern | MarkExample) -> float:
     return min(x1 - x0, y1 - y0)
 
 
-def _surface(search: Search, k: int, turn: ScanTurn, pixel_mm: float, factor: int) -> _Surface | None:
+def _surface(search: MarkSearch, k: int, turn: ScanTurn, pixel_mm: float, factor: int) -> _Surface | None:
     """Correlation of mark k with all places where it may lie; None: nowhere."""
     index, template = _template(search, search.layout.patterns[k], turn, pixel_mm * factor)
     region = _region(search, k, turn, pixel_mm, factor)
@@ -145,7 +145,7 @@ def _surface(search: Search, k: int, turn: ScanTurn, pixel_mm: float, factor: in
 
 
 def _template(
-    search: Search, pattern: MarkPattern | MarkExample, turn: ScanTurn, coarse_mm: float
+    search: MarkSearch, pattern: MarkPattern | MarkExample, turn: ScanTurn, coarse_mm: float
 ) -> tuple[int, Template]:
     """Number and template of a pattern; turns that leave it as it is share one."""
     made = draw(pattern, turn.matrix / coarse_mm, blur_px=0.7)
@@ -157,7 +157,7 @@ def _template(
     return len(search._templates) - 1, made
 
 
-def _region(search: Search, k: int, turn: ScanTurn, pixel_mm: float, factor: int) -> Window | None:
+def _region(search: MarkSearch, k: int, turn: ScanTurn, pixel_mm: float, factor: int) -> Window | None:
     """Coarse pixels where mark k may lie if all marks lie in the scan, turned by a few degrees; None: nowhere."""
     places = search.layout.mm @ turn.matrix.T / pixel_mm
     low, high = places.min(axis=0), places.max(axis=0)

@@ -18,7 +18,7 @@ from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.bundle.block import BlockCamera
-from photoplan.orientation.intersection import Rays, intersect
+from photoplan.orientation.intersection import MeasuredRays, intersect
 from photoplan.orientation.resection.direct import polished_pose, reprojected, resect_direct
 from photoplan.orientation.start.relative import RelativeOrientation, relate
 
@@ -140,7 +140,7 @@ def looseness(net: Net, model: StartModel) -> float:
         return 1.0
     image, point, sigma = place[net.image[rays]], net.point[rays], np.repeat(net.sigma[rays, None], 2, axis=1)
     poses = [model.poses[k] for k in numbers]
-    XYZ = intersect(poses, Rays(image, point, net.tangents[rays], sigma), len(net.points), critical=np.inf).XYZ
+    XYZ = intersect(poses, MeasuredRays(image, point, net.tangents[rays], sigma), len(net.points), critical=np.inf).XYZ
     miss = np.full(len(rays), np.nan)
     for k, pose in enumerate(poses):
         mine = image == k
@@ -163,7 +163,7 @@ def _intersected(net: Net, model: StartModel, loose: float, fixed: bool) -> None
     sigma = np.repeat(net.sigma[rays, None], 2, axis=1) * (_SLACK * loose)
     found = intersect(
         [model.poses[k] for k in numbers],
-        Rays(place[net.image[rays]], net.point[rays], net.tangents[rays], sigma),
+        MeasuredRays(place[net.image[rays]], net.point[rays], net.tangents[rays], sigma),
         len(net.points),
         min_angle=0.02,
     )

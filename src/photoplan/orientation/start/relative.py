@@ -13,7 +13,7 @@ from photoplan.adjustment.robust import huber
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import small_rotations
-from photoplan.orientation.intersection import Rays, intersect
+from photoplan.orientation.intersection import MeasuredRays, intersect
 
 Array = NDArray[np.float64]
 
@@ -192,7 +192,7 @@ def _refined(pose: Pose, a: Array, b: Array, limit: float) -> Pose:
 def _completed(pose: Pose, a: Array, b: Array, inliers: NDArray[np.bool_], sigma: float) -> RelativeOrientation:
     """Result with the points of the model."""
     n = len(a)
-    rays = Rays(
+    rays = MeasuredRays(
         np.repeat([0, 1], n), np.tile(np.arange(n), 2), np.concatenate([a[:, :2], b[:, :2]]), np.full((1, 2), sigma)
     )
     model = intersect([Pose(np.zeros(3), np.eye(3)), pose], rays, n, critical=6.0, min_angle=1e-4)

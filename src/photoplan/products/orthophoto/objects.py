@@ -14,7 +14,7 @@ from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Objects, Project
-from photoplan.plan.footprint import View, covered_tiles
+from photoplan.plan.footprint import ImageExtent, covered_tiles
 from photoplan.plan.tiles import Tiles
 from photoplan.products.orthophoto.keys import keyed
 from photoplan.products.orthophoto.look import Looked, extent_text, look_at, with_resolution
@@ -189,7 +189,7 @@ def _near(found: Sequence[_Single], looked: Sequence[Looked]) -> list[list[int]]
     low, high = float(np.nanmin(ranges)), float(np.nanmax(ranges))
     near: list[list[int]] = [[] for _ in found]
     for place, each in enumerate(looked):
-        view = View.of(each.scene.camera, low, high)
+        view = ImageExtent.of(each.scene.camera, low, high)
         for k in [] if view is None else np.flatnonzero(view.sees(boxes, ranges)):
             near[k].append(place)
     return near

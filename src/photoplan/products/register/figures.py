@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photoplan.adjustment.linear import solve
 from photoplan.adjustment.robust import huber
-from photoplan.matching.register import FOUND, STATES, Displacements
+from photoplan.matching.register import FOUND, STATES, PatchDisplacements
 from photoplan.plain import pick
 
 _Floats = NDArray[np.float64]
@@ -89,7 +89,7 @@ class SmoothModel:
         return {**pick(self, "kind", "middle", rms_px="rms"), **axes}
 
 
-def figures_of(found: Displacements) -> RegisterFigures:
+def figures_of(found: PatchDisplacements) -> RegisterFigures:
     """Figures of the vectors that were found; there is one at least."""
     good = found.state == FOUND
     d, length = found.moved[good], np.linalg.norm(found.moved[good], axis=1)
@@ -120,7 +120,7 @@ def _columns(at: _Floats, middle: tuple[float, float], unknowns: int) -> _Floats
     return np.column_stack([np.ones(len(off)), off])[:, :unknowns]
 
 
-def fit_smooth(found: Displacements, kind: str, overlap: float) -> SmoothModel | None:
+def fit_smooth(found: PatchDisplacements, kind: str, overlap: float) -> SmoothModel | None:
     """A shift or an affine mapping through the vectors by robust least squares; None for the kind `none`.
 
     Parameters

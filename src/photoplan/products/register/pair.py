@@ -13,7 +13,7 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
 from photoplan.matching.grey import GreyImage
-from photoplan.matching.register import Transfer
+from photoplan.matching.register import PixelTransfer
 from photoplan.products.orthophoto.look import extent_text
 
 #: Pixels of one image may be so much larger than those of the other.
@@ -26,7 +26,7 @@ class Pair:
 
     paths: tuple[Path, Path]
     images: tuple[GreyImage, GreyImage]
-    transfer: Transfer
+    transfer: PixelTransfer
     """From pixels of the first to pixels of the second image."""
     common: Window
     """Pixels of the first image that may have a partner."""
@@ -74,7 +74,7 @@ def open_pair(first: Path, second: Path) -> Pair:
         if a.to_map is not b.to_map:
             alone = second if b.to_map is None else first
             notes.append(f"{alone.name} has no place on a map: the images are compared pixel by pixel")
-        to_map, transfer = None, Transfer()
+        to_map, transfer = None, PixelTransfer()
     else:
         to_map, transfer = a.to_map, _between(a, b, notes)
     return Pair(
@@ -88,7 +88,7 @@ def open_pair(first: Path, second: Path) -> Pair:
     )
 
 
-def _between(a: RasterInfo, b: RasterInfo, notes: list[str]) -> Transfer:
+def _between(a: RasterInfo, b: RasterInfo, notes: list[str]) -> PixelTransfer:
     """By the places of both on the map."""
     assert a.to_map is not None and b.to_map is not None
     if a.crs is not None and b.crs is not None and not same_crs(a.crs, b.crs):
@@ -111,10 +111,10 @@ def _between(a: RasterInfo, b: RasterInfo, notes: list[str]) -> Transfer:
     L = np.where(np.abs(L - np.rint(L)) < 1e-9, np.rint(L), L)
     t = np.where(np.abs(t - np.rint(t)) < 1e-6, np.rint(t), t)
     a0, a1, a2, a3 = L.reshape(-1).tolist()
-    return Transfer((a0, a1, a2, a3), (float(t[0]), float(t[1])))
+    return PixelTransfer((a0, a1, a2, a3), (float(t[0]), float(t[1])))
 
 
-def _common(a: RasterInfo, b: RasterInfo, transfer: Transfer, placed: bool) -> Window:
+def _common(a: RasterInfo, b: RasterInfo, transfer: PixelTransfer, placed: bool) -> Window:
     width, height = b.size
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)
     back = (corners - np.array(transfer.shift)) @ np.linalg.inv(transfer.L).T

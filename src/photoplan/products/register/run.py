@@ -22,7 +22,7 @@ from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import recording, run_key, settings_of
 from photoplan.io.tables import write_table
-from photoplan.matching.register import FOUND, STATES, Displacements, PatchSettings, contradicting, match_grid
+from photoplan.matching.register import FOUND, STATES, PatchDisplacements, PatchSettings, contradicting, match_grid
 from photoplan.plain import pick
 from photoplan.products.register.figures import MODELS, RegisterFigures, SmoothModel, figures_of, fit_smooth
 from photoplan.products.register.pair import Pair, open_pair
@@ -110,7 +110,7 @@ class RegisterReport:
     step: int
     figures: RegisterFigures | None
     model: SmoothModel | None
-    found: Displacements | None
+    found: PatchDisplacements | None
 
     def json_fields(self) -> dict[str, Any]:
         """Figures, without the vectors."""
@@ -216,7 +216,9 @@ def _grid(pair: Pair, request: RegisterRequest) -> PatchGrid:
     return PatchGrid(columns, rows)
 
 
-def _together(parts: Sequence[Displacements], tiles: Sequence[tuple[slice, slice]], grid: PatchGrid) -> Displacements:
+def _together(
+    parts: Sequence[PatchDisplacements], tiles: Sequence[tuple[slice, slice]], grid: PatchGrid
+) -> PatchDisplacements:
     """Vectors of all tiles as one grid, row by row."""
     rows, columns = grid.shape
     number = np.arange(rows * columns).reshape(rows, columns)
@@ -225,7 +227,7 @@ def _together(parts: Sequence[Displacements], tiles: Sequence[tuple[slice, slice
     def of(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(part, name) for part in parts])[order]
 
-    return Displacements(
+    return PatchDisplacements(
         at=of("at"),
         moved=of("moved"),
         covariance=of("covariance"),
@@ -235,7 +237,7 @@ def _together(parts: Sequence[Displacements], tiles: Sequence[tuple[slice, slice
     )
 
 
-def _nothing(found: Displacements, request: RegisterRequest) -> str:
+def _nothing(found: PatchDisplacements, request: RegisterRequest) -> str:
     """Why there is no vector."""
     counts = np.bincount(found.state, minlength=len(STATES))
     listed = ", ".join(f"{count} {name}" for name, count in zip(STATES, counts.tolist()) if count)
@@ -249,7 +251,7 @@ def _nothing(found: Displacements, request: RegisterRequest) -> str:
     return f"no patch of {request.first} was found in {request.second}: {listed}; {advice.get(worst, '')}"
 
 
-def _write(request: RegisterRequest, pair: Pair, found: Displacements) -> None:
+def _write(request: RegisterRequest, pair: Pair, found: PatchDisplacements) -> None:
     """GeoPackage and table of all patches."""
     names = np.array(STATES)[found.state]
     sigma = found.sigma

@@ -73,7 +73,7 @@ def filter_figures(filter_: RestorationFilter) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Corrections:
+class OpticalCorrections:
     """What is corrected before the filter: light fall-off, then lateral chromatic aberration."""
 
     fall_off: FallOffFile | None
@@ -81,7 +81,7 @@ class Corrections:
     light: Linearisation
 
     @classmethod
-    def of(cls, request: RestoreRequest, light: Linearisation) -> Corrections:
+    def of(cls, request: RestoreRequest, light: Linearisation) -> OpticalCorrections:
         """Those that are asked for, their files read."""
         fall_off = None if request.fall_off is None else load_fall_off(request.fall_off)
         model = load_chromatic(request.chromatic) if isinstance(request.chromatic, Path) else request.chromatic
@@ -127,7 +127,7 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
     filter_ = load_filter(given) if isinstance(given, Path) else given
     text = filter_text(entries_of(filter_))
     light = linearisation_of(request.linearisation)
-    corrections = Corrections.of(request, light)
+    corrections = OpticalCorrections.of(request, light)
     files = [path.resolve() for path in request.images]
     twice = [path for path in files if files.count(path) > 1]
     if twice:

@@ -33,7 +33,7 @@ from photoplan.products.orthophoto.shown import shown
 from photoplan.products.run import BASE_MEMORY, question
 from photoplan.project.scene import SceneAddress, input_files
 from photoplan.radiometry.seams import find_seams, without_overlap
-from photoplan.radiometry.shown import Features, Layer, Shown, Store, features_of
+from photoplan.radiometry.shown import ArrayStore, SeamFeatures, SeamLayer, Shown, features_of
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
 
@@ -147,10 +147,10 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
 
 def _read(
     request: SeamsRequest, found: Survey, images: Sequence[_Image], log: ResultLog, events: Events
-) -> list[tuple[Layer, ...] | float | None]:
+) -> list[tuple[SeamLayer, ...] | float | None]:
     """What all images show, in the log."""
 
-    def kept(made: tuple[Features, ...] | float | None) -> tuple[Layer, ...] | float | None:
+    def kept(made: tuple[SeamFeatures, ...] | float | None) -> tuple[SeamLayer, ...] | float | None:
         return tuple(each.kept(log) for each in made) if isinstance(made, tuple) else made
 
     events.begin("reading", len(found.looked), "images")
@@ -165,8 +165,8 @@ def _read(
 def _seams(
     request: SeamsRequest,
     found: Survey,
-    images: Sequence[tuple[Layer, ...] | float | None],
-    store: Store,
+    images: Sequence[tuple[SeamLayer, ...] | float | None],
+    store: ArrayStore,
     run: Steps,
     events: Events,
     notes: Sequence[str],
@@ -184,7 +184,7 @@ def _seams(
     return labels, (halfway, best)
 
 
-def _odd(found: Survey, images: Sequence[tuple[Layer, ...] | float | None], store: Store) -> tuple[str, ...]:
+def _odd(found: Survey, images: Sequence[tuple[SeamLayer, ...] | float | None], store: ArrayStore) -> tuple[str, ...]:
     """A line for each image that has no seam: all of one colour, or without another beside it."""
     notes, shape = [], (found.grid.height, found.grid.width)
     alone = without_overlap([each if isinstance(each, tuple) else () for each in images], store, shape)
@@ -218,7 +218,7 @@ class _Map:
     side: int
     """Of the map's tiles, pixels."""
 
-    def __call__(self, one: _Image) -> tuple[Features, ...] | float | None:
+    def __call__(self, one: _Image) -> tuple[SeamFeatures, ...] | float | None:
         """All that it shows, tile by tile, put together; one grey value if it has no other; None: it shows nothing."""
         if not one.windows:
             return None

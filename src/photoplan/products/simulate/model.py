@@ -22,7 +22,7 @@ from photoplan.errors import InputError
 from photoplan.io.camera.model import Entry, Number
 from photoplan.io.plain_files import read_entries
 from photoplan.io.whole_image import write_whole_image
-from photoplan.quality.formation.model import Frame, ImageModel, exposed, frame_light
+from photoplan.quality.formation.model import FormedFrame, ImageModel, exposed, frame_light
 from photoplan.quality.formation.scenes import LightScene
 
 #: A description with a table of defects for every element of a large sensor stays below.
@@ -143,7 +143,7 @@ def form_frames(
             light = cache(partial(sampled.whole, run(sampled, sampled.tiles, pixels=lambda tile: tile.size)))
         again = store.index(("frame", n)) in store.finished and not is_kept(store, n, path)
         name = ("frame", n, "again") if again else ("frame", n)
-        ((own, gain, facts),) = run(partial(_write, model, light, path, how), [Frame(n, exposure, gain)], [name])
+        ((own, gain, facts),) = run(partial(_write, model, light, path, how), [FormedFrame(n, exposure, gain)], [name])
         images.append(SimulatedImage(path=path, frame=n, exposure=exposure, gain=own, facts=facts))
     return images
 
@@ -153,7 +153,7 @@ def _write(
     light: Callable[[], NDArray[np.float64]],
     path: Path,
     how: tuple[str, Mapping[str, str]],
-    frame: Frame,
+    frame: FormedFrame,
 ) -> tuple[float, float, dict[str, object]]:
     """Expose and write a frame; its gain, that of the next one, and what is known of it."""
     made = exposed(model, light(), frame)

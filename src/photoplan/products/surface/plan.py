@@ -23,7 +23,7 @@ from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.matching.facets.search import Planes, Search
 from photoplan.plain import pick
 from photoplan.products.orthophoto.look import extent_text
-from photoplan.products.surface.target import Bounds, Seen, frame_of, over_frame, over_map
+from photoplan.products.surface.target import Bounds, SeenTarget, frame_of, over_frame, over_map
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.scenes import ScenesAddress
 
@@ -298,7 +298,7 @@ def _inside(frame: Frame, start: float, reach: float, stated: float | None) -> f
     return min(reach, most)
 
 
-def _bounds(settings: SurfaceSettings, looked: Sequence[Seen], blind: Sequence[str]) -> Bounds:
+def _bounds(settings: SurfaceSettings, looked: Sequence[SeenTarget], blind: Sequence[str]) -> Bounds:
     """The bounds that were chosen, or around all that two images see by their footprints."""
     seen = [one.bounds for one in looked]
     common = []
@@ -324,7 +324,7 @@ def _bounds(settings: SurfaceSettings, looked: Sequence[Seen], blind: Sequence[s
     return b
 
 
-def _heights_of_a_pixel(looked: Sequence[Seen], gsd: float) -> tuple[float, float]:
+def _heights_of_a_pixel(looked: Sequence[SeenTarget], gsd: float) -> tuple[float, float]:
     """Heights that part images by one pixel, GSD · H / B: the outermost, and the usual of those that share enough."""
     rates = []
     for one, other in combinations(looked, 2):
@@ -340,7 +340,7 @@ def _heights_of_a_pixel(looked: Sequence[Seen], gsd: float) -> tuple[float, floa
     return gsd / max(rates), gsd / float(np.median(rates))
 
 
-def _slope(one: Seen, XY: np.ndarray) -> np.ndarray:
+def _slope(one: SeenTarget, XY: np.ndarray) -> np.ndarray:
     """By how much the ground point of a pixel moves on the map per metre of height, at a place, shape (2,)."""
     low, high = one.heights
     level = (low + high) / 2
@@ -348,7 +348,7 @@ def _slope(one: Seen, XY: np.ndarray) -> np.ndarray:
     return np.asarray(-np.linalg.solve(J[:, :2], J[:, 2]))
 
 
-def _flying_height(looked: Sequence[Seen]) -> float:
+def _flying_height(looked: Sequence[SeenTarget]) -> float:
     """Median height of the images above the ground, metres; 0 for satellites, which are too far away for that."""
     heights = []
     for one in looked:
@@ -364,7 +364,7 @@ def _facets(pixels: float, most: int) -> tuple[int, int]:
     return max(1, round(pixels / 2**base)), base
 
 
-def _search(looked: Sequence[Seen], pixels: float, height_error: float, reach: float, most: int) -> Search:
+def _search(looked: Sequence[SeenTarget], pixels: float, height_error: float, reach: float, most: int) -> Search:
     """How heights are searched whose facets have so many pixels of usual images along a side; `most` levels."""
     at = float(np.median([sum(one.heights) / 2 for one in looked]))
     vantages = [one.camera.vantage for one in looked]
@@ -376,7 +376,7 @@ def _search(looked: Sequence[Seen], pixels: float, height_error: float, reach: f
     return Search(Planes(cell, at, ceiling), ratio, base, min(level, most), _ROOM * cell)
 
 
-def _coarsest(reach: float, looked: Sequence[Seen], height_error: float, base: int) -> int:
+def _coarsest(reach: float, looked: Sequence[SeenTarget], height_error: float, base: int) -> int:
     """The level on which a start that is wrong by `reach` is wrong by few pixels, or the images have become small."""
     wanted = math.ceil(math.log2(max(1.0, reach / height_error / _CATCH / 2**base)))
     shortest = min(min(one.camera.size) for one in looked)

@@ -32,7 +32,7 @@ _FORMS = "`map`, `wall:X,Y,Z,AZIMUTH[,TILT]` or `image:NAME[,DISTANCE]`"
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenTarget:
     """What an image sees of a target."""
 
     name: str
@@ -46,12 +46,12 @@ class Seen:
     """Its mean ground sampling distance, metres."""
 
 
-def over_map(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Seen], list[str]]:
+def over_map(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[SeenTarget], list[str]]:
     """Images that see terrain, and a line for each that sees none; see `look_at`."""
     looked, blind = look_at(project, names, force, events)
     prints = [(one, one.look.footprint) for one in looked]
     seen = [
-        Seen(one.name, one.scene.camera, print_.bounds, print_.height_range, one.look.gsd)
+        SeenTarget(one.name, one.scene.camera, print_.bounds, print_.height_range, one.look.gsd)
         for one, print_ in prints
         if print_.bounds is not None
     ]
@@ -60,7 +60,7 @@ def over_map(project: Project, names: Sequence[str], force: bool, events: Events
 
 def over_frame(
     project: Project, names: Sequence[str], frame: Frame, bounds: Bounds, height: float, events: Events
-) -> tuple[list[Seen], list[str]]:
+) -> tuple[list[SeenTarget], list[str]]:
     """Images that see a part of a target at a height, and a line for each that sees none.
 
     Raises
@@ -86,7 +86,7 @@ def over_frame(
             continue
         low, high = uvh[inside, :2].min(axis=0).tolist(), uvh[inside, :2].max(axis=0).tolist()
         areas = np.abs(np.linalg.det(camera.derivatives(uvh[inside])[..., :2]))
-        seen[name] = Seen(name, camera, (*low, *high), (height, height), float(np.mean(areas**-0.5)))
+        seen[name] = SeenTarget(name, camera, (*low, *high), (height, height), float(np.mean(areas**-0.5)))
     if behind == len(names):
         raise GeometryError(
             f"all images stand behind the target at the height {height:g}: the azimuth of a wall is that of its "

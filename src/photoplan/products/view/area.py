@@ -25,7 +25,7 @@ from photoplan.products.view.camera import ViewCamera, view_camera
 from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.job import seen_surface
 from photoplan.products.view.make import ViewRequest, camera_request
-from photoplan.surfaces.seen_lines import Sight
+from photoplan.surfaces.seen_lines import LinesOfSight
 
 #: Side of the windows in which places are asked, pixels.
 TILE = 256
@@ -90,7 +90,7 @@ def visible_area(request: AreaRequest, events: Events = SILENT) -> VisibleArea:
         check_output(output, ground.files, overwrite=request.overwrite)
         camera = view_camera(camera_request(view), ground, view.force)
         grid = _grid(request, ground, camera)
-        sight = Sight(camera.target, seen_surface(ground, view.farthest, view.bound))
+        sight = LinesOfSight(camera.target, seen_surface(ground, view.farthest, view.bound))
         found = _all(partial(window_of_area, sight, grid), grid, request, events)
         result = VisibleArea(
             output,
@@ -106,7 +106,7 @@ def visible_area(request: AreaRequest, events: Events = SILENT) -> VisibleArea:
     return result
 
 
-def window_of_area(sight: Sight, grid: MapGrid, window: Window) -> NDArray[np.uint8]:
+def window_of_area(sight: LinesOfSight, grid: MapGrid, window: Window) -> NDArray[np.uint8]:
     """A window of the map, shape (height, width): `SEEN`, `HIDDEN` or `NO_TERRAIN`."""
     v, u = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].astype(float)
     XY = grid.to_map(np.stack([u, v], axis=-1)).reshape(-1, 2)

@@ -97,7 +97,7 @@ class ContentRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class ViewScene:
     """A part of a view before it has colours."""
 
     target: ViewTarget
@@ -111,7 +111,7 @@ class Scene:
     kernel: str
 
     @classmethod
-    def of(cls, target: ViewTarget, tile: Tile, look: Look, surface: SeenSurface, kernel: str) -> Scene:
+    def of(cls, target: ViewTarget, tile: Tile, look: Look, surface: SeenSurface, kernel: str) -> ViewScene:
         """What a part of a view shows; `look` tells it for a window."""
         window = tile.window
         around = Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2) & target.window
@@ -125,7 +125,7 @@ class Scene:
         return depth[window.slices(around)]
 
 
-class Layer(Protocol):
+class ViewLayer(Protocol):
     """What gives colours to a part of a view."""
 
     @property
@@ -133,7 +133,7 @@ class Layer(Protocol):
         """What it reads."""
         ...
 
-    def paint(self, scene: Scene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
+    def paint(self, scene: ViewScene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
         """Colours with its own over those `under` it, and where it has any."""
         ...
 
@@ -147,8 +147,8 @@ class Shade:
     first: bool
     files: tuple[Path, ...] = ()
 
-    def paint(self, scene: Scene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
-        """See `Layer`."""
+    def paint(self, scene: ViewScene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
+        """See `ViewLayer`."""
         there, light = scene.seen.owner >= 0, illumination(scene.seen.normal, self.light)
         if self.first:
             return np.broadcast_to(255 * light, under.shape).astype(np.float32), there
@@ -163,8 +163,8 @@ class Tint:
     slope: bool = False
     files: tuple[Path, ...] = ()
 
-    def paint(self, scene: Scene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
-        """See `Layer`."""
+    def paint(self, scene: ViewScene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
+        """See `ViewLayer`."""
         seen = scene.seen
         values = np.degrees(np.arccos(np.clip(seen.normal[..., 2], 0, 1))) if self.slope else seen.XYZ[..., 2]
         return self.ramp(values.astype(np.float32)), seen.owner >= 0
@@ -180,8 +180,8 @@ class Resampled:
     """Values that become black and white."""
     photos: bool
 
-    def paint(self, scene: Scene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
-        """See `Layer`."""
+    def paint(self, scene: ViewScene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
+        """See `ViewLayer`."""
         rule = AnchorRule.of(scene.kernel, 0.02, tilted=True)
         rows, window = tuple(range(len(self.sources))), scene.tile.window
         owners = None
@@ -264,7 +264,7 @@ def illumination(normal: NDArray[np.float64], light: Lighting) -> NDArray[np.flo
 
 def open_layers(
     requests: Sequence[ContentRequest], ground: ViewGround, light: Lighting, heights: tuple[float, float]
-) -> tuple[Layer, ...]:
+) -> tuple[ViewLayer, ...]:
     """Contents, ready to paint.
 
     Parameters
@@ -288,7 +288,7 @@ def open_layers(
 
 def _layer(
     request: ContentRequest, first: bool, ground: ViewGround, light: Lighting, heights: tuple[float, float]
-) -> Layer:
+) -> ViewLayer:
     if request.kind == "shade":
         return Shade(light, request.opacity, first)
     if request.kind == "slope":
@@ -321,7 +321,7 @@ def _ramp(text: str, heights: tuple[float, float]) -> Ramp:
     return built_in_ramp(name, low, high)
 
 
-def _raster(path: Path, ground: ViewGround) -> Layer:
+def _raster(path: Path, ground: ViewGround) -> ViewLayer:
     reader = RasterReader(path)
     placement = placement_of(reader.info)
     if placement.transform is None:

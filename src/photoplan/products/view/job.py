@@ -17,10 +17,10 @@ from photoplan.io.fingerprint import fingerprint
 from photoplan.io.matrix_file import MatrixFile
 from photoplan.plan.tiles import Tile
 from photoplan.products.view.camera import CameraRequest, view_camera
-from photoplan.products.view.content import Colours, ContentRequest, Layer, Scene, open_layers
+from photoplan.products.view.content import Colours, ContentRequest, ViewLayer, ViewScene, open_layers
 from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.overlay import Overlay
-from photoplan.products.view.photo import Photo, PhotoRequest
+from photoplan.products.view.photo import PhotoRequest, ViewPhoto
 from photoplan.products.view.stereo import anaglyph
 from photoplan.surfaces.rays import Hits
 from photoplan.surfaces.seen import Seen, SeenSurface, ground_size
@@ -105,10 +105,10 @@ class OpenView:
 
     target: ViewTarget
     surface: SeenSurface
-    layers: tuple[Layer, ...]
+    layers: tuple[ViewLayer, ...]
     light: Lighting
     matrix: MatrixFile | None
-    photo: Photo | None
+    photo: ViewPhoto | None
     water: float | None
     """Height of water, metres."""
 
@@ -128,7 +128,7 @@ def _open(address: ViewAddress) -> OpenView:
     light = Lighting(address.look.azimuth, address.look.altitude, camera.request.exaggeration)
     layers = open_layers(address.look.contents, ground, light, address.heights)
     matrix = None if address.matrix is None else MatrixFile(Path(address.matrix))
-    photo = None if address.look.photo is None else Photo.open(address.look.photo, camera.target.bundle.size)
+    photo = None if address.look.photo is None else ViewPhoto.open(address.look.photo, camera.target.bundle.size)
     surface = seen_surface(ground, address.farthest, address.bound)
     return OpenView(camera.target, surface, layers, light, matrix, photo, ground.water)
 
@@ -216,7 +216,7 @@ class ViewJob:
         for part in window.tiles(-(-max(window.width, window.height) // n)):
             fine = Window(part.col * n, part.row * n, part.width * n, part.height * n)
             look = partial(view.surface.look, target) if view.matrix is None else partial(from_matrix, view)
-            scene = Scene.of(target, Tile(tile.index, fine), look, view.surface, self.address.look.kernel)
+            scene = ViewScene.of(target, Tile(tile.index, fine), look, view.surface, self.address.look.kernel)
             colours = colours_of(scene, view, self.address.look)
             means = colours.reshape(3, part.height, n, part.width, n).mean(axis=(2, 4))
             at = part.slices(window)
@@ -224,7 +224,7 @@ class ViewJob:
             tally.add(_counts(target, scene.seen))
 
 
-def colours_of(scene: Scene, view: OpenView, look: LookRequest) -> Colours:
+def colours_of(scene: ViewScene, view: OpenView, look: LookRequest) -> Colours:
     """Colours of a part of a view: contents one over the other, shadows, haze, sky."""
     seen = scene.seen
     out = np.empty((3, *seen.owner.shape), np.float32)
@@ -252,7 +252,7 @@ def hazy(colours: Colours, distance: NDArray[np.float64], alpha: float, horizon:
     return np.asarray(colours * left + np.array(horizon, np.float32)[:, None, None] * (1 - left))
 
 
-def in_shadow(scene: Scene, light: Lighting) -> NDArray[np.bool_]:
+def in_shadow(scene: ViewScene, light: Lighting) -> NDArray[np.bool_]:
     """Pixels whose ground looks away from the sun, or that something stands before."""
     seen, sun = scene.seen, light.directions[0]
     dark = seen.normal @ sun <= 0

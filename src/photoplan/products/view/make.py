@@ -35,10 +35,10 @@ from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.job import LookRequest, ViewAddress, ViewJob, seen_surface
 from photoplan.products.view.lines import LinesRequest, open_drawing
 from photoplan.products.view.overlay import Lettering, Overlay, overlay
-from photoplan.products.view.photo import Photo
+from photoplan.products.view.photo import ViewPhoto
 from photoplan.products.view.result import ViewResult
 from photoplan.products.view.stereo import Stereo, eyes
-from photoplan.surfaces.seen_lines import Sight
+from photoplan.surfaces.seen_lines import LinesOfSight
 from photoplan.terrain.shading import Lighting
 
 TILE = 512
@@ -165,7 +165,7 @@ def plan_view(request: ViewRequest) -> ViewPlan:
     layers = open_layers(contents, ground, light, heights)
     matrix = None if request.matrix is None else _fitting(request.matrix, camera)
     files = dict.fromkeys([*ground.files, *(f for each in layers for f in each.files)])
-    photo = None if request.look.photo is None else Photo.open(request.look.photo, camera.target.bundle.size)
+    photo = None if request.look.photo is None else ViewPhoto.open(request.look.photo, camera.target.bundle.size)
     files |= {each: None for each in (matrix, None if photo is None else photo.reader.path) if each is not None}
     files |= {each.path: None for each in request.lines if each.path is not None}
     inputs = [input_entry(path) for path in files]
@@ -344,7 +344,7 @@ def draw(plan: ViewPlan, camera: ViewCamera) -> Overlay | None:
     ground = open_view_ground(request.source, request.crs, request.water)
     reach = min(request.farthest, 1.5 * (plan.first.farthest or 0.0) + 1000.0)
     drawing = open_drawing(request.lines, ground, reach, camera.target.center)
-    sight = Sight(camera.target, seen_surface(ground, request.farthest, request.bound))
+    sight = LinesOfSight(camera.target, seen_surface(ground, request.farthest, request.bound))
     return overlay(drawing, sight, request.lettering, request.text_size)
 
 

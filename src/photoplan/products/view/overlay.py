@@ -14,7 +14,7 @@ from scipy.ndimage import maximum_filter
 from photoplan.geometry.grid import Window
 from photoplan.kernels.strokes import draw_strokes
 from photoplan.products.view.lines import Drawing, LineStyle
-from photoplan.surfaces.seen_lines import LIFT_OF_POINTS, SeenLines, Sight
+from photoplan.surfaces.seen_lines import LIFT_OF_POINTS, LinesOfSight, SeenLines
 
 #: Lines are simplified by at most this, pixels.
 _SIMPLER = 0.03
@@ -179,7 +179,7 @@ def dashed(piece: NDArray[np.float64], dash: tuple[float, ...]) -> list[NDArray[
     return out
 
 
-def overlay(drawing: Drawing, sight: Sight, lettering: Lettering | None, text_size: float) -> Overlay:
+def overlay(drawing: Drawing, sight: LinesOfSight, lettering: Lettering | None, text_size: float) -> Overlay:
     """Find what is seen of a drawing, and places for labels.
 
     Parameters
@@ -196,7 +196,7 @@ def overlay(drawing: Drawing, sight: Sight, lettering: Lettering | None, text_si
         Stroke(style, tuple(simpler(seen, np.flatnonzero(drawing.style[seen.line] == k))))
         for k, style in enumerate(drawing.styles)
     ]
-    points = Sight(sight.target, sight.surface, LIFT_OF_POINTS).points(drawing.points)
+    points = LinesOfSight(sight.target, sight.surface, LIFT_OF_POINTS).points(drawing.points)
     at = np.flatnonzero(points.shown)
     marks = [Stroke(s, tuple(points.uv[[i]] for i in at[drawing.point_style[at] == k])) for k, s in
              enumerate(drawing.styles)]  # fmt: skip

@@ -53,7 +53,7 @@ class PhotoRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
+class ViewPhoto:
     """A photograph, open, and the size of the picture that it belongs to."""
 
     request: PhotoRequest
@@ -62,7 +62,7 @@ class Photo:
     """Values that become black and white."""
 
     @classmethod
-    def open(cls, request: PhotoRequest, size: tuple[int, int]) -> Photo:
+    def open(cls, request: PhotoRequest, size: tuple[int, int]) -> ViewPhoto:
         """
         Raises
         ------

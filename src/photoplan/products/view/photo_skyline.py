@@ -24,7 +24,7 @@ from photoplan.products.view.camera import ViewCamera
 from photoplan.products.view.content import grey_span, in_colours
 from photoplan.products.view.lines import LineStyle
 from photoplan.products.view.overlay import Overlay, OverlayFacts
-from photoplan.products.view.photo import Photo, PhotoRequest
+from photoplan.products.view.photo import PhotoRequest, ViewPhoto
 from photoplan.surfaces.seen import Seen
 from photoplan.targets.view import FrameBundle, ViewTarget
 
@@ -139,7 +139,7 @@ def against_photo(
     target, size = camera.target, camera.target.bundle.size
     if camera.request.exaggeration != 1.0:
         raise UsageError("a photograph shows heights as they are; leave `exaggeration` away")
-    reader = Photo.open(PhotoRequest(str(request.photo)), size).reader
+    reader = ViewPhoto.open(PhotoRequest(str(request.photo)), size).reader
     control = None if request.control is None else _control(request.control)
     search = max(2, round(_SEARCH * size[1])) if request.search is None else request.search
     first = _matched(request, reader, control, target, find(target, 0), search)

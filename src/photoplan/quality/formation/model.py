@@ -147,7 +147,7 @@ class FormedImage:
 
 
 @dataclass(frozen=True)
-class Frame:
+class FormedFrame:
     """One of a series."""
 
     number: int
@@ -178,7 +178,7 @@ def frame_light(model: ImageModel, scene: LightScene, frame: int) -> Light:
     return Light(scene, model.optics, model.falloff, shift if shift.any() else None)
 
 
-def exposed(model: ImageModel, light: _Array, frame: Frame) -> FormedImage:
+def exposed(model: ImageModel, light: _Array, frame: FormedFrame) -> FormedImage:
     """Image of light on the pixels, shape (bands, height, width), see `frame_light`."""
     bands, height, width = light.shape
     grey = np.empty_like(light)
@@ -240,7 +240,7 @@ def _electrons(
     return np.asarray(charge)
 
 
-def _grey(model: ImageModel, grey: _Array, frame: Frame) -> NDArray[Any]:
+def _grey(model: ImageModel, grey: _Array, frame: FormedFrame) -> NDArray[Any]:
     """Stored grey values of the amplified signal, shape (bands, height, width)."""
     if model.gain.noise:
         grey = grey + _random(model, 4, frame.number).normal(0.0, model.gain.noise, grey.shape)
