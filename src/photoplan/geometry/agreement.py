@@ -34,17 +34,25 @@ def agreement(a: ArrayLike, b: ArrayLike) -> Agreement:
     p, q = p[both], q[both]
     n, nan = len(p), float("nan")
     if not n:
-        return Agreement(0, nan, nan, nan, nan, nan, nan)
+        return Agreement(count=0, shift=nan, turn=nan, sigma_turn=nan, scale=nan, scatter=nan, spread=nan)
     shift = abs((q - p).mean())
     p, q = p - p.mean(), q - q.mean()
     square = float((np.abs(p) ** 2).sum())
     spread = float(np.sqrt(square / n))
     if n < 3 or square == 0:
-        return Agreement(n, shift, nan, nan, nan, nan, spread)
+        return Agreement(count=n, shift=shift, turn=nan, sigma_turn=nan, scale=nan, scatter=nan, spread=spread)
     factor = (np.conj(p) @ q) / square
     scatter = float(np.sqrt((np.abs(q - factor * p) ** 2).sum() / (2 * n - 4)))
     turn, scale = float(np.angle(factor)), float(abs(factor))
-    return Agreement(n, float(shift), turn, scatter / float(np.sqrt(square)), scale, scatter, spread)
+    return Agreement(
+        count=n,
+        shift=float(shift),
+        turn=turn,
+        sigma_turn=scatter / float(np.sqrt(square)),
+        scale=scale,
+        scatter=scatter,
+        spread=spread,
+    )
 
 
 def misfit(a: ArrayLike, b: ArrayLike) -> float:

@@ -148,7 +148,15 @@ def balance(
         tuple(_sigmas(nodes, each, k, raw[k][b], moved[k][b]) for b, each in enumerate(found)) or ((),) * cells.bands
         for k in range(len(images))
     )
-    return Balanced(images, tuple(map(tuple, moved)), sigmas, parts, tuple(found), contrast, beyond)
+    return Balanced(
+        images=images,
+        tones=tuple(map(tuple, moved)),
+        sigmas=sigmas,
+        parts=parts,
+        bands=tuple(found),
+        contrast=contrast,
+        shoulder=beyond,
+    )
 
 
 def _thinned(cells: Cells) -> Cells:
@@ -192,7 +200,15 @@ def pairs_of(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.i
         np.add.at(total, of.reshape(-1), mean)
         found.append(np.sqrt(total / count[:, None]))
         maps.append(np.sqrt(np.bincount(cell[a], mean.mean(axis=1), len(first)) / np.maximum(times, 1)))
-    return Pairs(pair, count * cells.pixels.shape[2], found[0], found[1], cells.place[first], maps[0], maps[1])
+    return Pairs(
+        images=pair,
+        pixels=count * cells.pixels.shape[2],
+        before=found[0],
+        after=found[1],
+        places=cells.place[first],
+        before_there=maps[0],
+        after_there=maps[1],
+    )
 
 
 def _tone(nodes: _Floats, found: AdjustedBand, image: int, powers: Sequence[tuple[int, int]]) -> Tone:

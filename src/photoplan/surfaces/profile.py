@@ -111,7 +111,15 @@ def _polyline(polyline: ArrayLike) -> NDArray[np.float64]:
 
 def _element(XY: NDArray[np.float64]) -> LineElement:
     zero = np.zeros(len(XY))
-    return LineElement("profile", "formline", "", np.column_stack([XY, zero]), None, zero, np.zeros(len(XY), bool))
+    return LineElement(
+        name="profile",
+        kind="formline",
+        code="",
+        xyz=np.column_stack([XY, zero]),
+        right=None,
+        sigmas=zero,
+        on_grid=np.zeros(len(XY), bool),
+    )
 
 
 def _cut_hybrid(surface: HybridSurface, XY: NDArray[np.float64]) -> _Pieces:

@@ -150,7 +150,13 @@ class _Blend:
         datum = old.datum if old is not None else float(np.rint(np.nanmean(heights)))
         sigmas = np.where(np.isfinite(heights), self.sigmas(XY), np.nan)
         return Unit(
-            left, top, layout.side, (heights - datum).astype(np.float32), sigmas.astype(np.float32), datum, None
+            left=left,
+            top=top,
+            side=layout.side,
+            heights=(heights - datum).astype(np.float32),
+            sigmas=sigmas.astype(np.float32),
+            datum=datum,
+            faces=None,
         )
 
     def sigmas(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:

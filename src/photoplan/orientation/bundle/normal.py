@@ -123,7 +123,9 @@ def reduce_normals(rows: Rows, points: int, damping: float = 0.0) -> Reduced:
         diagonal = S.diagonal()
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     D = sparse.diags(scale)
-    return Reduced(rows, (D @ S @ D).tocsc(), scale, np.asarray(b).ravel(), V_inverse, N_pg, n_p)
+    return Reduced(
+        rows=rows, S=(D @ S @ D).tocsc(), scale=scale, b=np.asarray(b).ravel(), V_inverse=V_inverse, N_pg=N_pg, n_p=n_p
+    )
 
 
 def _on_points(rows: Rows) -> tuple[NDArray[np.int64], _Floats]:

@@ -244,7 +244,18 @@ def plan_surface(
         "facts": ScenesAddress.of(project, used).facts,
     }
     key = run_key("surface", stated, files)
-    return SurfacePlan(project, settings, used, tuple(blind), grid, frame, scheme, gsd, height_error, key)
+    return SurfacePlan(
+        project=project,
+        settings=settings,
+        images=used,
+        blind=tuple(blind),
+        grid=grid,
+        frame=frame,
+        scheme=scheme,
+        gsd=gsd,
+        height_error=height_error,
+        key=key,
+    )
 
 
 def check_start(project: Project, settings: SurfaceSettings) -> None:

@@ -130,7 +130,15 @@ def _open(address: ViewAddress) -> OpenView:
     matrix = None if address.matrix is None else MatrixFile(Path(address.matrix))
     photo = None if address.look.photo is None else ViewPhoto.open(address.look.photo, camera.target.bundle.size)
     surface = seen_surface(ground, address.farthest, address.bound)
-    return OpenView(camera.target, surface, layers, light, matrix, photo, ground.water)
+    return OpenView(
+        target=camera.target,
+        surface=surface,
+        layers=layers,
+        light=light,
+        matrix=matrix,
+        photo=photo,
+        water=ground.water,
+    )
 
 
 def seen_surface(ground: ViewGround, farthest: float, bound: float) -> SeenSurface:

@@ -80,7 +80,17 @@ def refined_camera(camera: ViewCamera, match: PhotoMatch, ground: ViewGround, pa
         text = _camera_text(camera.request, after)
     told = (tuple(float(v) for v in row[:count]) for row in (before, after, sigma))
     b, a, s = told
-    return RefinedCamera(names[:count], b, a, s, unit, match.fit.used, match.fit.correlated, text, constant)
+    return RefinedCamera(
+        names=names[:count],
+        before=b,
+        after=a,
+        sigma=s,
+        unit=unit,
+        used=match.fit.used,
+        correlated=match.fit.correlated,
+        text=text,
+        constant=constant,
+    )
 
 
 def write_refined(path: Path, refined: RefinedCamera) -> None:

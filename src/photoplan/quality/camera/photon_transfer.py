@@ -201,7 +201,24 @@ def photon_transfer(
         )
     read = _read_noise(curve, bias, bias_sigma, dark, step)
     well = _full_well(levels, peak, curve)
-    return PhotonTransfer(curve.slope, gain_sigma, *read, *well, bias, curve, mean, variance, used)
+    return PhotonTransfer(
+        gain=curve.slope,
+        gain_sigma=gain_sigma,
+        read_noise_dn=read[0],
+        read_noise_dn_sigma=read[1],
+        read_noise_e=read[2],
+        read_noise_e_sigma=read[3],
+        read_noise_refused=read[4],
+        full_well_dn=well[0],
+        full_well_dn_sigma=well[1],
+        full_well_e=well[2],
+        full_well_e_sigma=well[3],
+        bias_dn=bias,
+        curve=curve,
+        mean=mean,
+        variance=variance,
+        used=used,
+    )
 
 
 def _curve(

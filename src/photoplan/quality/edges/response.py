@@ -189,7 +189,9 @@ def measure_edge(
         fit = _fit(seen, (distance, weight), line, (model, low, high), chosen)
     except np.linalg.LinAlgError as error:
         raise InputError("the region's pixels do not determine a profile; choose a larger region") from error
-    return _measured(_Context(seen, distance, line, fit, span, origin, chosen))
+    return _measured(
+        _Context(pixels=seen, distance=distance, line=line, fit=fit, span=span, origin=origin, settings=chosen)
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -143,13 +143,13 @@ class _Chain:
     def element(self, line: LineElement) -> LineElement:
         X, Y, Z, right, sigmas = self.ground.T
         return LineElement(
-            line.name,
-            line.kind,
-            line.code,
-            np.stack([X, Y, Z], axis=1),
-            None if line.right is None else right.copy(),
-            sigmas.copy(),
-            self.new,
+            name=line.name,
+            kind=line.kind,
+            code=line.code,
+            xyz=np.stack([X, Y, Z], axis=1),
+            right=None if line.right is None else right.copy(),
+            sigmas=sigmas.copy(),
+            on_grid=self.new,
         )
 
 

@@ -123,7 +123,15 @@ def read(path: Path, name: str | None) -> StatedLine:
     try:
         looks, beside = looks_of(detectors, path.parent, MAX_BYTES)
         chips = looks if len(looks) > 1 else ()
-        return StatedLine(path, FORM, _track(strip, path), looks[0], EARTH_RADII, beside, chips)
+        return StatedLine(
+            file=path,
+            form=FORM,
+            track=_track(strip, path),
+            look=looks[0],
+            radii=EARTH_RADII,
+            beside=beside,
+            chips=chips,
+        )
     except HeightSystemError:
         raise
     except InputError as error:
