@@ -88,9 +88,10 @@ def test_levels_come_from_the_widest_bars_and_slanting_light_is_divided_out():
         assert curve.mtf.modulation[k + 1] == pytest.approx(true, rel=0.015)
 
 
-def test_standard_deviations_are_those_of_repetition():
+@thinned("count", 24, 60)
+def test_standard_deviations_are_those_of_repetition(count):
     values, sigmas = [], []
-    for seed in range(60):
+    for seed in range(count):
         group = measure_bars(noisy(0.2, 25.0, seed, 6.0))
         values.append(group.fundamental)
         sigmas.append(group.fundamental_sigma)

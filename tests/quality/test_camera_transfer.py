@@ -40,7 +40,7 @@ def spread_of(normalised, what):
     return value
 
 
-@thinned("runs", 200, 500)
+@thinned("runs", 80, 500)
 def test_normalised_errors_of_gain_and_read_noise_spread_by_one(runs):
     gain, read, read_dn = [], [], []
     for run in range(runs):
@@ -162,7 +162,7 @@ def dark_series(sensor, noise, celsius=20.0, exposures=(100.0, 500.0, 1000.0, 20
     return exposures, [level_of(sensor, 0, e, noise, 3, celsius) for e in exposures]
 
 
-@thinned("runs", 200, 500)
+@thinned("runs", 80, 500)
 def test_normalised_errors_of_dark_current_and_doubling_temperature_spread_by_one(runs):
     current, doubling = [], []
     for run in range(runs):

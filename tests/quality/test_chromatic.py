@@ -50,9 +50,14 @@ def chart():
     return scene, form_image(camera(falloff=Falloff(artificial=0.2)), scene).values
 
 
-def test_centres_of_discs_and_their_standard_deviations(chart):
-    scene, bands = chart
-    discs = find_discs(bands[1])
+@pytest.fixture(scope="module")
+def found(chart):
+    return [find_discs(band) for band in chart[1]]
+
+
+def test_centres_of_discs_and_their_standard_deviations(chart, found):
+    scene, _ = chart
+    discs = found[1]
     errors = near(discs, scene.centres())
     claimed = np.sqrt(np.mean([[d.sigma_x**2, d.sigma_y**2] for d in discs]))
     print(f"\n{len(discs)} discs, centre ± {errors.std():.4f} px, claimed {claimed:.4f} px")
@@ -72,20 +77,20 @@ def test_centres_have_no_bias_by_phase(phase):
 
 def test_bright_discs_and_mosaics(chart):
     scene, bands = chart
-    assert len(find_discs(240.0 - bands[1])) == len(find_discs(bands[1]))
+    part = bands[1][:120, :160]
+    assert len(find_discs(240.0 - part)) == len(find_discs(part)) > 20
     # A mosaic whose planes have levels of their own: no interpolation, no bias.
     planes = np.add.outer(2 * (np.arange(240) % 2), np.arange(320) % 2)
     mosaic = bands[1] * np.array([0.3, 1.0, 0.6, 0.3])[planes]
     errors = near(find_discs(mosaic, 300.0, planes), scene.centres())
     assert abs(errors.mean()) < 0.002 and errors.std() < 0.012
-    green = np.where((planes == 0) | (planes == 3), planes, -1)
-    assert near(find_discs(mosaic, None, green), scene.centres()).std() < 0.02
+    green = np.where((planes == 0) | (planes == 3), planes, -1)[:120]
+    assert near(find_discs(mosaic[:120], None, green), scene.centres()).std() < 0.02
 
 
-def test_displacements_of_discs_within_two_hundredths_of_a_pixel(chart):
+def test_displacements_of_discs_within_two_hundredths_of_a_pixel(chart, found):
     """Issue: simulated displacements are recovered within 0.02 px at SNR 50."""
-    scene, bands = chart
-    discs = [find_discs(band) for band in bands]
+    scene, discs = chart[0], found
     for lateral, kind in zip(LATERAL, ("radial", "scale")):
         measured = disc_displacements(discs[1], discs[lateral.band - 1])
         fitted = fit_band(lateral.band, scene.size, measured)
@@ -213,9 +218,8 @@ def test_saturated_discs_are_refused(chart):
         find_discs(bright)
 
 
-def test_discs_that_do_not_match(chart):
-    _, bands = chart
-    discs = find_discs(bands[1])
+def test_discs_that_do_not_match(found):
+    discs = found[1]
     with pytest.raises(InputError, match="0 discs are the same"):
         disc_displacements(discs, [type(d)(**{**d.__dict__, "x": d.x + 12.0, "y": d.y + 12.0}) for d in discs])
     with pytest.raises(GeometryError, match="at least 4"):

@@ -7,6 +7,7 @@ from math import atan2, degrees
 import numpy as np
 import pytest
 from tools.edge_scenes import blocks, half_plane, noisy
+from tools.thinned import some
 
 from photoplan.errors import InputError
 from photoplan.quality.edges.candidates import find_lines, noise_of
@@ -45,11 +46,12 @@ class TestFound:
         assert abs(turned) < 0.5
         assert line.length > 38
 
-    def test_all_sides_of_all_blocks(self) -> None:
-        """Thirty turned rectangles with noise: each of their 120 sides once, no other."""
-        found, rejected = find_edges(EdgePicture(noisy(blocks((660, 550), 12.0, 0.8, 3), 50, 4, "float32")))
-        print(f"{len(found)} of 120 sides, rejected {dict(rejected)}")
-        assert len(found) == 120
+    @pytest.mark.parametrize(("size", "sides"), some([((330, 330), 36), ((660, 550), 120)], 0))
+    def test_all_sides_of_all_blocks(self, size: tuple[int, int], sides: int) -> None:
+        """Turned rectangles with noise: each of their sides once, no other."""
+        found, rejected = find_edges(EdgePicture(noisy(blocks(size, 12.0, 0.8, 3), 50, 4, "float32")))
+        print(f"{len(found)} of {sides} sides, rejected {dict(rejected)}")
+        assert len(found) == sides
 
     def test_pixels_of_the_mask(self) -> None:
         """They lie within half a width of the line, between its ends, outside gaps; both sides are equal in number."""
@@ -103,11 +105,12 @@ class TestRejected:
         What passes lies by chance where the texture is even; the measurement tests it once more.
         """
         passed, why = 0, set()
+        edge, bright = one_edge(), half_plane((90, 80), (44.3, 40.2), 8, 0.8) > 0.5
         for seed in range(10):
             for size in (3, 4, 5, 6, 8):
                 rng = np.random.default_rng(seed)
                 grain = np.kron(rng.uniform(-0.15, 0.15, (30, 33)), np.ones((size, size)))[:80, :90]
-                grey = one_edge() + np.where(half_plane((90, 80), (44.3, 40.2), 8, 0.8) > 0.5, grain, 0)
+                grey = edge + np.where(bright, grain, 0)
                 found, rejected = find_edges(EdgePicture(grey.astype(np.float32)))
                 passed += bool(found)
                 why |= set(rejected)

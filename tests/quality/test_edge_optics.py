@@ -30,7 +30,7 @@ def held(interval: tuple[float, float], truth: float) -> bool:
     return interval[0] <= truth <= interval[1]
 
 
-@thinned("each", 2, 73)
+@thinned("each", 1, 73)
 def test_intervals_hold_the_truth_whatever_the_optics(each: int) -> None:
     """Any angle, six classes, contrast over noise 30, 100, 300: so many edges of each; 1,314 in all."""
     rows, every = [], []

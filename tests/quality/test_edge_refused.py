@@ -24,8 +24,9 @@ def _refused(image, words, **options):
         measure_edge(image, **options)
 
 
-def test_the_clean_edge_is_measured():
-    for seed in range(20):
+@thinned("count", 6, 20)
+def test_the_clean_edge_is_measured(count):
+    for seed in range(count):
         edge = measure_edge(_clean(seed), limits=(-1.0, 2.0))
         assert edge.mtf50 == pytest.approx(true_mtf50(6.0, gaussian(0.7)), rel=0.1)
 
@@ -163,7 +164,7 @@ def _any_region(random):
 
 
 @pytest.mark.filterwarnings("error")
-@thinned("count", 45, 150)
+@thinned("count", 25, 150)
 def test_any_region_gives_figures_or_a_reason(count):
     random = np.random.default_rng(20)
     measured = 0

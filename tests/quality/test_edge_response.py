@@ -139,7 +139,7 @@ def test_short_edges_with_tails_reach_the_bound_of_fwhm():
 
 
 @pytest.mark.parametrize("angle", some([0.0, 90.0, 180.0, 270.0, 45.0], 1, 4))
-@thinned("edges", 8, 20)
+@thinned("edges", 5, 20)
 def test_an_edge_along_the_pixels_says_that_its_phases_are_few(angle, edges):
     random = np.random.default_rng(int(angle))
     spread = gaussian(0.8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import ndimage
-from tools.thinned import thinned
+from tools.thinned import some, thinned
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.grid import Window
@@ -66,7 +66,7 @@ def test_simulated_parts_are_recovered_with_true_standard_deviations(runs: int) 
     assert found.corners[0].artificial == pytest.approx(1 - MODEL.artificial(*CORNERS)[0], abs=0.004)
 
 
-@thinned("count", 15, 40)
+@thinned("count", 8, 40)
 def test_camera_constant_and_point_of_a_pure_natural_fall_off(count: int) -> None:
     model = FallOffModel(SIZE, POINT, FOCAL, (), ())
     settings = FallOffSettings("estimated", estimate_principal_point=True, artificial="none")
@@ -81,7 +81,7 @@ def test_camera_constant_and_point_of_a_pure_natural_fall_off(count: int) -> Non
     assert found.rank == ""
 
 
-@pytest.mark.parametrize("artificial", ["radial", "surface"])
+@pytest.mark.parametrize("artificial", some(["radial", "surface"], 1))
 def test_parts_that_cannot_be_told_apart_are_reported_not_stated(artificial: str) -> None:
     """The polynomial in r² and r⁴ imitates cos⁴ω; the whole is still known, and corrects."""
     image = flat(MODEL, 1)

@@ -43,7 +43,7 @@ def test_17_grey_values_after_bright_to_dark_are_recovered(runs: int) -> None:
     assert found.share == pytest.approx(-0.17, abs=0.01)
 
 
-@thinned("runs", 60, 300)
+@thinned("runs", 30, 300)
 def test_no_change_is_no_number(runs: int) -> None:
     """Noise alone is called a change in less than 2 % of the cases; what is not significant has no size."""
     alarms = 0

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from tools.camera_series import edge_lines
+from tools.thinned import thinned
 
 from photoplan.errors import InputError
 from photoplan.quality.camera.line_jitter import line_jitter
@@ -100,19 +101,20 @@ def test_period_amplitude_fields_with_true_standard_deviations() -> None:
     assert all(0.85 < s < 1.15 for s in spreads)  # 50 samples: ± 0.1
     assert found.residual_sigma == pytest.approx(0.1, rel=0.1)
     model = h.at(t)
-    assert np.corrcoef(model, np.sin(2 * np.pi * t / 120 + 49))[0, 1] > 0.999
+    assert np.corrcoef(model, np.sin(2 * np.pi * t / 120 + k))[0, 1] > 0.999
 
 
-def test_noise_alone_has_no_period_no_curve_no_fields() -> None:
+@thinned("runs", 20, 40)
+def test_noise_alone_has_no_period_no_curve_no_fields(runs: int) -> None:
     rng = np.random.default_rng(5)
-    found = [line_jitter(20 + 0.003 * LINES + rng.normal(0, 0.1, 400)) for _ in range(40)]
+    found = [line_jitter(20 + 0.003 * LINES + rng.normal(0, 0.1, 400)) for _ in range(runs)]
     alarms = [
         sum(bool(f.harmonics) for f in found),
         sum(f.degree > 1 for f in found),
         sum(f.fields_differ for f in found),
     ]
-    print(f"\nfalse alarms in 40: periods {alarms[0]}, curves {alarms[1]}, fields {alarms[2]}")
-    assert max(alarms) <= 1 and not any(f.spikes for f in found)
+    print(f"\nfalse alarms in {runs}: periods {alarms[0]}, curves {alarms[1]}, fields {alarms[2]}")
+    assert max(alarms) <= runs / 40 and not any(f.spikes for f in found)
 
 
 def test_two_oscillations_are_both_found() -> None:

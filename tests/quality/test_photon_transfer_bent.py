@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tools.camera_model import Sensor
-from tools.thinned import some
+from tools.thinned import some, thinned
 
 from photoplan.quality.camera.frame_statistics import Level, StackSums
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
@@ -37,9 +37,10 @@ def test_gain_of_a_response_that_loses_three_percent() -> None:
 
 
 @pytest.mark.parametrize("compression", some([0.0, 0.03, 0.06], 1))
-def test_normalised_errors_of_the_gain_spread_by_one(compression: float) -> None:
+@thinned("runs", 25, 60)
+def test_normalised_errors_of_the_gain_spread_by_one(compression: float, runs: int) -> None:
     sensor = Sensor(compression=compression, shape=(60, 80))
-    found = [transfer_of(sensor, 100 + seed) for seed in range(60)]
+    found = [transfer_of(sensor, 100 + seed) for seed in range(runs)]
     normalised = np.array([(each.gain - 0.4) / each.gain_sigma for each in found])
     bent = np.mean([each.bent for each in found])
     print(f"compression {compression}: spread {np.sqrt(np.mean(normalised**2)):.2f}, bent {100 * bent:.0f} %")

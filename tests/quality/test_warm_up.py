@@ -63,7 +63,7 @@ def test_parameters_have_true_standard_deviations(reference: str, runs: int) -> 
     assert all(0.75 < s < 1.25 for s in spreads.values())
 
 
-@thinned("runs", 20, 60)
+@thinned("runs", 10, 60)
 def test_exponential_course_is_recovered(runs: int) -> None:
     size, tau = [], []
     for seed in range(runs):

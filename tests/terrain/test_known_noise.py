@@ -45,7 +45,7 @@ def test_terraces(lines: bool) -> None:
 @pytest.mark.parametrize(
     "ground, count, noise, family",
     [
-        (hills, 500, 0.1, "auto"),
+        (hills, 300, 0.1, "auto"),
         pytest.param(fractal(3.0, 61, 1), 900, 0.3, "auto", marks=pytest.mark.slow),
         pytest.param(hills, 300, 0.3, "exponential", marks=pytest.mark.slow),
     ],
@@ -70,7 +70,7 @@ def test_terrains_densities_families(
 
 def test_what_the_ground_adds_to_the_accuracy_of_measuring_is_found() -> None:
     """Points measured to 2 cm in stubble of 15 cm: filtered as if nothing had been stated; exact if zero is."""
-    xyz = sampled(hills, scattered(SIDE, 900, 4), 0.15, 4)
+    xyz = sampled(hills, scattered(SIDE, 500, 4), 0.15, 4)
     unknown, _ = error(hills, terrain(xyz))
     stated, model = error(hills, terrain(xyz, sigma=0.02))
     assert stated <= 1.03 * unknown
@@ -81,7 +81,7 @@ def test_what_the_ground_adds_to_the_accuracy_of_measuring_is_found() -> None:
 
 def test_the_estimation_is_the_same_where_some_noise_is_known() -> None:
     """Spots of known noise among mass points do not end the estimation at the first of them."""
-    xyz = sampled(hills, scattered(SIDE, 900, 5), 0.1, 5)
+    xyz = sampled(hills, scattered(SIDE, 500, 5), 0.1, 5)
     groups = terrain(xyz[::2]).points + terrain(xyz[1::2], sigma=0.1, kind="spot").points
     mixed, _ = error(hills, MeasuredTerrain(groups))
     unknown, _ = error(hills, terrain(xyz))
