@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from tools.small_block import X0, Y0
 
+from photoplan.geometry.cylinder import CylinderFrame
 from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
 
 WALL = WallFrame.facing((X0, Y0, 100.0), 163.0, -4.0)
 IMAGE = ImageFrame((X0, Y0, 300.0), WallFrame.facing((0.0, 0.0, 0.0), 200.0, 71.0).axes, 200.0)
-FRAMES = pytest.mark.parametrize("frame", [WALL, IMAGE])
+VAULT = CylinderFrame.vault((X0, Y0, 100.0), 24.0, 110.0, 12.0)
+COLUMN = CylinderFrame.column((X0, Y0, 100.0), 200.0, 95.0)
+FRAMES = pytest.mark.parametrize("frame", [WALL, IMAGE, VAULT, COLUMN])
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +35,7 @@ def test_derivatives_are_those_of_differences(frame: Frame, uvh: np.ndarray) -> 
         assert J[..., axis] == pytest.approx(difference, abs=1e-6)
 
 
-@FRAMES
+@pytest.mark.parametrize("frame", [WALL, IMAGE])
 def test_rays_stay_straight(frame: Frame, uvh: np.ndarray) -> None:
     """Points of a ray of the ground lie on the line that it is in the frame, and directions are units."""
     origin = np.array([X0 - 30.0, Y0 + 20.0, 310.0])
@@ -42,6 +45,32 @@ def test_rays_stay_straight(frame: Frame, uvh: np.ndarray) -> None:
     assert np.linalg.norm(direction, axis=-1) == pytest.approx(np.linalg.norm(way, axis=-1) if frame is WALL else 1.0)
     along = (uvh[..., 2:] - point[..., 2:]) / direction[..., 2:]
     assert point + along * direction == pytest.approx(uvh, abs=1e-6)
+
+
+@pytest.mark.parametrize(("frame", "camera"), [(VAULT, (30.0, 10.0, 90.0)), (COLUMN, (-20.0, 10.0, 300.0))])
+def test_rays_meet_a_height_of_a_cylinder_where_they_are_seen(frame: CylinderFrame, camera: tuple) -> None:
+    """From inside the far side, from outside the near one; the direction is that of the ray there."""
+    uvh = np.random.default_rng(2).uniform((-60, -40, 20), (60, 60, 20.000001), (40, 3))
+    origin = frame(camera)
+    way = frame(uvh) - origin
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    point, direction = frame.lines(np.broadcast_to(origin, way.shape), way, 20.0)
+    assert point == pytest.approx(uvh, abs=1e-4) and (direction[:, 2] < 0).all()
+    after = frame.inverse(frame(point) + 1e-3 * way) - point
+    assert after / np.linalg.norm(after, axis=1, keepdims=True) == pytest.approx(direction, abs=1e-4)
+    away = frame.lines(np.broadcast_to(origin, way.shape), -way, 20.0)[0]
+    assert np.isnan(away).all() if frame is COLUMN else np.isfinite(away).all()
+
+
+def test_which_way_cylinders_lie() -> None:
+    vault = CylinderFrame.vault((1.0, 2.0, 3.0), 0.0, 5.0)
+    # Lying on one's back with the feet to the south and looking up, east is on the left.
+    assert vault((0.0, 0.0, 0.0)) == pytest.approx((1, 2, 8)) and vault((0.0, 4.0, 1.0)) == pytest.approx((1, 6, 7))
+    assert vault((2.5 * np.pi, 0.0, 0.0)) == pytest.approx((-4, 2, 3)) and vault.heights[1] < 5
+    column = CylinderFrame.column((1.0, 2.0, 3.0), 180.0, 5.0)
+    assert column((0.0, 1.0, 2.0)) == pytest.approx((1, -5, 4)) and column((2.5 * np.pi, 0, 0)) == pytest.approx(
+        (6, 2, 3)
+    )
 
 
 @pytest.mark.parametrize(

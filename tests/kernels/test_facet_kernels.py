@@ -12,7 +12,8 @@ from photoplan.kernels.jit import COMPILED
 def carried(low, high, posts, out, wall=np.inf) -> None:
     steep = np.empty((-(-(len(posts) - 1) // facets_transfer.CELL), -(-(posts.shape[1] - 1) // facets_transfer.CELL)))
     facets_transfer.steepness(posts, steep)
-    facets_transfer.transfer(low, high, 1, (0.0, 100.0), posts, steep, wall, out)
+    ways = np.concatenate([low, (high - low) / 100.0, np.zeros_like(low)], axis=-1)
+    facets_transfer.transfer(ways, 1, 1, posts, steep, wall, out)
 
 
 def test_a_ray_ends_at_the_first_facet_that_it_meets() -> None:

@@ -144,9 +144,12 @@ def test_targets_that_are_none(scene: Scene) -> None:
     for words, code, text in (
         (["--target", "wal:1,2"], 2, "give `map`, `wall:X,"),
         (["--target", "wall:1,2,3"], 2, "azimuth"),
+        (["--target", "vault:1,2,3,4"], 2, "the radius"),
+        (["--target", "vault:1,2,3,4,0"], 2, "the radius"),
+        (["--target", "column:1,2,3,4,5,6"], 2, "that its middle faces"),
         (["--target", "wall:1,2,3,4,95"], 2, "azimuth"),
         (["--target", "wall:1,2,3,nan"], 2, "azimuth"),
-        (["--target", ON_WALL], 2, "a wall has no end; give --bounds"),
+        (["--target", ON_WALL], 2, "it has no end; give --bounds"),
         (["--target", ON_WALL, *around(0, 0)], 3, "no two images see"),
         (["--target", "wall:0,0,0,0,-90", *around(-X, -Y)], 3, "all images stand behind the target"),
         (["--target", "image:none"], 3, "image 'none' is not in the project"),

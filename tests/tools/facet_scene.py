@@ -25,7 +25,9 @@ CONTRAST = 20.0
 """Standard deviation of the grey values."""
 
 
-def waves(seed: int, lengths: NDArray[np.float64], sizes: NDArray[np.float64]) -> Field:
+def waves(
+    seed: int, lengths: NDArray[np.float64], sizes: NDArray[np.float64], centre: tuple[float, float] = (X0, Y0)
+) -> Field:
     """A sum of plane waves of these lengths, metres, and sizes in random directions."""
     rng = np.random.default_rng(seed)
     way, phase = rng.uniform(0, 2 * np.pi, (2, len(lengths)))
@@ -34,7 +36,7 @@ def waves(seed: int, lengths: NDArray[np.float64], sizes: NDArray[np.float64]) -
     def field(X: NDArray[np.float64], Y: NDArray[np.float64]) -> NDArray[np.float64]:
         out = np.zeros(np.shape(X))
         for a, b, p, s in zip(kx, ky, phase, sizes):
-            out += s * np.cos(a * (X - X0) + b * (Y - Y0) + p)
+            out += s * np.cos(a * (X - centre[0]) + b * (Y - centre[1]) + p)
         return out
 
     return field

@@ -17,7 +17,8 @@ from photoplan.cli.options import NEW_FOLDER, PATH, bounds_option, dry_run_optio
     "--target",
     default="map",
     metavar="WHAT",
-    help="Heights over it: map, wall:X,Y,Z,AZIMUTH[,TILT], or image:NAME[,DISTANCE] [map].",
+    help="Heights over it: map, wall:X,Y,Z,AZIMUTH[,TILT], vault:X,Y,Z,AZIMUTH,RADIUS[,TILT], "
+    "column:X,Y,Z,AZIMUTH,RADIUS, or image:NAME[,DISTANCE] [map].",
 )
 @bounds_option
 @images_option()

@@ -11,18 +11,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 _Doubles = NDArray[np.float64]
-Axes = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+Triple = tuple[float, float, float]
+Axes = tuple[Triple, Triple, Triple]
 
 #: Nearest and farthest that is seen along an image, parts and multiples of the distance of its frame.
 _NEAREST, _FARTHEST = 0.25, 50.0
 
 
 class Frame(Hashable, Protocol):
-    """An invertible mapping of space that keeps straight lines straight. A value: hashable, and pickles."""
+    """An invertible mapping of space. A value: hashable, and pickles."""
 
     @property
     def heights(self) -> tuple[float, float]:
         """Between which h there is anything; infinite: everywhere."""
+        ...
+
+    def top(self, point: _Doubles) -> float:
+        """Height above which a camera at a point of the frame (3,) sees nothing; a point may be NaN."""
         ...
 
     def __call__(self, uvh: ArrayLike) -> _Doubles:
@@ -40,7 +45,7 @@ class Frame(Hashable, Protocol):
     def lines(self, origin: _Doubles, direction: _Doubles, height: float) -> tuple[_Doubles, _Doubles]:
         """Rays of the ground, (..., 3) each, in the frame: a point of each and its unit direction there.
 
-        The point is that at a height where the frame bends distances; NaN where the ray does not get there.
+        The point is that at a height where the frame bends distances or rays; NaN where the ray does not get there.
         """
         ...
 
@@ -49,20 +54,24 @@ class Frame(Hashable, Protocol):
 class WallFrame:
     """u along a wall to the right, v up on it, h in front of it: a rigid motion."""
 
-    origin: tuple[float, float, float]
+    origin: Triple
     """Ground point of u = v = h = 0."""
     axes: Axes
     """Rows: directions of u, v and h on the ground."""
     heights: tuple[float, float] = (-math.inf, math.inf)
     """Everywhere."""
 
+    def top(self, point: _Doubles) -> float:
+        """That of the camera."""
+        return float(point[2])
+
     @classmethod
-    def facing(cls, origin: tuple[float, float, float], azimuth: float, tilt: float = 0.0) -> WallFrame:
+    def facing(cls, origin: Triple, azimuth: float, tilt: float = 0.0) -> WallFrame:
         """The frame of a plane by the azimuth of its outward normal, from north by east, and how far that is raised, °.
 
         u is level and points to the right of who looks at the wall; a wall of azimuth 180° and tilt 90° is the map.
         """
-        (sa, ca), (st, ct) = (_sine_cosine(angle) for angle in (azimuth, tilt))
+        (sa, ca), (st, ct) = (sine_cosine(angle) for angle in (azimuth, tilt))
         normal, right = (sa * ct, ca * ct, st), (-ca, sa, 0.0)
         x, y, z = (float(c) + 0.0 for c in np.cross(normal, right))
         return cls(origin, (right, (x, y, z), normal))
@@ -92,7 +101,7 @@ class ImageFrame:
     metre of h is a metre towards the image; planes of constant h across its axis differ by constant parallax.
     """
 
-    origin: tuple[float, float, float]
+    origin: Triple
     """Projection centre C."""
     axes: Axes
     """Rows: directions of the image's axes on the ground, the third one against its view."""
@@ -103,6 +112,10 @@ class ImageFrame:
     def heights(self) -> tuple[float, float]:
         """From 50 times the distance to a quarter of it."""
         return tuple(self.distance * (1 / part - 1) for part in (_FARTHEST, _NEAREST))  # type: ignore[return-value]
+
+    def top(self, point: _Doubles) -> float:
+        """That of the camera, if it is in front."""
+        return float(np.fmin(point[2], self.heights[1]))
 
     def __call__(self, uvh: ArrayLike) -> _Doubles:
         """Points of the frame (..., 3) to the ground; NaN at and beyond infinity, h ≤ −D."""
@@ -143,8 +156,8 @@ class ImageFrame:
         return np.where(nearer > 0, nearer, np.nan)
 
 
-def _sine_cosine(degrees: float) -> tuple[float, float]:
-    """Exact for quarters of a circle."""
+def sine_cosine(degrees: float) -> tuple[float, float]:
+    """Of an angle; exact for quarters of a circle."""
     quarter, rest = divmod(degrees, 90.0)
     s, c = math.sin(math.radians(rest)), math.cos(math.radians(rest))
     for _ in range(int(quarter) % 4):

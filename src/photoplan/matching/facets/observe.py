@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import Camera, project
+from photoplan.cameras.base import Camera, project, tremor_of
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.facets_transfer import CELL, steepness, transfer
 from photoplan.matching.facets.pyramid import Pyramid
@@ -20,7 +20,7 @@ _Doubles = NDArray[np.float64]
 #: border of which nothing is learnt, and some more.
 MARGIN = 24
 #: Rays are followed for pixels this far apart, or closer where rays between them would be off by more than this part of
-#: a grey facet.
+#: a grey facet; they are bent if straight ones would be.
 _STEP, _OFF = 32, 0.001
 #: Times by which pixels lie closer on a facet than on level ground from which on they are left out: on a wall, whose
 #: grey values are finer than the facets of the map, or beside the edge of what hides the ground behind it.
@@ -101,13 +101,12 @@ class Sight:
 
     raw: _Floats
     """Grey values, shape (h, w); NaN where there are none."""
-    low: _Doubles
-    """Where rays of every `step`-th pixel cross the lower of two levels, column and row of the posts; (m, n, 2)."""
-    high: _Doubles
-    """The same for the upper one."""
-    step: int
-    levels: tuple[float, float]
-    """Heights of the two levels, metres."""
+    ways: _Doubles
+    """Rays of every so many pixels, see `facets_transfer.transfer`; (m, n, 6)."""
+    steps: tuple[int, int]
+    """How many pixels to the right and down."""
+    level: float
+    """Height that is 0 for them, metres."""
     first: tuple[int, int]
     """Column and row of the first pixel."""
     places: _Floats = field(default_factory=lambda: np.empty((0, 0, 4), np.float32))
@@ -118,7 +117,7 @@ class Sight:
         places = np.empty((*self.raw.shape, 4), np.float32)
         steep = np.empty((-(-(heights.shape[0] - 1) // CELL), -(-(heights.shape[1] - 1) // CELL)))
         steepness(heights, steep)
-        transfer(self.low, self.high, self.step, self.levels, heights, steep, _WALL, places)
+        transfer(self.ways, *self.steps, heights - self.level, steep, _WALL, places)
         return replace(self, places=places)
 
 
@@ -169,22 +168,39 @@ def _window(view: View, level: int, facets: Facets, heights: tuple[float, float]
 def _followed(
     camera: Camera, raw: _Floats, window: Window, level: int, facets: Facets, levels: tuple[float, float]
 ) -> Sight:
-    """Rays of a lattice of pixels, as fine as it takes for straight lines between them to be good."""
-    step = _STEP
+    """Rays of a lattice of pixels, as fine along each axis as it takes for straight lines between them to be good."""
+    size, first, scale = (window.width, window.height), np.array([window.col, window.row]), 2.0**level
+    # Where a flight shakes each line of the image stands for itself.
+    right, down = _STEP, _STEP if tremor_of(camera) is None else 1
+
+    def cross(at: _Doubles, z: float) -> _Doubles:
+        return facets.to_posts(_on_level(camera, (at + first) * scale, z))
+
+    def worst(found: _Doubles, expected: _Doubles) -> float:
+        return float(np.nanmax(np.abs(found - expected), initial=0.0)) * facets.ratio
+
     while True:
-        x, y = (np.arange(0, n + step, step) for n in (window.width - 1, window.height - 1))
-        x, y = (np.append(a, a[-1] + step) if len(a) < 2 else a for a in (x, y))
-        at = np.stack(np.meshgrid(x + window.col, y + window.row), axis=-1) * 2.0**level
-        low, high = (facets.to_posts(_on_level(camera, at, z)) for z in levels)
-        middle = at[:-1, :-1] + 0.5 * step * 2.0**level
-        off = 0.0
-        for cross, z in ((low, levels[0]), (high, levels[1])):
-            found = facets.to_posts(_on_level(camera, middle, z))
-            mean = (cross[:-1, :-1] + cross[1:, :-1] + cross[:-1, 1:] + cross[1:, 1:]) / 4
-            off = max(off, float(np.nanmax(np.abs(found - mean), initial=0.0)) * facets.ratio)
-        if off <= _OFF or step == 1:
-            return Sight(raw, low, high, step, levels, (window.col, window.row))
-        step = max(1, step // 2)
+        x, y = (np.arange(max(2, -(-(n - 1) // step) + 1)) * step for n, step in zip(size, (right, down)))
+        at = np.stack(np.meshgrid(x, y), axis=-1).astype(float)
+        low, high = (cross(at, z) for z in levels)
+        off = np.zeros(2)
+        for nodes, z in ((low, levels[0]), (high, levels[1])):
+            if right > 1:
+                off[0] = max(
+                    off[0], worst(cross(at[:, :-1] + np.array([right / 2, 0.0]), z), (nodes[:, :-1] + nodes[:, 1:]) / 2)
+                )
+            if down > 1:
+                off[1] = max(off[1], worst(cross(at[:-1] + np.array([0.0, down / 2]), z), (nodes[:-1] + nodes[1:]) / 2))
+        if (off <= _OFF).all():
+            break
+        right, down = (max(1, step // 2) if far > _OFF else step for step, far in zip((right, down), off))
+    half, mean = (levels[1] - levels[0]) / 2, (low + high) / 2
+    some = tuple(slice(None, None, max(1, n // _POINTS)) for n in at.shape[:2])
+    middle = mean
+    if worst(cross(at[some], sum(levels) / 2), mean[some]) > _OFF:
+        middle = cross(at, sum(levels) / 2)
+    ways = np.concatenate([middle, (high - low) / (2 * half), (mean - middle) / half**2], axis=-1)
+    return Sight(raw, ways, (right, down), sum(levels) / 2, (window.col, window.row))
 
 
 def _on_level(camera: Camera, xy: NDArray[Any], height: float) -> _Doubles:

@@ -61,7 +61,8 @@ class SurfaceJob:
 
     def __call__(self, tile: Tile) -> Made:
         """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""
-        views = [_view(scene, _KEPT // len(self.address.scenes), self.frame) for scene in self.address.scenes]
+        kept = _KEPT // len(self.address.scenes)
+        views = [_view(scene, kept, self.frame, self.grid.bounds) for scene in self.address.scenes]
         start = _start(self.address, self.start, self.grid.crs)
         window, m = tile.window, self.scheme.ratio
         shape, finest = (window.height, window.width), (m * window.height, m * window.width)
@@ -103,10 +104,10 @@ class SurfaceJob:
 
 
 @lru_cache(maxsize=256)
-def _view(address: SceneAddress, kept: int, frame: Frame | None) -> View:
+def _view(address: SceneAddress, kept: int, frame: Frame | None, bounds: tuple[float, float, float, float]) -> View:
     """An image and its pyramid, kept for the next tile."""
     scene = address.open()
-    camera = scene.camera if frame is None else FramedCamera(scene.camera, frame)
+    camera = scene.camera if frame is None else FramedCamera(scene.camera, frame, bounds)
     return View(camera, Pyramid(GreyImage(scene.reader), kept=kept))
 
 

@@ -61,9 +61,10 @@ class SurfaceSettings:
     resolution: float
     """Distance of the height posts, metres."""
     target: str = "map"
-    """What heights are over: `map`, `wall:X,Y,Z,AZIMUTH[,TILT]` or `image:NAME[,DISTANCE]`, see `frame_of`."""
+    """What heights are over: `map`, `wall:X,Y,Z,AZIMUTH[,TILT]`, `vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`,
+    `column:X,Y,Z,AZIMUTH,RADIUS` or `image:NAME[,DISTANCE]`, see `frame_of`."""
     bounds: Bounds | None = None
-    """xmin, ymin, xmax, ymax; None: all that two images see, or the image that is the target; a wall needs them."""
+    """xmin, ymin, xmax, ymax; None: all that two images see, or the image that is the target; others need them."""
     start: str = "terrain"
     """`terrain` (the project's), a height in metres, or a file of heights; on a target that is no map a height, for
     `terrain` 0."""
@@ -201,7 +202,7 @@ def plan_surface(
     else:
         bounds = settings.bounds or own
         if bounds is None:
-            raise UsageError(f"target {settings.target}: a wall has no end; give `bounds`, u and v on it in metres")
+            raise UsageError(f"target {settings.target}: it has no end; give `bounds`, u and v on it in metres")
         MapGrid.covering(bounds, settings.resolution, "")
         settings = replace(settings, bounds=bounds, start="0" if settings.start == "terrain" else settings.start)
         looked, blind = over_frame(project, names, frame, bounds, float(settings.start), events)

@@ -14,6 +14,7 @@ from photoplan.cameras.framed import FramedCamera
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import Events
 from photoplan.geometry.bounds import HIGHEST_FLIGHT, area_fault, odd_place
+from photoplan.geometry.cylinder import CylinderFrame
 from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
 from photoplan.io.project.model import Project
 from photoplan.plan.footprint import image_border
@@ -28,7 +29,33 @@ _POINTS = 33
 _APART, _STRAIGHT = 1024.0, 1e-6
 #: Nearest of what an image shows, metres.
 _NEAR = 0.001
-_FORMS = "`map`, `wall:X,Y,Z,AZIMUTH[,TILT]` or `image:NAME[,DISTANCE]`"
+#: Metres by which a place of a target lies beside a ray that meets it.
+_SAME = 1e-3
+_FORMS = (
+    "`map`, `wall:X,Y,Z,AZIMUTH[,TILT]`, `vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`, `column:X,Y,Z,AZIMUTH,RADIUS` or "
+    "`image:NAME[,DISTANCE]`"
+)
+#: Radii of vaults and columns, metres.
+_RADII = (0.01, 10_000.0)
+#: How many numbers each target has; what they are.
+_NUMBERS = {
+    "wall": (
+        (4, 5),
+        "`wall:X,Y,Z,AZIMUTH[,TILT]`: a point of the wall in the project's CRS, the azimuth of its outward normal from "
+        "north by east (-360 to 360), and by how much that is raised (-90 to 90), degrees",
+    ),
+    "vault": (
+        (5, 6),
+        "`vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`: a point of its axis in the project's CRS, the azimuth of the axis from "
+        f"north by east (-360 to 360), the radius ({_RADII[0]:g} to {_RADII[1]:g} m), and by how much the axis rises "
+        "(-90 to 90), degrees",
+    ),
+    "column": (
+        (5, 5),
+        "`column:X,Y,Z,AZIMUTH,RADIUS`: a point of its axis in the project's CRS, the azimuth that its middle faces, "
+        f"from north by east (-360 to 360), and the radius ({_RADII[0]:g} to {_RADII[1]:g} m)",
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,17 +93,18 @@ def over_frame(
     Raises
     ------
     GeometryError
-        The rays of an image are not straight on the ground, or meet in no point; or all images stand behind the target.
+        All images stand behind the target.
     """
     u, v = (np.linspace(bounds[k], bounds[k + 2], _POINTS) for k in (0, 1))
     uvh = np.stack([*np.meshgrid(u, v), np.full((_POINTS, _POINTS), height)], axis=-1).reshape(-1, 3)
     seen, blind, behind = {}, [], 0
     for name in (names[place] for place in map_order(project, names)):
-        camera = FramedCamera(straight(open_scene(project, name), name), frame)
+        camera = FramedCamera(open_scene(project, name).camera, frame, bounds)
         at = project_points(camera, uvh)
-        # From behind nothing of a wall is seen.
-        _, way = camera.rays(at, height)
-        inside = ((at > -0.5) & (at < np.array(camera.size) - 0.5)).all(axis=1) & (way[:, 2] < 0)
+        # From behind nothing of a wall is seen, nor the far side of a column.
+        point, way = camera.rays(at, height)
+        along = np.abs((uvh - point) - ((uvh - point) * way).sum(axis=1)[:, None] * way).max(axis=1)
+        inside = ((at > -0.5) & (at < np.array(camera.size) - 0.5)).all(axis=1) & (way[:, 2] < 0) & (along < _SAME)
         events.done()
         if not inside.any():
             stands = frame.inverse(camera.camera.vantage.point)
@@ -95,8 +123,8 @@ def over_frame(
     return [seen[name] for name in names if name in seen], blind
 
 
-def straight(scene: Scene, name: str) -> Camera:
-    """The camera of a scene, whose rays are straight on the ground and meet in a point.
+def _straight(scene: Scene, name: str) -> Camera:
+    """The camera of a scene, whose rays are straight on the ground and meet in a point, so that a target can follow it.
 
     Raises
     ------
@@ -107,11 +135,11 @@ def straight(scene: Scene, name: str) -> Camera:
     try:
         camera.rays(np.zeros((1, 2)))
     except UsageError:
-        way = "it is a line or satellite image; leave it out with `images`"
+        way = "it is a line or satellite image; choose another one"
         if camera.vantage.central:
-            way = 'state earth_curvature = "none" and no refraction in [orientation]; on a wall neither counts'
+            way = 'state earth_curvature = "none" and no refraction in [orientation]; so near neither counts'
         raise GeometryError(
-            f"image {name!r}: its rays are not straight on the ground, so it sees a map only: {way}"
+            f"image {name!r}: its rays are not straight on the ground, so that no surface lies along it: {way}"
         ) from None
     return camera
 
@@ -129,19 +157,21 @@ def frame_of(project: Project, text: str) -> tuple[Frame | None, Bounds | None]:
     kind, _, rest = text.partition(":")
     if text == "map":
         return None, None
-    if kind == "wall":
+    if kind in _NUMBERS:
         numbers = _numbers(rest)
-        if len(numbers) not in (4, 5) or not (abs(numbers[3]) <= 360 and abs(sum(numbers[4:])) <= 90):
-            raise UsageError(
-                f"target {text}: give `wall:X,Y,Z,AZIMUTH[,TILT]`: a point of the wall in the project's CRS, the "
-                "azimuth of its outward normal from north by east (-360 to 360), and by how much that is raised (-90 "
-                "to 90), degrees"
-            )
-        x, y, z, azimuth = numbers[:4]
+        counts, form = _NUMBERS[kind]
+        more = numbers[4:] if kind == "wall" else numbers[5:]
+        good = len(numbers) in counts and abs(numbers[3]) <= 360 and abs(sum(more)) <= 90
+        if not good or (kind != "wall" and not _RADII[0] <= numbers[4] <= _RADII[1]):
+            raise UsageError(f"target {text}: give {form}")
+        x, y, z, *others = numbers
         odd = odd_place((x, y, z), camera=False) or area_fault(project.crs, (x, y))
         if odd is not None:
             raise UsageError(f"target {text}: {odd}")
-        return WallFrame.facing((x, y, z), azimuth, *numbers[4:]), None
+        if kind == "wall":
+            return WallFrame.facing((x, y, z), *others), None
+        make = CylinderFrame.vault if kind == "vault" else CylinderFrame.column
+        return make((x, y, z), *others), None
     if kind != "image" or not rest:
         raise UsageError(f"target {text}; give {_FORMS}")
     name, _, last = rest.rpartition(",")
@@ -162,7 +192,7 @@ def _numbers(text: str) -> list[float]:
 def _along(project: Project, name: str, distance: float | None, text: str) -> tuple[Frame, Bounds]:
     """The frame of an image, and the bounds of its picture."""
     scene = open_scene(project, project.any_image(name).name)
-    camera = straight(scene, name)
+    camera = _straight(scene, name)
     center = camera.vantage.point
     # Of a camera in a plane picture (x·w, y·w, w) are linear in XYZ, and w is the depth.
     L, twice = (camera.project_homogeneous(center + length * np.eye(3)).T / length for length in (_APART, _APART / 2))
