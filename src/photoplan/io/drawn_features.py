@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio.raw
 import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import split_compound
 from photoplan.io.checks import check_plain_file
-from photoplan.io.objects.vector import _layer
-from photoplan.io.polygons import _states_crs
-from photoplan.io.terrain.options import ReadOptions
-from photoplan.io.terrain.vector import _ERRORS, _check_drawing_units, _is_drawing
+from photoplan.io.vector_layer import is_drawing, read_chosen, states_crs
 
 _POINT, _POLYGON = 0, 3
 
@@ -52,19 +47,9 @@ def read_drawn_features(path: Path, layer: str | None) -> DrawnFeatures:
         The file cannot be read, has several layers and none is stated, or holds nothing to draw.
     """
     path = check_plain_file(path, "vector file")
-    drawing = _is_drawing(path)
-    if drawing:
-        _check_drawing_units(path, ReadOptions())
-    name = "entities" if drawing else _layer(path, layer)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            more = {"INLINE_BLOCKS": "NO"} if drawing else {}
-            meta, _, wkb, data = pyogrio.raw.read(str(path), layer=name, force_2d=False, **more)
-            shapes = shapely.from_wkb(wkb)
-    except _ERRORS as error:
-        raise InputError(f"{path}: layer {name}: cannot be read ({' '.join(str(error).split())[:300]})") from None
-    fields = {str(f).casefold(): values for f, values in zip(meta["fields"], data)}
+    drawing = is_drawing(path)
+    name, found = read_chosen(path, layer)
+    shapes, fields = found.shapes, {field.casefold(): values for field, values in found.fields.items()}
     use = ~(shapely.is_missing(shapes) | shapely.is_empty(shapes))
     if drawing and layer is not None:
         use &= fields["layer"].astype(str) == layer
@@ -83,7 +68,7 @@ def read_drawn_features(path: Path, layer: str | None) -> DrawnFeatures:
     XYZ, part = shapely.get_coordinates(parts, include_z=True, return_index=True)
     if not len(XYZ) or not np.isfinite(XYZ[:, :2]).all():
         raise InputError(f"{path}: layer {name}: holds nothing that can be drawn, or a coordinate that is no number")
-    stated = meta["crs"] if drawing or _states_crs(path, path.open("rb").read(16)) else None
+    stated = found.crs if drawing or states_crs(path) else None
     crs, heights = (None, None) if stated is None else split_compound(stated)
     is_point = shapely.get_type_id(parts) == _POINT
     return DrawnFeatures(

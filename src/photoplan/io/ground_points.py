@@ -8,16 +8,13 @@ are read with declared columns: ``"name,-,x,y,z"``.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio.raw
 import shapely
 from numpy.typing import NDArray
-from pyogrio.errors import DataSourceError, FieldError, GeometryError
 
 from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
@@ -26,6 +23,7 @@ from photoplan.geometry.crs import crs_label, same_crs, split_compound
 from photoplan.io.checks import check_plain_file
 from photoplan.io.plain_files import crs_beside
 from photoplan.io.tables import Columns, Dialect, read_table, write_table
+from photoplan.io.vector_layer import read_layer
 
 _ROLES = {
     "name": ("name", "point", "id", "label", "gcp", "point_id", "marker"),
@@ -133,12 +131,9 @@ def _check_crs(path: Path, own: str | None, wanted: str | None) -> None:
 
 def _from_layer(path: Path, crs: str | None) -> GroundPoints:
     path = check_plain_file(path, "ground points")
-    try:
-        meta, _, wkb, values = pyogrio.raw.read(os.fspath(path.resolve()), force_2d=False)
-        shapes = shapely.from_wkb(wkb)
-    except (DataSourceError, FieldError, GeometryError, shapely.errors.ShapelyError, ValueError, RuntimeError) as error:
-        raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]})") from error
-    _check_crs(path, meta["crs"], crs)
+    found = read_layer(path)
+    shapes = found.shapes
+    _check_crs(path, found.crs, crs)
 
     def where(k: int) -> str:
         return f"{path}: feature {k + 1}"
@@ -149,7 +144,7 @@ def _from_layer(path: Path, crs: str | None) -> GroundPoints:
         if shape is None or shape.geom_type != "Point" or shape.is_empty:
             kind = "without geometry" if shape is None or shape.is_empty else f"a {shape.geom_type}"
             raise InputError(f"{where(k)} is {kind}; ground points are single points")
-    fields = dict(zip((name.casefold() for name in meta["fields"]), values))
+    fields = {name.casefold(): values for name, values in found.fields.items()}
     own = next((fields[n] for n in _ROLES["name"] if n in fields), None)
     if own is None:
         raise InputError(f"{path}: no field with names; one called {' or '.join(_ROLES['name'])} is needed")

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio.raw
 import rasterio.features
 import shapely
 from numpy.typing import NDArray
-from pyogrio.errors import DataSourceError, FieldError, GeometryError
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.checks import check_plain_file
 from photoplan.io.geopackage import VectorLayer, write_geopackage
+from photoplan.io.vector_layer import MAGIC, read_layer, states_crs
 
-_MAGIC = {b"SQLite format 3\0": "GeoPackage", b"\x00\x00\x27\x0a": "Shapefile", b"fgb": "FlatGeobuf"}
 _KINDS = {
     "Polygon": ("Polygon", "MultiPolygon"),
     "Point": ("Point", "MultiPoint"),
@@ -70,14 +66,10 @@ def read_features(path: Path, *kinds: str, crs: str | None = None) -> VectorFeat
     path = check_plain_file(path, "vector file")
     with path.open("rb") as file:
         head = file.read(16)
-    if not any(head.startswith(magic) for magic in _MAGIC) and not head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+    if not head.startswith(tuple(MAGIC)) and not head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
         raise InputError(f"{path}: not a vector file that is read here; allowed are GeoPackage, Shapefile, GeoJSON")
-    try:
-        meta, _, wkb, values = pyogrio.raw.read(os.fspath(path.resolve()), force_2d=False)
-        shapes = shapely.from_wkb(wkb)
-    except (DataSourceError, FieldError, GeometryError, shapely.errors.ShapelyError, ValueError, RuntimeError) as error:
-        raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]})") from error
-    columns = dict(zip(meta["fields"], values))
+    found = read_layer(path)
+    shapes, columns = found.shapes, found.fields
     names = next((columns[key] for key in ("image", "name", "NAME", "Name", "id", "ID") if key in columns), None)
     allowed = [name for kind in kinds for name in _KINDS[kind]]
     items = []
@@ -93,22 +85,12 @@ def read_features(path: Path, *kinds: str, crs: str | None = None) -> VectorFeat
     if not items:
         raise InputError(f"{path}: holds no {' or '.join(kinds)}; give a file that does")
     _refuse_invalid(path, items)
-    own = meta["crs"] if _states_crs(path, head) else None
+    own = found.crs if states_crs(path) else None
     if own is not None and crs is not None and not same_crs(own, crs):
         raise InputError(
             f"{path}: {_PLURAL[kinds[0]]} in {crs_label(own)}, the model is in {crs_label(crs)}; reproject them"
         )
     return VectorFeatures(path, own, tuple(items))
-
-
-def _states_crs(path: Path, head: bytes) -> bool:
-    """Whether a file states its CRS; GDAL takes geographic coordinates for a GeoJSON that says nothing."""
-    if any(head.startswith(magic) for magic in _MAGIC):
-        return True
-    try:
-        return "crs" in json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, OSError, RecursionError):
-        return False
 
 
 def _refuse_invalid(path: Path, items: Sequence[Feature]) -> None:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio.raw
 import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.objects.model import ObjectFile, from_polygons
-from photoplan.io.polygons import _states_crs
-from photoplan.io.terrain.options import ReadOptions
-from photoplan.io.terrain.vector import _ERRORS, _check_drawing_units, _is_drawing, _views
+from photoplan.io.vector_layer import is_drawing, read_chosen, states_crs
 
 _NAMES = ("name", "id", "nr", "label")
 _ROLES = ("paint", "occluder")
@@ -34,19 +30,9 @@ def read(path: Path, layer: str | None) -> ObjectFile:
         The file cannot be read, has several layers and none is stated, or its features are no polygons with heights;
         they are named.
     """
-    drawing = _is_drawing(path)
-    if drawing:
-        _check_drawing_units(path, ReadOptions())
-    name = "entities" if drawing else _layer(path, layer)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            more = {"INLINE_BLOCKS": "NO"} if drawing else {}
-            meta, _, wkb, data = pyogrio.raw.read(str(path), layer=name, force_2d=False, **more)
-            shapes = shapely.from_wkb(wkb)
-    except _ERRORS as error:
-        raise InputError(f"{path}: layer {name}: cannot be read ({' '.join(str(error).split())[:300]})") from None
-    fields = {str(f).casefold(): values for f, values in zip(meta["fields"], data)}
+    drawing = is_drawing(path)
+    name, found = read_chosen(path, layer)
+    shapes, fields = found.shapes, {field.casefold(): values for field, values in found.fields.items()}
     use = ~(shapely.is_missing(shapes) | shapely.is_empty(shapes))
     if drawing:
         use &= np.isin(shapely.get_type_id(shapes), (_LINE, _POLYGON, 6, 7))
@@ -70,23 +56,8 @@ def read(path: Path, layer: str | None) -> ObjectFile:
                 raise InputError(f"{path}: {names[k]!r} is a {part.geom_type}; polygons with heights are needed")
             polygons.append(rings)
             objects.append(k)
-    crs = meta["crs"] if drawing or _states_crs(path, path.open("rb").read(16)) else None
+    crs = found.crs if drawing or states_crs(path) else None
     return from_polygons(str(path), polygons, objects, names, crs, roles)  # type: ignore[arg-type]
-
-
-def _layer(path: Path, layer: str | None) -> str:
-    try:
-        names = [str(name) for name, kind in pyogrio.list_layers(str(path)) if kind is not None]
-    except _ERRORS as error:
-        raise InputError(f"{path}: cannot be opened ({' '.join(str(error).split())[:300]}); get a fresh copy") from None
-    if layer is None and len(names) == 1:
-        layer = names[0]
-    if layer not in names:
-        told = "state one as layer" if layer is None else f"there is no {layer!r}"
-        raise InputError(f"{path}: its layers are {', '.join(names)[:300] or 'none'}; {told}")
-    if layer.casefold() in _views(path):
-        raise InputError(f"{path}: layer {layer!r} is a view (a query, which may have no end); store it as a table")
-    return layer
 
 
 def _name(layer: str, called: Any, row: int) -> str:

@@ -10,31 +10,25 @@ for all) is two-sided. M values are not read.
 from __future__ import annotations
 
 import re
-import sqlite3
-import warnings
 from collections import Counter
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio.raw
 import shapely
 from numpy.typing import NDArray
-from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
 from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_line, make_groups
 from photoplan.io.terrain.options import CodeClass, ReadOptions
+from photoplan.io.vector_layer import ENTITIES, check_drawing_units, is_drawing, layers_of, read_layer, views_of
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 
 _CODES = ("kind", "class", "code")
 _NAMES = ("name", "id", "nr", "label")
 _POINT, _LINE, _RING, _POLYGON = 0, 1, 2, 3
-_DRAWING_METRES = ("0", "6")
-_ERRORS = (DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError, shapely.GEOSException, ValueError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +55,9 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     InputError
         The file cannot be read, is not in metres, or a point or line that needs heights has none.
     """
-    drawing = _is_drawing(path)
-    if drawing:
-        _check_drawing_units(path, options)
+    drawing = is_drawing(path)
+    if drawing and options.crs is None:  # A declared CRS says that the numbers are its metres.
+        check_drawing_units(path)
     notes: list[str] = []
     points: list[PointGroup] = []
     lines: list[MeasuredLine] = []
@@ -71,21 +65,19 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     heights: str | None = None
     codes: set[str] = set()
     fields: list[str] = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for name in _layers(path, options, drawing):
-            layer, text = _layer(path, name, options, drawing, notes)
-            if layer is None:
-                continue
-            stated = _reference(path, text, layer, notes)
-            if crs is not None and stated[0] is not None and stated[0] != crs:
-                raise InputError(f"{path}: layers in {crs} and {stated[0]}; choose layers of one CRS")
-            crs, heights = (crs or stated[0]), (heights or stated[1])
-            more = _features(path, layer, options, notes)
-            points += more[0]
-            lines += more[1]
-            codes |= {layer.name, *layer.codes}
-            fields.append(f"{path.name}: layer {layer.name} with {', '.join(layer.fields) or 'no attributes'}")
+    for name in _layers(path, options, drawing):
+        layer, text = _layer(path, name, options, drawing, notes)
+        if layer is None:
+            continue
+        stated = _reference(path, text, layer, notes)
+        if crs is not None and stated[0] is not None and stated[0] != crs:
+            raise InputError(f"{path}: layers in {crs} and {stated[0]}; choose layers of one CRS")
+        crs, heights = (crs or stated[0]), (heights or stated[1])
+        more = _features(path, layer, options, notes)
+        points += more[0]
+        lines += more[1]
+        codes |= {layer.name, *layer.codes}
+        fields.append(f"{path.name}: layer {layer.name} with {', '.join(layer.fields) or 'no attributes'}")
     return MeasuredTerrain(
         points=tuple(points),
         lines=tuple(lines),
@@ -99,35 +91,11 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     )
 
 
-def _is_drawing(path: Path) -> bool:
-    with path.open("rb") as file:
-        head = file.read(22)
-    return head.startswith(b"AutoCAD Binary DXF") or not head.startswith(
-        (b"SQLite", b"\x00\x00\x27\x0a", b"{", b"\xef", b"fgb")
-    )
-
-
-def _check_drawing_units(path: Path, options: ReadOptions) -> None:
-    """Refuse drawings in units other than metres; a declared CRS says that the numbers are its metres."""
-    with path.open("rb") as file:
-        head = file.read(1 << 16).decode("latin-1")
-    found = re.search(r"\$INSUNITS\s+70\s+(\d+)", head)
-    if found and found[1] not in _DRAWING_METRES and options.crs is None:
-        unit = {"1": "inches", "2": "feet", "4": "millimetres", "5": "centimetres", "21": "US survey feet"}
-        raise InputError(
-            f"{path}: the drawing says its unit is {unit.get(found[1], f'number {found[1]}')} ($INSUNITS); metres are "
-            "needed: convert it, or declare the CRS if the coordinates are its metres nevertheless"
-        )
-
-
 def _layers(path: Path, options: ReadOptions, drawing: bool) -> list[str]:
     if drawing:
-        return ["entities"]
-    views = _views(path)
-    try:
-        names = [str(name) for name, kind in pyogrio.list_layers(str(path)) if kind is not None]
-    except _ERRORS as error:
-        raise InputError(f"{path}: cannot be opened ({' '.join(str(error).split())[:300]}); get a fresh copy") from None
+        return [ENTITIES]
+    views = views_of(path)
+    names = layers_of(path)
     if options.layers is not None and len(names) > 1:
         lost = [name for name in options.layers if name not in names]
         chosen = [name for name in names if name in options.layers]
@@ -144,32 +112,12 @@ def _layers(path: Path, options: ReadOptions, drawing: bool) -> list[str]:
     return names
 
 
-def _views(path: Path) -> set[str]:
-    """Names of the views of a GeoPackage in small letters; nothing for other formats."""
-    with path.open("rb") as file:
-        if file.read(6) != b"SQLite":
-            return set()
-    try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
-            return {
-                str(name).casefold() for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'view'")
-            }
-    except sqlite3.Error as error:
-        raise InputError(f"{path}: cannot be opened ({error}); get a fresh copy") from None
-
-
 def _layer(
     path: Path, name: str, options: ReadOptions, drawing: bool, notes: list[str]
 ) -> tuple[_Layer | None, str | None]:
     """One layer with its geometries taken apart, and its CRS."""
-    # Blocks of drawings are not unfolded: nested ones grow without bound. Their insertion points are points.
-    more = {"INLINE_BLOCKS": "NO"} if drawing else {}
-    try:
-        meta, _, wkb, data = pyogrio.raw.read(str(path), layer=name, **more)
-        geometry = shapely.from_wkb(wkb)
-    except _ERRORS as error:
-        raise InputError(f"{path}: layer {name}: cannot be read ({' '.join(str(error).split())[:300]})") from None
-    fields = {str(f).casefold(): values for f, values in zip(meta["fields"], data)}
+    found = read_layer(path, name)
+    geometry, fields = found.shapes, {name.casefold(): values for name, values in found.fields.items()}
     use = ~(shapely.is_missing(geometry) | shapely.is_empty(geometry))
     if drawing:
         use &= _drawn(path, geometry, fields, options, notes)
@@ -197,10 +145,10 @@ def _layer(
             codes=codes,
             sigma=None if "sigma" not in fields else _sigma(path, fields["sigma"][row]),
             names=None if names is None else np.array([_text(v) for v in names[row]]),
-            fields=tuple(str(f) for f in meta["fields"]),
+            fields=tuple(found.fields),
             right=fields["z_right"][row] if "z_right" in fields else None,
         ),
-        meta["crs"],
+        found.crs,
     )
 
 
