@@ -98,6 +98,17 @@ def test_fault_23_lines_beyond_the_ephemeris_are_not_known(shared: Path) -> None
     assert "0 to 6665 only" in stated.describe()["oriented lines"]
 
 
+@pytest.mark.parametrize("name", ["instrument_pointing", "body_rotation"])
+def test_fault_23_lines_beyond_one_of_the_tables_of_attitudes_are_not_known(name: str) -> None:
+    """The pointing of ale's image of MGS MOC begins a second after its last line; the body's rotation covers it."""
+    isd = Strip(lines=40, columns=30).isd()
+    table = isd["body_rotation"] | isd["instrument_pointing"] if name == "body_rotation" else dict(isd[name])
+    middle = int(np.searchsorted(table["ephemeris_times"], isd["center_ephemeris_time"]))
+    isd[name] = table | {k: table[k][middle:] for k in ("ephemeris_times", "quaternions")}
+    oriented = csm.read(isd, Path("strip.json")).track.oriented
+    assert 15 < oriented[0] < 25 and oriented[1] == 39.5
+
+
 @pytest.fixture
 def pleiades(shared: Path) -> StatedLine:
     return read_line(next((shared / "data/pleiades_line_model").glob("PHRDIMAP*.XML")))

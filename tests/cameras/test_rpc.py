@@ -14,7 +14,7 @@ from tools.rpc_images import CRS, camera, functions, gdal_form
 
 from photoplan.cameras.base import project
 from photoplan.cameras.plane import Affine2D
-from photoplan.cameras.rpc import BOUND, RpcCamera
+from photoplan.cameras.rpc import BOUND, RationalFunctions, RpcCamera, terms
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.geodetic import GeodeticGround
 
@@ -48,6 +48,44 @@ def test_first_numerator_terms_are_longitude_latitude_height() -> None:
         coefficients[0, k] += 1.0
         found = replace(rpc, coefficients=coefficients)(at)
         assert found[0] == pytest.approx((L + term) * rpc.image_scale[0] + rpc.image_offset[0], abs=1e-9)
+
+
+def powers() -> np.ndarray:
+    """Of longitude, latitude and height in the twenty terms, from what the terms of primes are."""
+    primes = np.log([2.0, 3.0, 5.0])
+    logs = np.log(terms(np.exp(primes)))
+    every = np.stack(np.meshgrid(*[range(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    return every[np.abs(logs[:, None] - every @ primes).argmin(axis=1)]
+
+
+@pytest.mark.parametrize("part", [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)])
+def test_scales_may_be_negative(part: tuple[float, float]) -> None:
+    """Planet counts latitudes southwards: LAT_SCALE is −0.0234."""
+    rpc, ground = functions(), np.array([1.0, part[0], part[1]])
+    other = rpc.coefficients * np.prod(ground ** powers(), axis=1)
+    other[2] *= -1
+    turned = RationalFunctions(
+        image_offset=rpc.image_offset,
+        image_scale=(rpc.image_scale[0], -rpc.image_scale[1]),
+        ground_offset=rpc.ground_offset,
+        ground_scale=tuple(np.array(rpc.ground_scale) * ground),
+        coefficients=other,
+    )
+    assert (turned(places()) == rpc(places())).all()
+    assert turned.heights == rpc.heights and min(turned.ground_scale) > 0
+
+
+def test_scales_may_be_whole_degrees() -> None:
+    """SkySat does not scale: the image is a hundredth of its box, whose border lies hundreds of images away."""
+    rpc = functions()
+    unit = np.array([1.0, 1.0, rpc.ground_scale[2]])
+    other = rpc.coefficients * np.prod((unit / rpc.ground_scale) ** powers(), axis=1)
+    seen = replace(rpc, ground_scale=tuple(unit), coefficients=other)
+    assert np.abs(seen(places()) - rpc(places())).max() < 1e-8
+    assert (np.abs(seen.coefficients[::2, 1:3]) > 3).any()
+    other[0, 7] = 1e6
+    with pytest.raises(InputError, match="images away"):
+        replace(seen, coefficients=other)
 
 
 @pytest.mark.parametrize("correction", [None, Affine2D(1.0 + 1e-4, 2e-4, -3.5, -1e-4, 1.0 - 2e-4, 8.25)])
@@ -105,7 +143,7 @@ def test_longitudes_of_a_file_may_be_counted_from_greenwich_all_round() -> None:
     ("changes", "told"),
     [
         ({"image_scale": (0.0, 1.0)}, "scales 0, 1"),
-        ({"ground_scale": (0.1, -0.1, 500.0)}, "all of them are positive"),
+        ({"ground_scale": (0.1, 0.0, 500.0)}, "none of them is 0"),
         ({"ground_offset": (16.0, float("nan"), 0.0)}, "not a finite number"),
         ({"ground_offset": (16.0, 5_340_000.0, 0.0)}, "nowhere on earth"),
         ({"coefficients": np.zeros((4, 20))}, "denominator vanishes"),

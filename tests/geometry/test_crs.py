@@ -51,6 +51,7 @@ def test_fault_20_unfit_crs_is_refused_with_what_is_needed(crs: str, says: str) 
         ("0.9996", "1e300"),
         ("0.9996", "0"),
         ("6378137.0", "1e300"),
+        ("6378137.0", "6378.137"),
         ("500000.0", "1e300"),
         ('"Meter",1.0', '"Meter",1e300'),
         ('"Meter",1.0', '"Meter",-1'),
@@ -65,7 +66,11 @@ def test_fault_30_well_formed_nonsense_is_no_reference_system(number: str, absur
         parse_crs(usual.replace(number, absurd), "a.prj")
 
 
-@pytest.mark.parametrize("crs", ["EPSG:32615", "EPSG:2154", "EPSG:31287", NGI])
+#: Vesta and Jupiter, a 22nd of the earth and eleven times as large.
+OTHERS = [f"+proj=eqc +lat_ts=-16 +lon_0=-83 +a={a} +b={b} +units=m" for a, b in ((289e3, 229e3), (71492e3, 66854e3))]
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32615", "EPSG:2154", "EPSG:31287", NGI, *OTHERS])
 def test_projected_metres_are_taken(crs: str) -> None:
     assert require_projected_metres(crs).is_projected
 

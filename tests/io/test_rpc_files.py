@@ -99,7 +99,7 @@ def changed(name: str, old: str, new: str) -> str:
     [
         ("scene_RPC.TXT", changed("scene_RPC.TXT", "SAMP_DEN_COEFF_7:", "X:"), "SAMP_DEN_COEFF: 19 values"),
         ("scene_RPC.TXT", changed("scene_RPC.TXT", "LINE_OFF:", "LINE_OFF: 5\nLINE_OFF:"), "LINE_OFF is given twice"),
-        ("scene_RPC.TXT", changed("scene_RPC.TXT", "LAT_SCALE: 0.1", "LAT_SCALE: 0"), "scales .* positive"),
+        ("scene_RPC.TXT", changed("scene_RPC.TXT", "LAT_SCALE: 0.1", "LAT_SCALE: 0"), "scales .* none of them is 0"),
         ("scene_RPC.TXT", changed("scene_RPC.TXT", "HEIGHT_OFF: 300.0", "HEIGHT_OFF: nan"), "HEIGHT_OFF: .*finite"),
         ("scene_RPC.TXT", changed("scene_RPC.TXT", "LINE_OFF: 2199.5", "LINE_OFF: x"), "LINE_OFF: 'x' given"),
         ("scene_RPC.TXT", "nothing of it", "LINE_OFF"),

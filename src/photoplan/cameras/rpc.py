@@ -44,8 +44,7 @@ class RationalFunctions:
     Raises
     ------
     InputError
-        A number is not finite, a scale not positive, an offset no place on earth, or a denominator vanishes in the
-        middle.
+        A number is not finite, a scale 0, an offset no place on earth, or a denominator vanishes in the middle.
     """
 
     image_offset: tuple[float, float]
@@ -67,9 +66,11 @@ class RationalFunctions:
         if not (np.isfinite(np.concatenate(parts)).all() and np.isfinite(coefficients).all()):
             raise InputError("an offset, scale or coefficient is not a finite number")
         scales = (*self.image_scale, *self.ground_scale)
-        if not min(scales) > 0:
+        if 0 in scales:
             told = ", ".join(f"{scale:g}" for scale in scales)
-            raise InputError(f"scales {told} (sample, line, longitude, latitude, height); all of them are positive")
+            raise InputError(f"scales {told} (sample, line, longitude, latitude, height); none of them is 0")
+        if min(scales) < 0:
+            self._turn_scales()
         lon, lat, height = self.ground_offset
         if not (abs(lon) <= 360 and abs(lat) <= 90 and abs(height) < 1e4):
             raise InputError(
@@ -87,9 +88,27 @@ class RationalFunctions:
             raise InputError("a numerator does not change with longitude and latitude; coefficients are missing")
         self._refuse_far()
 
+    def _turn_scales(self) -> None:
+        """Bring signs of scales into the terms of odd degree: some producers count latitudes southwards (Planet)."""
+        image, ground = np.sign(self.image_scale), np.sign(self.ground_scale)
+        coefficients = self.coefficients * np.prod(ground**_POWERS, axis=1)
+        coefficients[::2] *= image[:, None]
+        coefficients.setflags(write=False)
+        object.__setattr__(self, "coefficients", coefficients)
+        for name in ("image_scale", "ground_scale"):
+            object.__setattr__(self, name, tuple(abs(scale) for scale in getattr(self, name)))
+
     def _refuse_far(self) -> None:
-        """Refuse what leads from the box of ground coordinates to places many images away: a coefficient is wrong."""
+        """Refuse what leads from the box of ground coordinates to places many images away: a coefficient is wrong.
+
+        Some producers scale by a whole degree (SkySat): of such a box that part counts in which the image lies, by the
+        slopes in the middle.
+        """
         nodes = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
+        top, bottom = self.coefficients[::2, :3], self.coefficients[1::2, :3]
+        with np.errstate(all="ignore"):
+            J = (top[:, 1:] - top[:, :1] / bottom[:, :1] * bottom[:, 1:]) / bottom[:, :1]
+            nodes[:, :2] *= np.fmin(1.0, 2.0 * np.linalg.norm(J) / np.abs(J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]))
         p = terms(nodes) @ self.coefficients.T
         with np.errstate(all="ignore"):
             value, bottom = p[:, ::2] / p[:, 1::2], p[:, 1::2] / self.coefficients[1::2, 0]

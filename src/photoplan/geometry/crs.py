@@ -22,8 +22,8 @@ from pyproj.transformer import TransformerGroup
 
 from photoplan.errors import InputError
 
-#: A hundredth of a degree on the earth, metres.
-_HUNDREDTH = 6.371e6 * np.pi / 180.0 / 100.0
+#: A hundredth of a degree, radians.
+_HUNDREDTH = np.pi / 180.0 / 100.0
 
 
 @lru_cache(maxsize=256)
@@ -48,14 +48,19 @@ def parse_crs(text: str, where: str = "CRS") -> CRS:
     return crs
 
 
-#: A map's metre on the ground: units are converted, projections stretch, the moon is small.
+#: A map's metre on the ground: units are converted, projections stretch.
 _SCALES = 0.1, 10.0
+#: Radii of bodies that ellipsoids describe, from asteroids to Jupiter, metres.
+_RADII = 1e5, 1e8
 
 
 def _unusable(crs: CRS) -> str:
     """Why a projected CRS describes no map, though it is well formed: numbers may have any size in WKT; else empty."""
     if not crs.is_projected:
         return ""
+    radius = 6378137.0 if crs.ellipsoid is None else crs.ellipsoid.semi_major_metre
+    if not _RADII[0] < radius < _RADII[1]:
+        return f"a body of radius {radius / 1000:g} km"
     # Some of these places are near the middle of any map.
     lon, lat = (v.ravel() for v in np.meshgrid(np.arange(-180.0, 180.0, 15.0), np.arange(-75.0, 80.0, 25.0)))
     try:
@@ -67,10 +72,10 @@ def _unusable(crs: CRS) -> str:
         return "PROJ cannot compute with its numbers"
     with np.errstate(all="ignore"):
         turned = (back[0] - lon + 180.0) % 360.0 - 180.0
-        scale = np.hypot(north[0] - x, north[1] - y) * crs.axis_info[0].unit_conversion_factor / _HUNDREDTH
+        scale = np.hypot(north[0] - x, north[1] - y) * crs.axis_info[0].unit_conversion_factor / (_HUNDREDTH * radius)
         close = np.hypot(turned, back[1] - lat) < 1e-6
         usable = close & (scale > _SCALES[0]) & (scale < _SCALES[1])
-    return "" if usable.any() else "nowhere on earth is one of its metres near a metre: a number of it is wrong"
+    return "" if usable.any() else "nowhere is one of its metres near a metre: a number of it is wrong"
 
 
 def require_projected_metres(text: str, where: str = "CRS") -> CRS:

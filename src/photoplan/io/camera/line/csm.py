@@ -171,6 +171,10 @@ def _track(isd: _Isd) -> LineTrack:
     ]
     courses = [replace(each, start=each.start - isd.numbers("center_ephemeris_time", ())) for each in courses]
     known = max(each.start for each in courses), min(each.end for each in courses)
+    # Of attitudes there are two tables; where one has ended nothing is known (of a single value: it holds always).
+    for name in ("instrument_pointing", "body_rotation"):
+        its = isd.moments(name) - isd.numbers("center_ephemeris_time", ())
+        known = (max(known[0], its[0]), min(known[1], its[-1])) if len(its) > 1 else known
     return LineTrack(isd.lines, *_clock(isd), courses[0], courses[1], known)
 
 
