@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tools.thinned import some
 
 from photoplan.cameras.affine_facts import affine_facts, film_shrinkage, residuals_on_film
 from photoplan.cameras.fiducials_fit import MODELS, FiducialFit, fit_affine, fit_bilinear, fit_marks, fit_similarity
@@ -72,7 +73,7 @@ def test_similarity_is_the_least_squares_solution() -> None:
     assert fit.sigma0 == pytest.approx(math.sqrt((v**2).sum() / 12))
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("mirrored", some([False, True], 1))
 def test_covariance_of_a_similarity_describes_the_scatter_of_many_scans(mirrored: bool) -> None:
     sd, truth = 0.2, film(0.4, mirrored=mirrored)
     fits = [fit_similarity(EIGHT, scan(truth, sd, seed), mirrored=mirrored) for seed in range(400)]
@@ -171,7 +172,7 @@ def test_shrinkage_is_along_the_film_however_it_lies_in_the_scanner(turn: float)
         film_shrinkage(transformation, (0.0, 0.02))
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", some(MODELS, 2))
 def test_sigma_of_the_shrinkage_describes_the_scatter_of_many_scans(model: str) -> None:
     truth = film(0.4, (50.0, 40.0) if model != "similarity" else (50.0, 50.0))
     fits = [fit_marks(model, EIGHT, scan(truth, 0.2, seed)) for seed in range(400)]

@@ -175,7 +175,7 @@ class TestStrip:
     """A flight over level ground, its pixels drawn ray by ray by other means."""
 
     def test_pixels_see_what_was_drawn(self) -> None:
-        strip = Strip()
+        strip = Strip(lines=120)
         camera = csm.read(strip.isd(), Path("strip.json")).camera(strip.crs, "ellipsoidal")
         XY = strip.seen(300.0)
         found = project(camera, np.concatenate([XY, np.full((*XY.shape[:2], 1), 300.0)], axis=-1))
@@ -184,8 +184,8 @@ class TestStrip:
 
     def test_commands(self, tmp_path: Path) -> None:
         """Information, check, orthophoto: each place of the map shows the grey value that it has."""
-        project_file = Strip().write(tmp_path, 300.0)
-        assert "600 lines of 4.28571 ms" in inside("info", tmp_path / "strip.json").out
+        project_file = Strip(lines=160).write(tmp_path, 300.0)
+        assert "160 lines of 4.28571 ms" in inside("info", tmp_path / "strip.json").out
         assert "all plausible" in inside("check", project_file).out
         said = inside("ortho", project_file, "--resolution", 0.3, "--no-quicklook")
         assert said.code == 0, said.err
@@ -212,11 +212,11 @@ class TestStrip:
         assert np.ptp(seen.outline[:, :2], axis=0) == pytest.approx([along, across], rel=0.15)
 
     def test_an_image_of_another_size_is_refused(self, tmp_path: Path) -> None:
-        project_file = Strip().write(tmp_path, 300.0)
-        isd = Strip(lines=500).isd()
+        project_file = Strip(lines=60).write(tmp_path, 300.0)
+        isd = Strip(lines=50).isd()
         (tmp_path / "strip.json").write_text(json.dumps(isd))
         said = inside("ortho", project_file, "--resolution", 0.3)
-        assert said.code == 3 and "400 × 600 pixels" in said.err and "400 × 500" in said.err
+        assert said.code == 3 and "400 × 60 pixels" in said.err and "400 × 50" in said.err
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ def test_pixels_see_what_was_drawn(
     tmp_path: Path, name: str, ahead: float, lever: tuple[float, float, float], late: float
 ) -> None:
     """A lens, a line that looks 25° ahead, an antenna two metres away, a clock that is late; grid north is 1° off."""
-    strip = Strip()
+    strip = Strip(lines=120)
     camera = read_line(strip.strip_file(tmp_path, lever, late), name).camera(strip.crs, "ellipsoidal")
     XY = strip.seen(300.0, ahead)
     found = project(camera, np.concatenate([XY, np.full((*XY.shape[:2], 1), 300.0)], axis=-1))
@@ -36,9 +36,9 @@ def test_pixels_see_what_was_drawn(
 
 def test_boresight_turns_the_camera(tmp_path: Path) -> None:
     """A tenth of a degree about the line of flight moves columns by 0.1° in units of a pixel."""
-    strip = Strip()
+    strip = Strip(lines=60)
     path = strip.strip_file(tmp_path)
-    ground = np.array([[*strip.seen(300.0)[300, 200], 300.0]])
+    ground = np.array([[*strip.seen(300.0)[30, 200], 300.0]])
     before = project(read_line(path, "nadir").camera(strip.crs, "ellipsoidal"), ground)
     path.write_text(path.read_text().replace("lever_arm", "boresight = [0.1, 0.0, 0.0]\nlever_arm"))
     after = project(read_line(path, "nadir").camera(strip.crs, "ellipsoidal"), ground)
@@ -48,12 +48,12 @@ def test_boresight_turns_the_camera(tmp_path: Path) -> None:
 
 def test_two_lines_of_one_flight_show_the_same_ground(tmp_path: Path) -> None:
     """Orthophotos of the nadir and the forward line, by command: the grey value of each place in both."""
-    strip = Strip()
+    strip = Strip(lines=160)
     strip.strip_file(tmp_path)
     entries = []
     for name, ahead in (("nadir", 0.0), ("forward", 46.6)):
         with rasterio.open(
-            tmp_path / f"{name}.tif", "w", driver="GTiff", width=400, height=600, count=1, dtype="float32"
+            tmp_path / f"{name}.tif", "w", driver="GTiff", width=400, height=160, count=1, dtype="float32"
         ) as file:
             file.write(pattern(strip.seen(300.0, ahead)).astype(np.float32), 1)
         entries.append(f'[[images]]\nname = "{name}"\nfile = "{name}.tif"\nline = "strip.toml"\ndetectors = "{name}"\n')

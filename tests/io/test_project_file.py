@@ -81,7 +81,7 @@ def usable(name: str) -> bool:
         return False
 
 
-@settings(max_examples=examples(25, 60), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(10, 60), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.text(min_size=1, max_size=30).filter(usable),
     numbers=st.tuples(

@@ -179,10 +179,17 @@ def test_fault_29_no_folder(tmp_path: Path) -> None:
         write_small(tmp_path / "absent" / "m.gpkg")
 
 
-@pytest.fixture
-def model(tmp_path: Path) -> Path:
-    path = tmp_path / "m.gpkg"
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("written") / "m.gpkg"
     write_small(path)
+    return path.read_bytes()
+
+
+@pytest.fixture
+def model(tmp_path: Path, written: bytes) -> Path:
+    path = tmp_path / "m.gpkg"
+    path.write_bytes(written)
     return path
 
 

@@ -11,7 +11,7 @@ from photoplan.kernels.coverage import cover
 
 def covered(outline: NDArray[np.float64], rows: int = 9, columns: int = 12) -> NDArray[np.float64]:
     total = np.full((rows, columns + 1), np.nan)
-    cover(outline, total)
+    cover(np.ascontiguousarray(outline), total)
     return total[:, :-1]
 
 

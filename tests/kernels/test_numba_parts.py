@@ -30,7 +30,7 @@ def many(gather):
 
 
 #: Two kernels of numba are compiled for each.
-QUICK = {("bilinear", "uint8"), ("lanczos3", "uint8"), ("bicubic", "float32"), ("nearest", "float32")}
+QUICK = {("lanczos3", "uint8"), ("bicubic", "float32")}
 GATHER = {"loops": many(sampling.gather_loops), "vectors": many(sampling.gather)}
 
 

@@ -47,6 +47,7 @@ def predicted(
     reached = [np.flatnonzero(np.abs(targets - leaf[:2]).max(axis=1) < 1.5 * leaf[2]) for leaf in leaves]
     wanted, start = np.concatenate(reached), np.concatenate([[0], np.cumsum([len(r) for r in reached])])
     about = np.full(len(xyz), np.nan) if squares is None else squares, USUAL
+    ids = np.ascontiguousarray(ids)
     failed = predict(
         xyz, noise, ids, leaves, targets, wanted, start, *stacked(list(lines)), models, shares, *about, sums
     )

@@ -55,7 +55,7 @@ def match(template: NDArray, window: NDArray, start: tuple[float, ...] = (HALF, 
     results = np.zeros((1, RESULTS))
     results[0, :6] = start
     weights = np.ones((1, *template.shape))
-    match_patches(template[None], weights, coefficients, np.array([30, 1e-3, 4.0]), results)
+    match_patches(np.ascontiguousarray(template)[None], weights, coefficients, np.array([30, 1e-3, 4.0]), results)
     return results[0]
 
 

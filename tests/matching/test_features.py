@@ -64,9 +64,9 @@ def test_sixteen_bits_give_the_features_of_eight() -> None:
 
 
 def test_tiles_leave_no_trace() -> None:
-    image = grey(texture(500, 420).astype(np.uint8))
+    image = grey(texture(330, 300).astype(np.uint8))
     whole = extract_features(image, FeatureSettings(count=5000))
-    tiled = extract_features(image, FeatureSettings(count=5000, tile=160))
+    tiled = extract_features(image, FeatureSettings(count=5000, tile=128))
     assert same_places(whole, tiled, 0.3) > 0.97 and same_places(tiled, whole, 0.3) > 0.97
     assert abs(len(whole) - len(tiled)) < 0.03 * len(whole)
 

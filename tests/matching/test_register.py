@@ -71,7 +71,7 @@ def image(pixels: NDArray) -> GreyImage:
             ((0.3, -0.4), 50, 4.0, 0.7),
             ((0.5, 0.5), 50, 3.0, 0.0),
         ],
-        *(2, 5, 6, 7),
+        *(2, 5, 6),
     ),
 )
 def test_errors_are_small_and_as_large_as_stated(

@@ -133,7 +133,7 @@ def test_simulated_blocks_are_unbiased_and_covariances_calibrated(count: int) ->
     assert 0.97 < np.mean(sigma0) < 1.03
 
 
-@pytest.mark.parametrize("seed", some(range(5), 0, 1))
+@pytest.mark.parametrize("seed", some(range(5), 0))
 def test_fault_17_a_tenth_of_gross_errors_is_found(seed: int) -> None:
     """Errors of 20 standard deviations to 200 pixels in a tenth of all image points."""
     simulated = simulate(seed, strips=3, images=6, per_image=70, gross=0.1)
@@ -160,7 +160,7 @@ def test_fault_17_a_tenth_of_gross_errors_is_found(seed: int) -> None:
 
 
 def test_gross_errors_in_control_and_positions_are_found() -> None:
-    simulated = simulate(2, strips=3, images=10, per_image=100, gnss=0.05, attitude=2e-4, base=0.2)
+    simulated = simulate(2, strips=3, images=6, per_image=80, gnss=0.05, attitude=2e-4, base=0.2)
     block = simulated.block
     XYZ, seen = block.ground.XYZ.copy(), block.positions.XYZ.copy()
     rays = np.bincount(block.observations.point)
@@ -174,7 +174,7 @@ def test_gross_errors_in_control_and_positions_are_found() -> None:
     assert result.ground_residuals[wrong, 2] == pytest.approx(-5.0, abs=0.5)
 
 
-@pytest.mark.parametrize("seed", [6, 9])
+@pytest.mark.parametrize("seed", some([6, 9], 0))
 def test_a_block_that_only_control_holds_is_not_tilted_to_fit_wrong_control(seed: int) -> None:
     """Two corners wrong by a tilt's worth: six more heights of seven would go to keep them."""
     simulated = simulate(seed, strips=2, images=5, per_image=40, gross=0.03, control=9, height=300, relief=30, base=0.3)
@@ -343,7 +343,7 @@ def test_variance_components_find_the_accuracies() -> None:
 def test_opencv_lens_is_calibrated() -> None:
     """A block seen through OpenCV's lens gives its coefficients back, in OpenCV's own meaning."""
     true = OpenCV(-0.05, 0.02, 8e-4, -5e-4)
-    simulated = simulate(7, strips=4, images=6, per_image=80, lens=true, sigma=0.2, cross=True, free=PARAMETERS[:8])
+    simulated = simulate(7, strips=3, images=5, per_image=80, lens=true, sigma=0.2, cross=True, free=PARAMETERS[:8])
     start = replace(simulated.block.cameras["cam"], lens=OpenCV())
     block = replace(simulated.block, cameras={"cam": start})
     result = adjust_block(block)

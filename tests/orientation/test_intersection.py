@@ -144,6 +144,7 @@ def test_chunks_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (parts.used == whole.used).all()
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_points_take_seconds() -> None:
     rng = np.random.default_rng(6)
     poses, X = block(rng, 4), ground(rng, 100_000)

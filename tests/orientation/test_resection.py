@@ -28,8 +28,9 @@ from photoplan.orientation.resection.direct import resect_direct
 UNKNOWN_C = ResectSettings(camera_constant_known=False)
 
 
-@pytest.mark.parametrize("relief", [0.0, 300.0])
-@pytest.mark.parametrize("tilt", some([0.0, 0.03, 0.2], 0, 2))
+@pytest.mark.parametrize(
+    ("relief", "tilt"), some([(0.0, 0.0), (300.0, 0.2), (0.0, 0.2), (300.0, 0.0), (0.0, 0.03), (300.0, 0.03)], 0, 1)
+)
 def test_exact_observations_give_the_pose(relief: float, tilt: float) -> None:
     rng = np.random.default_rng(3)
     for count in (4, 5, 8, 30):
@@ -215,10 +216,11 @@ def test_fault_16_too_few_points() -> None:
         resect(measured(frame(pose), X, rng, 0.0), AERIAL, NoLens(), ResectSettings(free=("c", "x0", "y0")))
 
 
-def test_three_points_need_an_approximate_pose_or_leave_several() -> None:
+@thinned("poses", 8, 20)
+def test_three_points_need_an_approximate_pose_or_leave_several(poses: int) -> None:
     rng = np.random.default_rng(13)
     refused = 0
-    for _ in range(20):
+    for _ in range(poses):
         pose = aerial_pose(rng)
         points = measured(frame(pose), ground_below(rng, pose, 3, 100.0), rng, 0.0)
         near = Pose(pose.center + np.array([5, -6, 5]), pose.R_ground_camera @ rotation_opk(0.004, 0.003, 0.01))
@@ -230,11 +232,11 @@ def test_three_points_need_an_approximate_pose_or_leave_several() -> None:
             assert np.abs(alone.pose.center - pose.center).max() < 1e-4
         except GeometryError as error:
             refused += "3 points leave" in str(error)
-    assert refused > 5
+    assert refused > 0.25 * poses
 
 
 @pytest.mark.parametrize("count", [4, pytest.param(5, marks=pytest.mark.slow)])
-@thinned("poses", 40, 100)
+@thinned("poses", 20, 100)
 def test_few_noisy_points_never_give_another_pose(count: int, poses: int) -> None:
     rng = np.random.default_rng(1)
     refused = 0

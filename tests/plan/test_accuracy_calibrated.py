@@ -99,7 +99,7 @@ def errors_of_a_block(seed: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", some(CAMERAS, 3))
-@thinned("blocks", 4, 200)
+@thinned("blocks", 2, 200)
 def test_normalised_errors_of_pixels(kind: str, blocks: int) -> None:
     found = [errors_of_a_block(seed, kind)[0] for seed in range(blocks)]
     rms = np.sqrt(np.mean(np.square(np.concatenate(found, axis=1)), axis=1))

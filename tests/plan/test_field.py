@@ -155,7 +155,7 @@ def test_a_crop_of_a_tile_has_the_same_positions_bit_by_bit() -> None:
 
 
 @pytest.mark.parametrize("kernel", some(["bilinear", "bicubic", "lanczos3"], 1))
-@settings(max_examples=examples(5, 10), deadline=None)
+@settings(max_examples=examples(3, 10), deadline=None)
 @given(
     name=st.sampled_from(sorted(LENSES)),
     kappa=st.floats(-3.1, 3.1),

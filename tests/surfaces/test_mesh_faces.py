@@ -10,6 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.hybrid_models import line, model, plain_unit, random_lines, rough
+from tools.thinned import examples
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.surfaces.hybrid import HybridSurface
@@ -55,7 +56,7 @@ def edge_points(surface: HybridSurface, rng: np.random.Generator, away: float = 
     return a[inside], b[inside]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(15, 40), deadline=None)
 @given(seed=st.integers(0, 100_000))
 def test_the_surface_is_continuous_and_exact_along_lines(seed: int) -> None:
     rng = np.random.default_rng(seed)

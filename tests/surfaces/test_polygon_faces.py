@@ -7,6 +7,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tools.thinned import examples
 
 from photoplan.errors import InputError, UsageError
 from photoplan.surfaces.polygon_faces import distance_weighted, triangles_of
@@ -118,7 +119,7 @@ def test_weighted_by_distance_a_vertex_keeps_its_height_and_an_edge_does_not() -
     assert (inside > 10).all() and (inside < 16).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(12, 30), deadline=None)
 @given(st.integers(3, 20), st.integers(0, 10_000))
 def test_squares_cover_a_polygon_to_the_finest_and_never_overlap(count: int, seed: int) -> None:
     hole = shapely.Polygon([(-1, -1), (1, -1), (0.5, 1)])

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.hybrid_models import line, model, random_lines
+from tools.thinned import examples
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
@@ -51,7 +52,7 @@ def check(surface, polyline, bound: float) -> tuple[np.ndarray, ...]:
     return distance, X, Y, Z
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(15, 40), deadline=None)
 @given(seed=st.integers(0, 100_000))
 def test_between_its_points_a_profile_is_the_surface(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.function_surface import ArrayGrid
 from tools.ray_twin import over_patches
+from tools.thinned import examples
 
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
@@ -77,7 +78,7 @@ def assert_same(seen: Seen, wanted: Seen, within: float = 1e-6) -> None:
         np.testing.assert_allclose(getattr(seen, name), getattr(wanted, name), rtol=0, atol=within, err_msg=name)
 
 
-@settings(max_examples=40 if COMPILED else 4, deadline=None)
+@settings(max_examples=examples(15, 40) if COMPILED else 4, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
     kind=st.sampled_from(["frame", "cylinder", "sphere"]),

@@ -307,7 +307,7 @@ def terrains(draw: st.DrawFn) -> tuple[MeasuredTerrain, bool]:
     return MeasuredTerrain((CORNERS, points), tuple(lines)), side == 1.0 and noise == 0.0
 
 
-@settings(max_examples=examples(60, 150), deadline=None, derandomize=True)
+@settings(max_examples=examples(25, 150), deadline=None, derandomize=True)
 @given(terrains())
 def test_fault_19_any_lines_can_be_triangulated_after_cleaning(case: tuple[MeasuredTerrain, bool]) -> None:
     measured, exact = case

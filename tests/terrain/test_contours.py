@@ -147,7 +147,7 @@ def test_a_saddle_has_its_hyperbolas() -> None:
 
 
 def test_higher_ground_is_on_the_right() -> None:
-    heights = rough(5)
+    heights = rough(5, 24)
     for line in traced(heights, interval=0.5):
         step = np.diff(line.xy, axis=0)
         size = np.hypot(*step.T)[:, None]
@@ -195,7 +195,7 @@ def canonical(lines: list[ContourLine]) -> set[Any]:
 @pytest.mark.parametrize("options", [{}, {"smooth": True}])
 def test_parts_do_not_show(options: dict[str, Any]) -> None:
     """Lines over parts of 5, 7 and all meshes are the same, whole lines; smoothing comes after joining."""
-    heights = rough(2)
+    heights = rough(2, 22)
     whole = canonical(traced(heights, side=100, interval=0.9, base=0.05, **options))
     for side in (5, 7):
         assert canonical(traced(heights, side=side, interval=0.9, base=0.05, **options)) == whole

@@ -189,10 +189,10 @@ class BestImage:
             there = np.abs(near) < 2 * rim
             x, y = np.moveaxis(np.abs(camera.field(xy[there]) - (np.array(camera.size) - 1) / 2), -1, 0)
             near[there] = np.minimum(width / 2 - x, height / 2 - y)
-        border = self.weights.border, rim, _MARGIN, _RIMMED
-        sloped = 0.5 * self.weights.coarseness, _FLATTEST, _STEEPEST
-        mine = np.zeros((0, 0), np.uint16) if drawn is None else drawn
-        ahead = self.ranks[row] if self.ranks else 0.0, row + 1, _DRAWN
+        border = float(self.weights.border), float(rim), _MARGIN, _RIMMED
+        sloped = 0.5 * float(self.weights.coarseness), _FLATTEST, _STEEPEST
+        mine = np.zeros((0, 0), np.uint16) if drawn is None else np.ascontiguousarray(drawn)
+        ahead = float(self.ranks[row]) if self.ranks else 0.0, row + 1, _DRAWN
         add_penalties(near, values, slope, mine, border, sloped, ahead)
         return values[0], values[1]
 

@@ -171,10 +171,10 @@ def _singles(
             break
         used[best] = False
         near = around.wide[best]
-        touched = np.unique(near[near >= 0])
+        touched = np.unique(near[near >= 0]).astype(np.int64)
         fit_planes(seen.xyz, around.near, used, touched, planes)
         near = around.wide[touched]
-        changed = np.unique(near[near >= 0])
+        changed = np.unique(near[near >= 0]).astype(np.int64)
         asked = np.union1d(changed, found)
     return np.flatnonzero(~used[:p])
 

@@ -218,7 +218,7 @@ class Margin:
             wanted = self._near(valid, at, wide) & ~known
             place = (wide.row - at.row, wide.col - at.col, LEFT)
             light = np.ascontiguousarray(pixels, np.float32)
-            extend_oddly(light, valid, wanted, _offsets(self.columns, self.rows), place, out)
+            extend_oddly(light, np.ascontiguousarray(valid), wanted, _offsets(self.columns, self.rows), place, out)
         elif common.size < wide.size:
             _beyond_edges(pixels, at, wide, to, body)
         return out
