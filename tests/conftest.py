@@ -28,13 +28,16 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 #: Files that take longest, the longest first: one that began last would keep one process busy when all others are done.
 DEAR = (
     "products/test_every_run.py",
-    "terrain/test_fit.py",
     "kernels/test_rectify.py",
+    "terrain/test_fit.py",
     "cli/test_run_faults.py",
     "products/test_restore_design.py",
     "cli/test_adjust_command.py",
     "orientation/test_mark_search.py",
     "terrain/test_build.py",
+    "engine/test_tilted.py",
+    "terrain/test_gross_errors.py",
+    "orientation/test_bundle.py",
     "experiments/test_design_pages.py",
     "cli/test_mtf_command.py",
     "products/test_plausibility.py",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -33,23 +34,33 @@ def affine(k: int) -> tuple[NDArray, NDArray]:
 
 def pictures(noise: float, blur: float = 0.0, seed: int = 1) -> list[GreyImage]:
     """Three views of waves, known everywhere; noise of standard deviation `noise`, correlated by `blur`."""
+    rng, out = np.random.default_rng(seed), []
+    rng.uniform(size=450)  # of the waves
+    for view, values in enumerate(waves(seed)):
+        grains = rng.normal(size=(SIDE, SIDE))
+        if blur:
+            grains = ndimage.gaussian_filter(grains, blur)
+            grains /= grains.std()
+        seen = values + noise * grains
+        out.append(GreyImage(ArrayPixels((seen * (1 - 0.1 * view) + 5 * view)[None].astype(np.float32))))
+    return out
+
+
+@cache
+def waves(seed: int) -> tuple[NDArray, ...]:
+    """The three views without noise."""
     rng = np.random.default_rng(seed)
     length, angle = rng.uniform(6, 30, 150), rng.uniform(0, 2 * np.pi, 150)
     k = 2 * np.pi / length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     phase = rng.uniform(0, 2 * np.pi, 150)
     row, col = np.mgrid[:SIDE, :SIDE].astype(float)
-    out = []
+    views = []
     for view in range(3):
         A, t = affine(view)
         at = np.linalg.inv(A) @ (np.stack([col, row]).reshape(2, -1) - t[:, None])
         values = sum(np.cos(a * at[0] + b * at[1] + p) for (a, b), p in zip(k, phase))
-        grains = rng.normal(size=(SIDE, SIDE))
-        if blur:
-            grains = ndimage.gaussian_filter(grains, blur)
-            grains /= grains.std()
-        values = 120 + 30 * values.reshape(SIDE, SIDE) / np.sqrt(75) + noise * grains
-        out.append(GreyImage(ArrayPixels((values * (1 - 0.1 * view) + 5 * view)[None].astype(np.float32))))
-    return out
+        views.append(120 + 30 * values.reshape(SIDE, SIDE) / np.sqrt(75))
+    return tuple(views)
 
 
 def tracks(count: int, spoil: float, seed: int = 2) -> tuple[Tracks, NDArray]:

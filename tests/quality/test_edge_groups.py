@@ -39,7 +39,7 @@ class TestCombine:
         assert np.ptp(apart.interval) < 6.0 * apart.sigma
         assert np.ptp(near.interval) < 0.75 * np.ptp(alone.interval)
 
-    @pytest.mark.parametrize("edges", [1, 2, 5])
+    @pytest.mark.parametrize("edges", some([1, 2, 5], 0, 1))
     def test_errors_that_are_known_from_few_blocks_make_intervals_wider(self, edges: int) -> None:
         """Of seven degrees of freedom each: with the normal distribution's factor 91 % and not 95 % for one edge."""
         rng = np.random.default_rng(edges)

@@ -127,7 +127,7 @@ def test_a_direction_that_is_practically_unknown_stays_as_it_is():
         design_filter(unknown, known, (SCENE,), DesignOptions("exact"))
 
 
-@pytest.mark.parametrize("quality", [60, 90])
+@pytest.mark.parametrize("quality", some([60, 90], 0))
 def test_noise_that_compression_has_smoothed_is_not_taken_for_the_scene(quality):
     """JPEG takes noise from high frequencies and from even blocks; the white noise that is left there is too little."""
     rng = np.random.default_rng(4)
@@ -327,7 +327,7 @@ def errors(scene, optics, snr, bits, rng):
     return before, after, other
 
 
-@pytest.mark.parametrize(("name", "snr", "bits"), [("gaussian 0.6", 50, 8), ("diffraction 2", 200, 16)])
+@pytest.mark.parametrize(("name", "snr", "bits"), some([("gaussian 0.6", 50, 8), ("diffraction 2", 200, 16)], 0))
 def test_restored_images_are_as_good_as_those_of_the_unsupervised_wiener_filter(name, snr, bits):
     rng = np.random.default_rng(11)
     scene = 0.7 * any_edges(rng, 192) + 0.3 * fractal(rng, 1.2, 192)

@@ -37,7 +37,6 @@ def noisy_star(shape, centre, sectors, sigma, noise=2.0, seed=0, **options):
             ((300, 300), (150.3, 148.8), 25, 0.6, True),
             ((120, 120), (60.3, 61.0), 16, 0.6, False),
         ],
-        3,
         4,
     ),
 )

@@ -58,29 +58,36 @@ def test_edge_at_an_angle_is_that_of_the_transfer_function():
     image = form_image(model, PatternScene("edge", (60, 60), (17.0,), 8)).values
     y, x = np.mgrid[:60, :60] - 29.5
     distance = x * np.cos(angle) + y * np.sin(angle)
-    step = 5e-4
+    step = 1e-3
     f = np.arange(step / 2, 4.0, step)
     modulation = model_modulation(model, f, 17.0)
-    u = np.linspace(-6, 6, 2401)
+    u = np.linspace(-6, 6, 1201)
     edge = 0.5 + np.sin(2 * np.pi * np.outer(u, f)) @ (modulation / f) * step / np.pi
     near = np.abs(distance) < 5.9
     assert np.abs(image - np.interp(distance, u, edge))[near].max() < 3e-4
 
 
-@pytest.mark.parametrize(
-    "spread",
-    [
-        Spread(gaussian=(0.6, 0.3)),
-        Spread(defocus=3.3),
-        Spread(motion=4.0, motion_deg=30.0),
-        Spread(diffraction=1.5),
-        Spread(gaussian=(0.5, 0.5), tail_share=0.2, tail_length=3.0),
-        Spread(along_x=(0.02, 0.15, 0.66, 0.15, 0.02)),
-        Spread(kernel=((0.0, 0.1, 0.0), (0.1, 0.6, 0.1), (0.0, 0.1, 0.0))),
-    ],
-    ids=["gaussian", "defocus", "motion", "diffraction", "tail", "discrete", "kernel"],
-)
-@pytest.mark.parametrize("aperture", [Aperture(), Aperture("round", (0.75, 0.75)), Aperture("square", (0.4, 1.0))])
+SPREADS = {
+    "gaussian": Spread(gaussian=(0.6, 0.3)),
+    "defocus": Spread(defocus=3.3),
+    "motion": Spread(motion=4.0, motion_deg=30.0),
+    "diffraction": Spread(diffraction=1.5),
+    "tail": Spread(gaussian=(0.5, 0.5), tail_share=0.2, tail_length=3.0),
+    "discrete": Spread(along_x=(0.02, 0.15, 0.66, 0.15, 0.02)),
+    "kernel": Spread(kernel=((0.0, 0.1, 0.0), (0.1, 0.6, 0.1), (0.0, 0.1, 0.0))),
+}
+APERTURES = (Aperture(), Aperture("round", (0.75, 0.75)), Aperture("square", (0.4, 1.0)))
+
+
+def spreads_and_apertures():
+    """Every spread function with one of the apertures; with all of them in `make test-slow`."""
+    for k, (name, spread) in enumerate(SPREADS.items()):
+        for i, aperture in enumerate(APERTURES):
+            slow = () if k % 3 == i else pytest.mark.slow
+            yield pytest.param(spread, aperture, id=f"{name}-{aperture.shape} {aperture.width[0]:g}", marks=slow)
+
+
+@pytest.mark.parametrize(("spread", "aperture"), spreads_and_apertures())
 def test_modulation_of_a_wave_is_the_transfer_function(spread, aperture):
     model = ImageModel(spread, aperture)
     # Cells that the aperture cuts are taken as even where nothing smooths them; Airy's rings are cut off.
