@@ -15,7 +15,7 @@ from tools.line_strip import Strip, pattern
 from tools.shaken_strip import ShakenStrip
 from tools.thinned import some
 
-from photoplan.cameras.base import project
+from photoplan.cameras.base import project, tremor_told
 from photoplan.cameras.line_chips import ChippedLine
 from photoplan.errors import InputError
 from photoplan.io.camera.line.file import read_line
@@ -133,6 +133,12 @@ def test_chips_that_make_no_line_are_refused(tmp_path: Path, change: tuple[str, 
     path.write_text(text.replace(*change, 1))
     with pytest.raises(InputError, match=told):
         read_line(path, "nadir").camera(strip.crs, "ellipsoidal")
+
+
+def test_it_is_told_how_strongly_they_shake(tmp_path: Path) -> None:
+    strip = shaken(400)
+    camera = read_line(strip_file(tmp_path, strip, 12.0), "nadir").camera(strip.crs, "ellipsoidal")
+    assert (tremor_told(camera, HEIGHT) or "").startswith("a turbulent flight: lines lie up to ")
 
 
 @pytest.mark.parametrize(

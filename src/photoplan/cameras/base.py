@@ -217,3 +217,12 @@ def parts_of(projection: Projection) -> tuple[Part | None, ...]:
     """The parts of its image; (None,): it is one."""
     breaks = projection.breaks
     return breaks.parts if isinstance(breaks, Parts) else (None,)
+
+
+def tremor_told(projection: Projection, height: float) -> str | None:
+    """How strongly it shakes, see `Tremor.told`; None: it does not. Parts of one image shake alike."""
+    for part in parts_of(projection):
+        tremor = tremor_of(projection if part is None else part.projection)
+        if tremor is not None:
+            return tremor.told(height)
+    return None

@@ -59,8 +59,16 @@ class Correctable(Protocol):
         """The camera with values (owners, parameters) of its sets, by their keys."""
         ...
 
+    def seen(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> _Floats:
+        """Where `camera` sees ground points (n, 3) that were measured at `xy` (n, 2): (n, 2); NaN where it does not."""
+        ...
+
+    def by_ground(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> _Floats:
+        """Derivatives of that by the ground points, (n, 2, 3)."""
+        ...
+
     def by_corrections(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> Mapping[str, ByCorrections]:
-        """Derivatives of image points (n, 2) of ground points (n, 3), which `camera` has made, by each set."""
+        """Derivatives of that by each set."""
         ...
 
 

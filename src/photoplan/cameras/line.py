@@ -39,8 +39,6 @@ class LineCamera:
     track: LineTrack
     look: LineLook
     ground: BodyGround
-    like: LineTremor | None = None
-    """What is known of how a flight shakes that differs from this one by next to nothing: it need not be looked for."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -65,7 +63,7 @@ class LineCamera:
         """What of a turbulent flight changes from line to line; None: the trajectory is smooth."""
         if not self.track.per_line:
             return None
-        return smoothed(self) if self.like is None else self.like.again(self)
+        return smoothed(self)
 
     @cached_property
     def sight(self) -> LineSight:
@@ -87,7 +85,7 @@ class LineCamera:
         else:
             point, rows, _ = self.breaks.passages(P)
             xy = self.sight.between(P[point], rows)
-        inside = ((xy >= -0.5) & (xy <= np.array(self.size) - 0.5)).all(axis=1) & ~self._unoriented(xy[:, 1])
+        inside = ((xy >= -0.5) & (xy <= np.array(self.size) - 0.5)).all(axis=1) & ~self.unoriented(xy[:, 1])
         return Moments(point[inside], xy[inside])
 
     def project_homogeneous(self, XYZ: ArrayLike) -> _Floats:
@@ -150,7 +148,7 @@ class LineCamera:
 
     def body_rays(self, xy: _Floats) -> tuple[_Floats, _Floats]:
         """Projection centres and unit directions of image points (n, 2) in the axes of the body, each (n, 3)."""
-        unknown = ~np.isfinite(xy).all(axis=1) | self._unoriented(xy[:, 1])
+        unknown = ~np.isfinite(xy).all(axis=1) | self.unoriented(xy[:, 1])
         S, d = self.sight.rays(np.nan_to_num(xy))
         S[unknown], d[unknown] = np.nan, np.nan
         return S, d
@@ -171,7 +169,7 @@ class LineCamera:
         reach = 1.1 * float(np.nanmax(np.linalg.norm(feet - middle, axis=1)))
         return Vantage(np.array([*middle, high]), low, reach)
 
-    def _unoriented(self, y: _Floats) -> NDArray[np.bool_]:
+    def unoriented(self, y: _Floats) -> NDArray[np.bool_]:
         """Rows inside the image whose orientation is not known."""
         inside = (y >= -0.5) & (y <= self.size[1] - 0.5)
         return np.asarray(inside & ~self.track.is_oriented(y))
@@ -186,7 +184,7 @@ class LineCamera:
             out = np.full((len(P), 2), np.nan)
             point, rows = tremor.first(P)
             out[point] = self.sight.between(P[point], rows)
-        out[(out[:, 1] < room[0]) | (out[:, 1] > room[1]) | self._unoriented(out[:, 1])] = np.nan
+        out[(out[:, 1] < room[0]) | (out[:, 1] > room[1]) | self.unoriented(out[:, 1])] = np.nan
         return out
 
     @property

@@ -121,14 +121,14 @@ class ChippedLine:
     def rays(self, xy: ArrayLike, height: ArrayLike | None = None) -> tuple[_Floats, _Floats]:
         """See `LineCamera.rays`."""
         xy = np.asarray(xy, float)
-        chip = self._chip(xy[..., 0])
+        chip = self.chip(xy[..., 0])
         found = [np.stack(each.rays(xy, height)) for each in self.chips]
         point, tangent = np.where(np.isnan(xy[..., :1]), np.nan, np.choose(chip[..., None], found))
         return point, tangent
 
     def body_rays(self, xy: _Floats) -> tuple[_Floats, _Floats]:
         """See `LineCamera.body_rays`."""
-        chip = self._chip(xy[:, 0])[:, None]
+        chip = self.chip(xy[:, 0])[:, None]
         S, d = (np.choose(chip, each) for each in zip(*(one.body_rays(xy) for one in self.chips)))
         return S, d
 
@@ -145,7 +145,7 @@ class ChippedLine:
         order = np.lexsort((xy[:, 1], point))
         return Moments(point[order], xy[order])
 
-    def _chip(self, column: _Floats) -> NDArray[np.int64]:
+    def chip(self, column: _Floats) -> NDArray[np.int64]:
         """Number of the chip that has a column."""
         return np.searchsorted([each.look.ends[1] for each in self.chips[:-1]], np.nan_to_num(column), side="right")
 

@@ -15,11 +15,15 @@ from photoplan.cameras.correctable import ByCorrections, Corrections, prior_rows
 from photoplan.cameras.line import LineCamera
 from photoplan.cameras.line_chips import ChippedLine
 from photoplan.cameras.line_correction import TURNED, LineCorrection, TrackSpline, map_axes, spline_weights
+from photoplan.cameras.line_measured import measured
 from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
+from photoplan.geometry.motion import cubic_convolution
 from photoplan.geometry.rotation import rotation_vector, skew
 
 _Floats = NDArray[np.float64]
+#: Half the time over which the motion of a shaken flight is taken, lines.
+_SHORT = 1e-3
 #: Parameters of a mount, in their order.
 MOUNT = ("boresight about x", "boresight about y", "boresight about z",
          "lever arm x", "lever arm y", "lever arm z", "time offset")  # fmt: skip
@@ -132,11 +136,7 @@ class CorrectableLine:
         """See `Correctable`."""
         track = self.correction(values).track(self.plain.track)
         # Calm flights are as smooth between the lines as the record; poses of all lines would be made at every step.
-        if not self._shaken:
-            return self.plain.along(replace(track, per_line=False))
-        if isinstance(self.plain, LineCamera):
-            return replace(self.plain, track=track, like=self.plain.breaks)
-        return self.plain.along(track)
+        return self.plain.along(track if self._shaken else replace(track, per_line=False))
 
     @cached_property
     def _shaken(self) -> bool:
@@ -156,35 +156,64 @@ class CorrectableLine:
         J[:, :3, 6], J[:, 3:, 6] = -speed @ axes, -turning @ TURNED
         return J
 
+    def seen(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> _Floats:
+        """See `Correctable`: the row that was measured tells the moment, see `line_measured`."""
+        assert isinstance(camera, LineCamera | ChippedLine)
+        return xy + measured(camera, self._steady(camera), XYZ, xy).miss
+
+    def by_ground(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> _Floats:
+        """See `Correctable`."""
+        assert isinstance(camera, LineCamera | ChippedLine)
+        return measured(camera, self._steady(camera), XYZ, xy).by_place @ camera.ground.jacobian(XYZ)
+
     def by_corrections(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> Mapping[str, ByCorrections]:
         """See `Correctable`; whatever moves the camera moves the ground the other way."""
         assert isinstance(camera, LineCamera | ChippedLine)
-        track, ground = camera.track, camera.ground
-        S, R = track(xy[:, 1])
-        d = np.einsum("nij,ni->nj", R, ground(XYZ) - S)
-        by_place = camera.derivatives(XYZ) @ np.linalg.inv(ground.jacobian(XYZ))
+        track, rows = camera.track, xy[:, 1]
+        by_place = measured(camera, self._steady(camera), XYZ, xy).by_place
+        S, R = track(rows)
         # A turn δ of the camera about its own axes moves the ground by R (d × δ), seen from a camera that stays.
-        by_turn = by_place @ R @ skew(d) @ TURNED
+        by_turn = by_place @ R @ skew(np.einsum("nij,ni->nj", R, camera.ground(XYZ) - S))
         out: dict[str, ByCorrections] = {}
         n, free = len(xy), self.free
         if len(free):
-            speed, turning = _motion(track, xy[:, 1])
+            speed, turning = _motion(track, rows)
             # A later record: the camera is where it was before.
-            late = by_place @ speed[:, :, None] - (by_place @ R @ skew(d)) @ turning[:, :, None]
-            J = np.concatenate([by_turn, -by_place @ R @ TURNED, late], axis=2)
+            late = by_place @ speed[:, :, None] - by_turn @ turning[:, :, None]
+            J = np.concatenate([by_turn @ TURNED, -by_place @ R @ TURNED, late], axis=2)
             out[self.keys[0]] = ByCorrections(np.broadcast_to(np.arange(len(free)), (n, len(free))), J[:, :, free])
         spline = self.spline
         if spline is not None:
-            at, w = spline_weights(track.time(xy[:, 1]), spline.first, spline.step, len(spline.coefficients))
-            J = np.concatenate([-by_place @ map_axes(self.plain.track), by_turn], axis=2)
+            at, w = spline_weights(track.time(rows), spline.first, spline.step, len(spline.coefficients))
+            J = np.concatenate([-by_place @ map_axes(self.plain.track), by_turn @ TURNED], axis=2)
             columns = (6 * at[:, :, None] + np.arange(6)).reshape(n, 24)
             out[self.keys[1]] = ByCorrections(columns, (J[:, :, None, :] * w[:, None, :, None]).reshape(n, 2, 24))
         return out
 
+    def _steady(self, camera: LineCamera | ChippedLine) -> LineCamera | ChippedLine:
+        """By whose pace rows are measured."""
+        return self._calm if self._shaken else camera
+
+    @cached_property
+    def _calm(self) -> LineCamera | ChippedLine:
+        return self.plain.calm()
+
 
 def _motion(track: LineTrack, rows: _Floats) -> tuple[_Floats, _Floats]:
     """Speed (n, 3), metres a second, and rate of rotation about the camera's own axes (n, 3), radians a second."""
-    ahead, behind = (track(rows + half) for half in (0.5, -0.5))
-    seconds = (track.time(rows + 0.5) - track.time(rows - 0.5))[:, None]
+    if not track.per_line:
+        return _rates(track, rows, 0.5)
+    # Between the lines a late clock moves what is interpolated there: the poses of the lines around.
+    flown, row = replace(track, per_line=False), np.floor(rows)
+    around = [_rates(flown, row + k, _SHORT) for k in (-1.0, 0.0, 1.0, 2.0)]
+    weights = cubic_convolution(rows - row)
+    speed, turning = (np.einsum("nk,knj->nj", weights, np.array(each)) for each in zip(*around))
+    return speed, turning
+
+
+def _rates(track: LineTrack, rows: _Floats, half: float) -> tuple[_Floats, _Floats]:
+    """The same, over so many lines before and after."""
+    ahead, behind = (track(rows + each) for each in (half, -half))
+    seconds = (track.time(rows + half) - track.time(rows - half))[:, None]
     speed = (ahead[0] - behind[0]) / seconds
     return speed, rotation_vector(np.swapaxes(behind[1], 1, 2) @ ahead[1]) / seconds

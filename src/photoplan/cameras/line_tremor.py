@@ -27,8 +27,6 @@ _KNOTS = 128
 _EVEN = (0.6, 1.7)
 #: What moves a pixel by less than this from where the smooth part has it is not worth a table.
 _LEAST = 0.05
-#: What a smooth correction may change of them, pixels.
-_AGAIN = 0.5
 #: Lines whose largest shift is kept.
 _BLOCK = 64
 #: The lowest ground, metres: from there shifts are largest.
@@ -63,13 +61,6 @@ class LineTremor:
     """The whole."""
     largest: _Floats
     """Largest shifts along x and y of blocks of lines, the first before, the last behind the image, (k, 2), pixels."""
-    knots: int = _KNOTS
-    """Lines between the knots of the smooth part."""
-
-    def again(self, camera: LineCamera) -> LineTremor:
-        """The same of a camera whose trajectory differs by a smooth correction."""
-        smooth = replace(camera, track=_smooth_track(camera.track, self.knots))
-        return LineTremor(smooth, camera, self.largest + _AGAIN, self.knots)
 
     def part(self, XYZ: _Floats) -> StraightPart | None:
         """See `Tremor`."""
@@ -220,7 +211,7 @@ def smoothed(camera: LineCamera) -> LineTremor | None:
         if even or knots >= 2 * camera.track.lines:
             break
         knots *= 2
-    return LineTremor(smooth, camera, largest, knots) if largest[1:-1].max() > _LEAST else None
+    return LineTremor(smooth, camera, largest) if largest[1:-1].max() > _LEAST else None
 
 
 def _straightened(camera: LineCamera, first: int, last: int) -> StraightFlight:

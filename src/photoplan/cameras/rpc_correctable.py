@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import Camera, project
 from photoplan.cameras.correctable import ByCorrections, Corrections, prior_rows
 from photoplan.cameras.plane import Affine2D
 from photoplan.cameras.rpc import RpcCamera
@@ -80,6 +80,14 @@ class CorrectableRpc:
         """See `Correctable`."""
         x, y, xx, xy, yx, yy = self.affine(values[self.key][0])
         return replace(self.plain, correction=Affine2D(a1=1.0 + xx, a2=xy, a3=x, a4=yx, a5=1.0 + yy, a6=y))
+
+    def seen(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> _Floats:
+        """See `Correctable`."""
+        return project(camera, XYZ)
+
+    def by_ground(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> _Floats:
+        """See `Correctable`."""
+        return camera.derivatives(XYZ)
 
     def by_corrections(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> Mapping[str, ByCorrections]:
         """See `Correctable`."""

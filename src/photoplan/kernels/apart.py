@@ -53,7 +53,8 @@ def _mean_of_rows(
 ) -> tuple[float, float]:
     """Mean of the rows around a place, each at its own x; the weight of the pixels that are usable, and of all.
 
-    Where rows end before the place (at ragged borders) the others still show a ramp where it is.
+    Where rows end before the place (at ragged borders) the others still show a ramp where it is. Where one of the two
+    rows beside the place does, nothing tells how the flight moved there: no weight is usable.
 
     lines = (frame, cells, place in the cells); spot = (ideal x, y, widening along x, along y). The mean of each band is
     in the last of `work`, if there is any usable weight.
@@ -69,9 +70,11 @@ def _mean_of_rows(
         if not abs(x) < 1e9:
             continue
         down = np.float64(wy[BEFORE + row - top])
+        away = row - spot[1]
+        if abs(away) < 1.0 and not -0.5 <= x <= width - 0.5:
+            return 0.0, 1.0
         left, right, in_x, last = _weights(rule, 0, (x, spot[2]), width, wx)
         total += down * last
-        away = row - spot[1]
         if valid.size > 0:
             in_x = 0.0
             for col in range(left, right):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.cameras.base import Camera, tremor_of
+from photoplan.cameras.base import Camera, tremor_told
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.io.project.model import Project
@@ -169,9 +169,9 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
             fault=fault,
             notes=notes,
         )
-    tremor = tremor_of(camera)
-    if tremor is not None:
-        notes = (*notes, tremor.told(float(np.nanmean(seen.outline[:, 2]))))
+    shaken = tremor_told(camera, float(np.nanmean(seen.outline[:, 2])))
+    if shaken is not None:
+        notes = (*notes, shaken)
     relief, curvature = _sensitivity(camera, seen)
     longer = _longer(camera, seen)
     if longer > _LONGEST:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from photoplan.adjustment.blocks import Layout
-from photoplan.cameras.base import Camera, project
+from photoplan.cameras.base import Camera
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.geometry.rotation import rotation_vector, skew
@@ -179,8 +179,9 @@ def _image_rows(model: Model, state: State, made: tuple[_Rays, list[_Seen]], ent
     out[model.framed] = by_X
     for each in made[1]:
         white = 1.0 / model.sigma[each.mine][:, :, None]
-        out[each.mine] = each.camera.derivatives(each.XYZ) @ each.by_block * white
-        by_set = each.projection.geometry.by_corrections(each.camera, each.XYZ, each.xy)
+        geometry, there = each.projection.geometry, (each.camera, each.XYZ, model.xy[each.mine])
+        out[each.mine] = geometry.by_ground(*there) @ each.by_block * white
+        by_set = geometry.by_corrections(*there)
         for key, by in by_set.items():
             values = by.values * white
             column = model.columns.columns_of(key)[by.columns][:, None]
@@ -207,9 +208,10 @@ class _Seen:
 def _seen(model: Model, state: State) -> list[_Seen]:
     out = []
     for projection, keys, mine in model.of_projections:
-        camera = projection.geometry.camera({key: state.corrections(key) for key in keys})
+        geometry = projection.geometry
+        camera = geometry.camera({key: state.corrections(key) for key in keys})
         XYZ, by_block = _on_map(model, state.XYZ[model.point[mine]])
-        out.append(_Seen(projection, mine, camera, XYZ, by_block, project(camera, XYZ)))
+        out.append(_Seen(projection, mine, camera, XYZ, by_block, geometry.seen(camera, XYZ, model.xy[mine])))
     return out
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from photoplan import __version__
-from photoplan.cameras.base import tremor_of
+from photoplan.cameras.base import tremor_told
 from photoplan.engine.execute import OutputName, RenderJob
 from photoplan.engine.executors import Workers, open_workers
 from photoplan.engine.run import Kept, Runner, Tally, Work
@@ -327,12 +327,11 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scenes: Scenes, result: Prod
 def _image_record(name: str, scene: Scene, look: Look) -> dict[str, Any]:
     """An image as it took part."""
     step, vantage = scene.reader.step(RestoreStep), scene.camera.vantage
-    tremor, level = tremor_of(scene.camera), look.footprint.outline[:, 2]
     return {
         "name": name,
         "projection_centre": [float(c) for c in vantage.point] if vantage.central else None,
         "gsd_m": look.gsd,
         "blur": look.blur,
         "restored": None if step is None else step.describe(),
-        "tremor": None if tremor is None else tremor.told(float(np.nanmean(level))),
+        "tremor": tremor_told(scene.camera, float(np.nanmean(look.footprint.outline[:, 2]))),
     }

@@ -19,7 +19,7 @@ from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.body import EARTH_RADII, BodyGround
 from photoplan.geometry.bounds import odd_angles, odd_place
-from photoplan.geometry.motion import between, continuous, cubic, odd_step, quaternions
+from photoplan.geometry.motion import continuous, cubic, odd_step, quaternions
 from photoplan.geometry.rotation import ANGLE_UNITS, rotation_from_angles, rotation_opk
 from photoplan.io.camera.line.detectors import StripDetectors, looks_of
 from photoplan.io.camera.line.model import MAX_BYTES, StatedLine
@@ -155,14 +155,15 @@ def _track(strip: StripFile, path: Path) -> LineTrack:
     record = axes @ rotation_from_angles(angles[:, ["opk".index(k) for k in flight.rotation]], flight.rotation)
     S = places + record @ np.array(flight.lever_arm)
     q = continuous(quaternions(record @ rotation_opk(*np.radians(flight.boresight)) @ _TURNED))
-    speed = np.gradient(S, t, axis=0, edge_order=2 if len(t) > 2 else 1)
+    # Attitudes too without kinks at the records: where these are as far apart as lines, a late clock lies between them.
+    speed, turning = (np.gradient(each, t, axis=0, edge_order=2 if len(t) > 2 else 1) for each in (S, q))
     clock = np.array([0.0]), np.array([0.0]), np.array([strip.clock.line])
     known = float(t[0]), float(t[-1])
     return LineTrack(
         strip.lines,
         *clock,
         positions=lambda when: cubic(t, S, speed, when),
-        attitudes=lambda when: between(t, q, when),
+        attitudes=lambda when: cubic(t, q, turning, when),
         known=known,
         gaps=_gaps(t),
         per_line=True,
