@@ -10,7 +10,7 @@ from matching.test_facets import Pixels
 
 from photoplan.cameras.base import Vantage
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.matching.facets.judged import edge_variances
+from photoplan.matching.facets.judged import edge_variances, misfit_variances
 from photoplan.matching.facets.observe import View
 from photoplan.matching.facets.pyramid import Pyramid
 from photoplan.matching.facets.search import Planes, Search, search
@@ -110,3 +110,37 @@ def test_beside_a_step_a_height_may_be_any_of_it() -> None:
     block = SimpleNamespace(heights=heights, scale=1.0, facets=SimpleNamespace(shape=(6, 7), ratio=3))
     found = edge_variances(block)  # 9 pixels of parallax over three are a wall, 2 are a slope
     assert np.allclose(found[:, 3:5], 81 / 12) and (np.delete(found, (3, 4), axis=1) == 0).all()
+
+
+def test_a_post_whose_height_no_two_images_show_is_not_found_elsewhere() -> None:
+    """Ground that a second image sees only where it would lie lower: what matches there by chance is not believed."""
+    rng = np.random.default_rng(8)
+    texture = rng.normal(100, 20, (SIDE, SIDE))
+    views = []
+    for slope in (-0.25, 0.25):
+        image = texture + rng.normal(0, 2, (SIDE, SIDE))
+        if slope > 0:
+            image[:, 100:] = np.nan
+        views.append(View(Parallel(slope), Pyramid(Pixels(image), span=3)))
+    grid = MapGrid(0.0, 0.0, 2.0, 100, 100, "EPSG:32633")
+    window = Window(20, 20, 60, 60)
+    found = search(
+        views, grid, window, Search(Planes(2.0, 0.0), 2, 0, 1, 6.0), lambda XY: np.zeros(XY.shape[:-1]), 60.0
+    )
+    assert found is not None
+    uv = found.facets.to_posts(grid.to_map(np.array([20.0, 20.0]))).astype(int)
+    heights, spread = (a[uv[1] : uv[1] + 60, uv[0] : uv[0] + 60] for a in (found.heights, np.sqrt(found.variance)))
+    off = np.abs(heights)
+    print((off[:, :25] < 1).mean(), (off > 5 * spread + 1).mean(axis=0))
+    assert (off[:, :25] < 1).mean() > 0.98
+    assert (off > 5 * spread + 1).mean() < 0.01
+
+
+def test_where_pixels_do_not_fit_a_height_may_be_any_of_those_around() -> None:
+    heights = np.zeros((20, 20))
+    heights[:, 10:] = 6.0
+    misfit = np.ones((20, 20))
+    misfit[6, 9], misfit[6, 2], misfit[3, 9], misfit[0, 0] = 2.6, 2.6, 1.3, np.nan
+    found = misfit_variances(SimpleNamespace(heights=heights), misfit)
+    # Three quarters of the squared residuals are not noise; what lies on even ground is not farther off than that.
+    assert np.isclose(found[6, 9], 0.75**2 * 36 / 12) and np.count_nonzero(found) == 1

@@ -224,6 +224,16 @@ def test_pixels_of_reduced_images_are_those_that_count() -> None:
     assert len(told[1]) == 1 and "the relief is finer than" in told[1][0] and "finer than" not in told[0][0]
 
 
+def test_heights_that_fit_badly_are_told_with_what_helps() -> None:
+    told = []
+    for search in (None, object()):
+        scheme = SimpleNamespace(base=0, search=search)
+        plan: Any = SimpleNamespace(scheme=scheme, settings=SimpleNamespace(name="s"))
+        told += findings(plan, {"a": 1.0}, 80.0, 0.1, 0.03, 0.01, 0.0)
+    assert all("3.0% of the heights fit badly: see s_fit.tif" in line and "s_sigma.tif" in line for line in told)
+    assert len(told) == 2 and "`search`" in told[0] and "`search`" not in told[1] and "`target`" in told[1]
+
+
 def test_labels_of_a_report_keep_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr(report, "png", drawn.append)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from photoplan.geometry.grid import Window
 from photoplan.kernels.facets_grey import OFFSETS, add_grey, sample_grey
@@ -17,6 +18,9 @@ _Doubles = NDArray[np.float64]
 _PATCH = 17
 #: Least part of the pixels around a post that are redundant.
 _LEAST = 0.1
+#: Root mean square of residuals up to which pixels fit: four standard deviations of it, of two images. Posts along the
+#: surroundings in which heights are that a wrong one may have.
+_FITS, _AROUND = 1.3, 9
 
 
 def grey_places(block: FacetBlock, window: Window, margin: int) -> _Doubles:
@@ -38,7 +42,7 @@ def grey_sigmas(block: FacetBlock, at: _Doubles, height_variances: _Doubles) -> 
 
     Parameters
     ----------
-    block : Block
+    block : FacetBlock
         After its last iteration.
     at : ndarray
         Columns and rows of the posts.
@@ -100,6 +104,24 @@ def edge_variances(block: FacetBlock) -> _Doubles:
         for side in (tuple(before), tuple(after)):
             out[side] = np.maximum(out[side], jump)
     return out
+
+
+def misfit_variances(block: FacetBlock, misfit: _Doubles) -> _Doubles:
+    """Variances of heights around which pixels do not fit, shape (rows, columns), m²; 0 where they do.
+
+    A height that is not where it should be may be any of those around it. How probable that is: the square of the part
+    of the squared residuals that noise does not explain, as a little more of it tells little (noise differs from place
+    to place). So a rounded edge says so, and a region that went wrong as far as there is relief in it.
+
+    Parameters
+    ----------
+    block : FacetBlock
+    misfit : ndarray, shape (rows, columns)
+        See `fit`.
+    """
+    wrong = (1.0 - (_FITS / np.maximum(np.nan_to_num(misfit), _FITS)) ** 2) ** 2
+    around = ndimage.maximum_filter(block.heights, _AROUND) - ndimage.minimum_filter(block.heights, _AROUND)
+    return np.asarray(wrong * around**2 / 12)
 
 
 def residual_pictures(block: FacetBlock) -> list[_Floats]:

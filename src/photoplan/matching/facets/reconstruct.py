@@ -8,11 +8,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.block import FacetBlock
 from photoplan.matching.facets.curvature import Roughness
-from photoplan.matching.facets.judged import edge_variances, fit, grey_places, grey_sigmas, residual_pictures
+from photoplan.matching.facets.judged import (
+    edge_variances,
+    fit,
+    grey_places,
+    grey_sigmas,
+    misfit_variances,
+    residual_pictures,
+)
 from photoplan.matching.facets.observe import MARGIN, Facets, Sight, View, facets_of, look
 from photoplan.matching.facets.radiometry import Transfer, first_guess
 from photoplan.matching.facets.search import Search, Searched, search
@@ -37,6 +45,8 @@ _BEYOND = 1.5
 _BETTER = 0.8
 #: Part of the posts that a search must be sure of, so that they tell the noise of all.
 _TRUSTED = 0.1
+#: Posts around those at a step that do not tell it either.
+_BESIDE = 5
 #: Standard deviation of grey values until it is estimated, part of their contrast.
 _NOISE = 0.1
 
@@ -138,6 +148,8 @@ def reconstruct(
                 block.trusted = found.sure if found.sure.mean() > _TRUSTED else None
         block.adjust(_FIRST[level < scheme.coarsest], True)
         for estimates, iterations in _THEN[level > 0]:
+            if level == 0:
+                block.trusted = _telling(block, found)
             block.roughen(estimates)
             block.adjust(iterations, level == 0)
         moves[level] = block.moves[-1]
@@ -145,6 +157,14 @@ def reconstruct(
         return None
     made = _found(block, views, window, tuple(moves), residuals)
     return made if found is None else _doubting(made, found, window, scheme)
+
+
+def _telling(block: FacetBlock, found: Searched | None) -> NDArray[np.bool_] | None:
+    """Posts that tell noise and roughness of a block: not those beside steps, nor where a search is not sure."""
+    told = ~ndimage.maximum_filter(edge_variances(block) > 0, _BESIDE)
+    if found is not None:
+        told &= found.sure
+    return told if told.mean() > _TRUSTED else None
 
 
 def _opened(
@@ -244,7 +264,8 @@ def _found(
     block: FacetBlock, views: Sequence[View], window: Window, moves: tuple[float, ...], residuals: bool = False
 ) -> Found:
     """What a block holds of its window."""
-    variance = block.variances()
+    variance, misfit = block.variances(), fit(block)
+    doubt = edge_variances(block) + misfit_variances(block, misfit)
     ratio = block.facets.ratio
     inner = slice(MARGIN, MARGIN + window.height), slice(MARGIN, MARGIN + window.width)
     astray = block.astray[inner] & (block.counted[inner] > 1)
@@ -268,9 +289,9 @@ def _found(
             pictures[n] = picture[fine]
     return Found(
         heights=_where(count > 1, block.heights[inner]),
-        sigmas=_where(count > 1, np.sqrt(np.maximum(variance[inner], 0.0) + edge_variances(block)[inner])),
+        sigmas=_where(count > 1, np.sqrt(np.maximum(variance[inner], 0.0) + doubt[inner])),
         count=count,
-        fit=_where(count > 1, fit(block)[inner]),
+        fit=_where(count > 1, misfit[inner]),
         grey=_where(finer(count > 0), block.grey_values(at.reshape(-1, 2)).reshape(at.shape[:2])),
         grey_sigmas=_where(finer(count > 0), grey_sigmas(block, at, finer(np.nan_to_num(variance[inner])))),
         residuals=pictures,

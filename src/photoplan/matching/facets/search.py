@@ -41,8 +41,6 @@ _APART, _SURE = 2, 0.5
 _PROBABLE, _FAINT = 0.094, 0.003
 #: Pixels of parallax by which heights may differ from those that were found without a doubt.
 _AWAY = 1.0
-#: Cost of a place that no two images see: that of images of different things.
-_NEUTRAL = 0.5
 
 
 @dataclass(frozen=True)
@@ -217,7 +215,7 @@ def _level(
     shape = (len(seen), (rows - 1) * m + 1, (columns - 1) * m + 1)
     census, known = np.zeros(shape, np.uint64), np.zeros(shape, bool)
     first = np.concatenate([[0], np.cumsum(high - low)]).astype(np.int64)
-    cost = np.full(first[-1], _NEUTRAL, np.float32)
+    cost = np.full(first[-1], np.nan, np.float32)
     pairs = _pairs(seen, facets, planes, level, float(ends.mean()))
     half = max(1, m // 2)
     grey = np.empty(shape[1:], np.float32)
@@ -233,8 +231,10 @@ def _level(
         for n, (_, _, raw) in enumerate(seen):
             sample_plane(raw, (1 - part) * ats[n][0] + part * ats[n][1], _LATTICE, around, grey)
             describe(grey, cells, census[n], known[n])
-        add_costs(census, known, pairs, k, low, high, m, half, _NEUTRAL, first, cost)
-    contrast = _contrast(cost, first)
+        add_costs(census, known, pairs, k, low, high, m, half, np.nan, first, cost)
+    contrast, usual = _contrast(cost, first)
+    # Heights at which no two images see a post may be right as well: others have to be better than chance.
+    cost[np.isnan(cost)] = usual - _SURE * contrast
     path, total = np.empty_like(cost), np.zeros_like(cost)
     sum_paths(cost, first, low, np.float32(_SMALL * contrast), np.float32(_LARGE * contrast), path, total)
     steps, margin, variance = np.empty((3, rows, columns))
@@ -291,12 +291,13 @@ def _pairs(
     return np.ascontiguousarray(every[np.argsort(np.abs(np.log(np.maximum(apart, 1e-9) / best)), kind="stable")])
 
 
-def _contrast(cost: NDArray[np.float32], first: _Integers) -> float:
-    """Usual cost of a plane less the least one of its post."""
-    counts = np.diff(first)
-    starts = first[:-1][counts > 2]
-    if not len(starts):
-        return 0.1
-    least = np.minimum.reduceat(cost, first[:-1])[counts > 2]
-    usual = (np.add.reduceat(cost, first[:-1]) / counts)[counts > 2]
-    return max(float(np.median(usual - least)), 0.02)
+def _contrast(cost: NDArray[np.float32], first: _Integers) -> tuple[float, float]:
+    """Usual cost of a plane less the least one of its post, and the usual cost; NaN: not seen by two images."""
+    known = np.isfinite(cost)
+    counts = np.add.reduceat(known, first[:-1], dtype=np.int64)
+    several = counts > 2
+    if not several.any():
+        return 0.1, 0.5
+    least = np.minimum.reduceat(np.where(known, cost, np.float32(np.inf)), first[:-1])[several]
+    usual = np.add.reduceat(np.where(known, cost, np.float32(0)), first[:-1])[several] / counts[several]
+    return max(float(np.median(usual - least)), 0.02), float(np.median(usual))

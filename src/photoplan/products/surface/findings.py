@@ -55,9 +55,12 @@ def findings(
             "away (`start`, `reach`)"
         )
     if misfit_share > _MISFITS:
+        searched = plan.scheme.search is not None
+        helps = "`target` where walls are seen" if searched else "`search`, or a better `start` with a smaller `reach`"
         lines.append(
             f"{misfit_share:.1%} of the heights fit badly: see {plan.settings.name}_fit.tif. They lie at edges and "
-            "moving things, or in regions that went wrong; `reach` and a better `start` help these"
+            "moving things, or in regions that went wrong; their standard deviations are as large as what heights do "
+            f"around them, so mask by these ({plan.settings.name}_sigma.tif). What helps: a finer `resolution`, {helps}"
         )
     if astray > _ASTRAY:
         lines.append(
