@@ -12,6 +12,7 @@ from tools.command import inside
 from tools.effort import at_most
 from tools.line_strip import Strip
 from tools.shaken_strip import ShakenStrip
+from tools.thinned import some
 
 from photoplan.errors import HeightSystemError, InputError
 from photoplan.io.camera.line.file import read_line
@@ -151,7 +152,7 @@ def test_fault_22_nodata_leaves_no_dark_fringes(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("shaken", [False, True])
+@pytest.mark.parametrize("shaken", some([False, True], 1))
 def test_fault_23_lines_in_a_gap_of_the_record_are_not_made_up(tmp_path: Path, shaken: bool) -> None:
     """A fifth of the record is missing, another part at its end: these lines are told, and nothing of them is shown."""
     strip = ShakenStrip(

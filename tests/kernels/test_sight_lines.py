@@ -42,7 +42,7 @@ def twin(heights, eye, row, col) -> float:
     return top - h
 
 
-@pytest.mark.parametrize("seed", some(range(4), 0, 1))
+@pytest.mark.parametrize("seed", some(range(4), 0))
 @pytest.mark.parametrize("eye", [(0.4, 0.6), (0.5, 0.2), (1.0, 1.0), (0.31, 0.0)])
 def test_same_as_the_twin_on_random_terrain(seed, eye):
     rng = np.random.default_rng(seed)

@@ -43,7 +43,7 @@ def spoilt(kind: str, seed: int) -> Block:
     [
         pytest.param("constant", "the camera constant of camera 'cam'", marks=pytest.mark.slow),
         pytest.param("principal point", "the principal point of camera 'cam'", marks=pytest.mark.slow),
-        ("datum", "a common shift of the observed positions"),
+        pytest.param("datum", "a common shift of the observed positions", marks=pytest.mark.slow),
         pytest.param("shift", "a shift of the observed positions in each strip", marks=pytest.mark.slow),
         ("drift", "a drift of the observed positions in each strip"),
     ],

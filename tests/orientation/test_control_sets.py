@@ -29,7 +29,7 @@ def disturbed(seed: int, gnss: float | None) -> tuple[set[int], Adjusted]:
 
 
 @pytest.mark.parametrize("gnss", some([None, 0.05], 0))
-@thinned("count", 3, 200)
+@thinned("count", 2, 200)
 def test_wrong_control_takes_no_right_control_with_it(count: int, gnss: float | None) -> None:
     """Asked: in 95 % of 200 blocks no right point is lost."""
     lost = missed = wrongs = 0

@@ -111,7 +111,7 @@ def edges(grid: Grid) -> tuple[float, float, float, float]:
     return (-half - MESH / 2, -half + MESH / 2, half - MESH / 2, half + MESH / 2)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", some(range(6), 0, 1, 2))
 @pytest.mark.parametrize("tilt", [0.0, 30.0, 60.0, 80.0])
 def test_all_ground_that_falls_into_the_image_is_inside(seed: int, tilt: float) -> None:
     """Also a mountain between the camera and what it looks at, and ground below the level of the camera's foot."""

@@ -7,7 +7,7 @@ from math import pi
 import numpy as np
 import pytest
 from tools.patterns import bars, gauss_box, star
-from tools.thinned import thinned
+from tools.thinned import some, thinned
 
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
@@ -33,7 +33,7 @@ def square_contrast(frequency, angle):
 
 
 @pytest.mark.parametrize("duty", [0.5, 0.4])
-@pytest.mark.parametrize("angle", [3.0, 20.0, 37.0, 71.0, 120.0, 164.0])
+@pytest.mark.parametrize("angle", some([3.0, 20.0, 37.0, 71.0, 120.0, 164.0], 0, 2, 4))
 def test_mtf_of_any_direction_within_one_percent_at_a_signal_to_noise_ratio_of_80(angle, duty):
     worst = 0.0
     for k, frequency in enumerate((0.08, 0.15, 0.25, 0.33, 0.45)):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from tools.thinned import some
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
@@ -356,7 +357,7 @@ def test_triangles_meet_bilinear_meshes_without_a_gap() -> None:
 SEEDS = [pytest.param(seed, marks=[] if seed in (1, 4) else pytest.mark.slow) for seed in range(6)]
 
 
-@pytest.mark.parametrize("simplify", [False, True])
+@pytest.mark.parametrize("simplify", some([False, True], 1))
 @pytest.mark.parametrize("seed", SEEDS)
 def test_smoothed_lines_never_cross(seed: int, simplify: bool) -> None:
     rng = np.random.default_rng(seed)
