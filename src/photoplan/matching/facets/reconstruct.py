@@ -160,11 +160,14 @@ def reconstruct(
 
 
 def _telling(block: FacetBlock, found: Searched | None) -> NDArray[np.bool_] | None:
-    """Posts that tell noise and roughness of a block: not those beside steps, nor where a search is not sure."""
+    """Posts that tell noise and roughness of a block: not those beside steps, nor where a search is not sure.
+
+    None: all, also where those that would are too few.
+    """
     told = ~ndimage.maximum_filter(edge_variances(block) > 0, _BESIDE)
     if found is not None:
         told &= found.sure
-    return told if told.mean() > _TRUSTED else None
+    return told if _TRUSTED < told.mean() < 1 else None
 
 
 def _opened(
