@@ -144,7 +144,7 @@ def test_it_is_told_how_strongly_they_shake(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overlap", "strip", "most"),
     [
-        pytest.param(7.0, Strip(lines=100), 0.05, id="overlap"),
+        pytest.param(7.0, Strip(lines=70), 0.05, id="overlap"),
         pytest.param(-0.6, Strip(lines=400), 1.0, marks=pytest.mark.slow, id="gap"),
         pytest.param(12.0, shaken(400), 0.5, marks=pytest.mark.slow, id="shaken"),
     ],

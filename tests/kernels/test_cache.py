@@ -73,6 +73,42 @@ def test_no_kernel_assigns_an_array_to_a_slice_or_takes_differences():
     assert seen > 150
 
 
+def test_only_kernels_whose_sources_have_changed_are_compiled_again(tmp_path):
+    """Those of a file, of files that it imports, and of files that these import; no others."""
+    sources = {
+        "a": "\nfrom photoplan.kernels.b import x\n",
+        "b": "\nfrom photoplan.kernels import c\n",
+        "c": "",
+        "d": "",
+    }
+
+    def stamps():
+        for function in (numba_parts.stamp, numba_parts.source):
+            function.cache_clear()
+        return {name: numba_parts.stamp(str(tmp_path / f"{name}.py"), str(tmp_path)) for name in sources}
+
+    for name, text in sources.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    before = stamps()
+    assert before["a"] != before["b"] != before["d"]
+    (tmp_path / "c.py").write_text("other = 1\n")
+    assert [name for name, each in stamps().items() if each != before[name]] == ["a", "b", "c"]
+
+
+def test_all_that_kernels_import_from_each_other_is_found():
+    folder = Path(jit.__file__).parent
+    for path in folder.glob("*.py"):
+        wanted = set()
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            assert not (isinstance(node, ast.Import) and any("photoplan" in name.name for name in node.names)), (
+                path.name
+            )
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("photoplan.kernels"):
+                named = node.module.removeprefix("photoplan.kernels").strip(".")
+                wanted |= {named} if named else {name.name for name in node.names}
+        assert {Path(each).stem for each in numba_parts.source(str(path), str(folder))[1]} == wanted, path.name
+
+
 LOADED = """
 import sys
 import numpy as np

@@ -21,6 +21,8 @@ from photoplan.terrain.leaves import quadtree
 from photoplan.terrain.settings import FAMILIES, BuildSettings
 
 STEP = 0.2
+#: Few posts: what is asked here is asked of the fit, and of places themselves.
+WIDE = {"grid_width": 4.0, "unit_meshes": 16, "adapt": 0.0}
 
 
 def sample(family: str, length: float, seed: int, noise: float, count: int = 6000) -> NDArray[np.float64]:
@@ -108,7 +110,7 @@ class TestSigma:
     def test_sigma_grows_away_from_the_data(self) -> None:
         xyz = sample("matern", 4.0, 9, self.NOISE, 1600)
         xyz = xyz[np.linalg.norm(xyz[:, :2] - [1020, 520], axis=1) > 6]
-        model = built(terrain(xyz))
+        model = built(terrain(xyz), **WIDE)
         _, sigmas = directly(model, np.array([[1020.0, 520.0], [1020, 524], [1007, 507]]))
         assert sigmas[0] > 1.3 * sigmas[1] > 1.5 * sigmas[2]
 
@@ -158,12 +160,12 @@ class TestGrossErrors:
         xyz, k = roof[near], int(np.searchsorted(near, k))
         pair = [k, self.nearest(xyz, k)]
         xyz[pair, 2] += 20 * self.NOISE
-        assert set(pair) <= set(built(terrain(xyz, self.ridge())).fit.gross.tolist())
+        assert set(pair) <= set(built(terrain(xyz, self.ridge()), **WIDE).fit.gross.tolist())
 
     @pytest.fixture(scope="class")
     def model(self, roof: NDArray[np.float64]) -> tuple[Built, list[int]]:
         xyz, bad = self.spoiled(roof)
-        return built(terrain(xyz, self.ridge())), bad
+        return built(terrain(xyz, self.ridge()), **WIDE), bad
 
     def test_fault_17_planted_errors_are_flagged_and_few_others(self, model: tuple[Built, list[int]]) -> None:
         found, bad = model
@@ -197,7 +199,7 @@ class TestGrossErrors:
 
     def test_none_is_sought_with_limit_zero(self, roof: NDArray[np.float64]) -> None:
         xyz, _ = self.spoiled(roof)
-        found = built(terrain(xyz[:400], self.ridge()), gross=0.0, grid_width=4.0, unit_meshes=4).fit
+        found = built(terrain(xyz[:400], self.ridge()), gross=0.0, **WIDE).fit
         assert len(found.gross) == 0 and np.isfinite(found.residuals[:, 2]).mean() > 0.99
 
 

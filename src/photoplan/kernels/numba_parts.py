@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -53,15 +54,32 @@ MAKER_OPTIONS = (
 INNER_OPTIONS = MAKER_OPTIONS | {"_nrt": False} if USABLE else {}
 
 
-def _fingerprint() -> tuple[str, int]:
-    """Digest of all kernel sources: numba looks at one file's date only, but kernels inline each other."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+_FOLDER = os.path.dirname(__file__)  # noqa: PTH120, every start waits for this: paths as text take a quarter of the time
+
+
+@cache
+def source(path: str, folder: str) -> tuple[bytes, tuple[str, ...]]:
+    """Digest of a file of kernels, and the files of a folder that it imports as modules of this package."""
+    text = Path(path).read_bytes()
+    lines = [each.split(b"\n", 1)[0].decode() for each in text.split(b"\nfrom photoplan.kernels")[1:]]
+    names = {name for each in lines for name in (each[1:].split()[0] if each[0] == "." else each[8:]).split(", ")}
+    return hashlib.sha256(text).digest(), tuple(f"{folder}/{name}.py" for name in sorted(names))
+
+
+@cache
+def stamp(path: str, folder: str = _FOLDER) -> tuple[str, int]:
+    """Digest of a file of kernels and of all that it imports, directly or not: kernels inline each other.
+
+    Numba looks at the date of one file only.
+    """
+    digest, seen, waiting = hashlib.sha256(), {path}, [path]
+    while waiting:
+        own, files = source(waiting.pop(), folder)
+        digest.update(own)
+        fresh = [each for each in files if each not in seen]
+        seen.update(fresh)
+        waiting += fresh
     return digest.hexdigest(), 0
-
-
-_STAMP = _fingerprint() if USABLE else ("", 0)
 
 
 class _Kept(FunctionCache if USABLE else object):  # type: ignore[misc]
@@ -77,12 +95,12 @@ class _Kept(FunctionCache if USABLE else object):  # type: ignore[misc]
 
 
 def keep(dispatcher: Any) -> None:
-    """Keep a kernel on the disk as long as no kernel changes; a numba of another version follows its own rules."""
+    """Keep a kernel on the disk as long as its sources are the same; another numba follows its own rules."""
     if not USABLE:
         dispatcher.enable_caching()
         return
     dispatcher._cache = _Kept(dispatcher.py_func)
-    dispatcher._cache._cache_file._source_stamp = _STAMP
+    dispatcher._cache._cache_file._source_stamp = stamp(dispatcher.py_func.__code__.co_filename)
 
 
 def is_cached(dispatcher: Any, signature: tuple[Any, ...]) -> bool:
