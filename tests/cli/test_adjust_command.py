@@ -13,7 +13,6 @@ from tools.recorded import recorded
 pytest.importorskip("matplotlib")
 
 
-@pytest.mark.drawn
 def test_a_block_is_adjusted(tmp_path: Path) -> None:
     made = write_project(tmp_path / "block", Make(pixel_noise=0.3, check=3))
     said = inside("adjust", made.path, "--calibrate", "cam=c")

@@ -64,7 +64,7 @@ def test_control_is_proposed_that_fits_the_true_orientation(
 
 
 def test_json_and_refusal_of_files_that_exist(photoplan: Here, block: Path, near: Path) -> None:
-    images = ["--images", IMAGES[0], "--ortho-sigma", 0.05]
+    images = ["--images", IMAGES[0], "--ortho-sigma", 0.05, "--grid", 4]
     found = json.loads(photoplan(*words(block, near, *images, "--json")).out)
     (image,) = found["images"]
     assert image["image"] == IMAGES[0] and image["kept"] == found["points"] <= image["matched"] <= image["tried"]

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import click
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.command import options_of, unfinished_in_files, unknown_options, verbs
+from tools.thinned import examples
 
 import photoplan
 from photoplan.cli.main import photoplan as command
@@ -106,6 +107,7 @@ def test_strings_of_the_command_line_name_options_of_their_verbs() -> None:
     assert wrong == [] and checked > 200
 
 
+@settings(max_examples=examples(25, 100))
 @given(st.sampled_from(sorted(VERBS)), st.lists(st.tuples(st.sampled_from(WORDS), st.booleans()), max_size=5))
 def test_parameters_become_options_that_the_verb_has(name: str, words: list[tuple[str, bool]]) -> None:
     text = ", or ".join(f"give `{word}{'=False' * off}`" for word, off in words)

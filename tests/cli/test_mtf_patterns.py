@@ -112,6 +112,7 @@ def test_star_in_a_window_of_one_band(photoplan: Here, tmp_path: Path) -> None:
     assert said.code == 3 and "40 bright sectors are stated, but 36 are counted" in said.err
 
 
+@pytest.mark.slow
 def test_usaf_target(photoplan: Here, tmp_path: Path) -> None:
     file = write(tmp_path / "target.tif", np.load(TARGET))
     table = tmp_path / "out.csv"

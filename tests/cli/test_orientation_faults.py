@@ -15,6 +15,7 @@ import rasterio
 from rasterio.transform import Affine
 from tools.adjust_project import Make, write_project
 from tools.command import Here, Said, edit, inside, start, wait_for
+from tools.thinned import some
 
 import photoplan as photoplan_package
 from photoplan.products.adjust import run as adjust
@@ -142,6 +143,7 @@ class TestNames:
 
 
 class TestOutputs:
+    @pytest.mark.slow
     def test_fault_13_reports_that_exist_are_kept(self, photoplan: Here, block: Path) -> None:
         project = block / "project.toml"
         assert photoplan("adjust", project, "-q").code == 0
@@ -224,6 +226,7 @@ class TestGeometry:
         """Control only: nothing else says where the block lies."""
         edit(block / "project.toml", POSITIONS, "")
 
+    @pytest.mark.slow
     def test_fault_16_control_on_a_line_in_adjust(self, photoplan: Here, block: Path) -> None:
         """Two control points leave the turn about the line through them."""
         self.alone(block)
@@ -256,6 +259,7 @@ class TestGeometry:
         assert "c" in said.replace(",", " ").replace(":", " ").split() or "camera constant" in said
         assert "Z0" in said
 
+    @pytest.mark.slow
     def test_fault_16_no_overlap_in_tie(self, photoplan: Here, tmp_path: Path) -> None:
         pytest.importorskip("cv2")
         random = np.random.default_rng(4)
@@ -320,6 +324,7 @@ def flat_block(folder: Path) -> None:
 
 
 class TestGrossErrors:
+    @pytest.mark.slow
     def test_fault_17_in_adjust_are_named(self, photoplan: Here, block: Path) -> None:
         """One measurement by 40 pixels, one control height by 20 m."""
 
@@ -424,7 +429,7 @@ class TestTables:
         assert table + (message or "") in said.replace(": ", "") or (message or table) in said, said
         assert table in said
 
-    @pytest.mark.parametrize("table", ["points.csv", "control.csv", "positions.csv"])
+    @pytest.mark.parametrize("table", some(["points.csv", "control.csv", "positions.csv"], 0))
     def test_fault_18_bom_crlf_and_semicolons_are_read(self, photoplan: Here, block: Path, table: str) -> None:
         expected = json.loads(photoplan("adjust", block / "project.toml", "--dry-run", "--json", "-q").out)
         text = (block / table).read_text().replace(",", ";").replace("\n", "\r\n")
@@ -482,6 +487,7 @@ class TestInterruption:
         assert "Traceback" not in err
         assert state(block) == before
 
+    @pytest.mark.slow
     def test_fault_25_ctrl_c_in_tie(self, tmp_path: Path) -> None:
         """While features are sought: no table, no entry in the project, no child left behind."""
         pytest.importorskip("cv2")

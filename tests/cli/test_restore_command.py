@@ -197,6 +197,7 @@ class TestFault24Pixels:
         assert str(image) in said.err and message in said.err
         assert not list((tmp_path / "restored").glob("*.tif"))
 
+    @pytest.mark.slow
     def test_fault_24_a_side_over_32767(self, photoplan: Here, tmp_path: Path, weights: Path) -> None:
         columns = np.broadcast_to(np.arange(40_000, dtype=np.float32), (8, 40_000))[None]
         image = write_image(tmp_path / "line.tif", columns, tiled=True, blockxsize=256, blockysize=64)

@@ -25,6 +25,7 @@ def image(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_measured_filter_is_printed_kept_and_gives_the_same_again(photoplan, image, tmp_path):
     first = photoplan("restore", image, "--output", tmp_path / "a", "--linearisation", "linear")
     assert first.code == 0

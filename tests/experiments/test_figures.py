@@ -11,13 +11,13 @@ mpl = pytest.importorskip("matplotlib")
         ("one-idea", {}),
         ("linear-prediction", {"steps": 21}),
         ("anchor-interpolation", {"steps": 5}),
-        ("homogeneous-anchors", {"steps": 3}),
+        pytest.param("homogeneous-anchors", {"steps": 3}, marks=pytest.mark.slow),
         ("resampling-kernels", {"steps": 21}),
-        ("anchor-residual", {"samples": 3, "steps": 3}),
+        pytest.param("anchor-residual", {"samples": 3, "steps": 3}, marks=pytest.mark.slow),
         pytest.param("road-edge", {}, marks=pytest.mark.slow),
-        ("marks", {}),
+        pytest.param("marks", {}, marks=pytest.mark.slow),
         pytest.param("true-orthophoto", {"resolution": 2.0}, marks=pytest.mark.slow),
-        ("pyramid-strip", {"lines": 500, "columns": 400}),
+        pytest.param("pyramid-strip", {"lines": 500, "columns": 400}, marks=pytest.mark.slow),
     ],
 )
 def test_figure(name, sizes, tmp_path):

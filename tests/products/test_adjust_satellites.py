@@ -182,7 +182,7 @@ def test_a_late_clock_of_a_turbulent_strip_is_found(tmp_path: Path, splines: str
 
 
 def test_splines_of_a_strip_are_written_and_read(tmp_path: Path) -> None:
-    path, cameras = flown(tmp_path, ", knots = 4.0, attitude = 0.01, position = 0.1, smooth_attitude = 0.005")
+    path, cameras = flown(tmp_path, ", knots = 4.0, attitude = 0.01, position = 0.1, smooth_attitude = 0.005", 60)
     report = adjust_project(AdjustRequest(path))
     assert difference(path, cameras) < 0.15
     times, values = report.figures.corrections[0].over_time or (np.empty(0), np.empty(0))

@@ -157,7 +157,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory, block: Path) -> Path:
     write_image(folder / "scan.tif", np.ascontiguousarray(pixels), tiled=True)
     (folder / "weights.csv").write_text("0,-0.8,0\n-0.8,4.2,-0.8\n0,-0.8,0\n")
     (folder / "model.toml").write_text(MODEL)
-    write_landxml(folder / "survey.xml", ground(), {"ridge": ridge()})
+    write_landxml(folder / "survey.xml", ground(250), {"ridge": ridge()})
     (folder / "ties").mkdir()
     drone_project(block, folder / "ties", "DJI_0025", "DJI_0026", "DJI_0033")
     return folder
@@ -222,12 +222,53 @@ def undisturbed(product: Product, quiet: Ran) -> Path:
     return product.folder / "quiet"
 
 
+def test_faults_03_04_26_killed_then_starved_then_in_any_order(
+    product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path
+) -> None:
+    """A run that is killed halfway; the same command on a disk that runs full; the same with two workers.
+
+    Nothing has the product's name before the end, nothing is computed twice, and the bytes are those of a quiet run.
+    Each mishap by itself is in `make test-slow`.
+    """
+    half = round(0.5 * len(quiet.tasks))
+    killed = product.run(tmp_path, Mishap(end_at=half))
+    assert (killed.code, len(killed.tasks)) == (-9, half)
+    nothing_made(product, tmp_path)
+    full = starved(product, undisturbed, tmp_path)
+    assert not set(killed.tasks) & set(full.tasks)
+    again = product.run(tmp_path, Mishap(shuffled=True), 2)
+    assert again.code == 0, again.err
+    assert "finished already" in again.err or "of an earlier run are kept" in again.err
+    # The task whose result found no room may have been counted before it was kept.
+    done = killed.tasks + full.tasks[:-1]
+    assert not set(done) & set(again.tasks)
+    assert sorted({*done, *full.tasks, *again.tasks}) == sorted(quiet.tasks)
+    assert len(again.tasks) == len(set(again.tasks)) < len(quiet.tasks)
+    assert product.same(tmp_path, undisturbed)
+
+
+def nothing_made(product: Product, out: Path) -> None:
+    assert not product.path(out).exists() and not record_path(product.path(out)).exists()
+
+
+def starved(product: Product, undisturbed: Path, out: Path) -> Ran:
+    """A run on a full disk: exit code 5, which file and what to do; no half product."""
+    room = product.path(undisturbed).stat().st_size // 2
+    full = product.run(out, Mishap(most_bytes=room))
+    assert full.code == 5, full.err
+    assert str(out) in full.err and "free some space" in full.err
+    nothing_made(product, out)
+    assert not [p for p in out.iterdir() if ".part" in p.name or ".plain" in p.name]
+    return full
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sign", "share", "code"),
     [
         pytest.param(signal.SIGKILL, 0.5, -9, id="killed halfway"),
-        pytest.param(signal.SIGKILL, 1.0, -9, id="killed at the last task", marks=pytest.mark.slow),
-        pytest.param(signal.SIGINT, 0.5, 130, id="interrupted", marks=pytest.mark.slow),
+        pytest.param(signal.SIGKILL, 1.0, -9, id="killed at the last task"),
+        pytest.param(signal.SIGINT, 0.5, 130, id="interrupted"),
     ],
 )
 def test_faults_03_25_a_run_that_ended_early_goes_on(
@@ -238,7 +279,7 @@ def test_faults_03_25_a_run_that_ended_early_goes_on(
     killed = product.run(tmp_path, Mishap(end_at=at, sign=sign))
     assert (killed.code, len(killed.tasks)) == (code, at)
     assert sign == signal.SIGKILL or "same command continues" in killed.err.splitlines()[-1]
-    assert not product.path(tmp_path).exists() and not record_path(product.path(tmp_path)).exists()
+    nothing_made(product, tmp_path)
     again = product.run(tmp_path)
     assert again.code == 0, again.err
     assert "finished already" in again.err or "of an earlier run are kept" in again.err
@@ -247,14 +288,10 @@ def test_faults_03_25_a_run_that_ended_early_goes_on(
     assert product.same(tmp_path, undisturbed)
 
 
+@pytest.mark.slow
 def test_fault_04_a_full_disk(product: Product, undisturbed: Path, tmp_path: Path) -> None:
-    """Exit code 5, which file and what to do; no half product; with more room the same command goes on."""
-    room = product.path(undisturbed).stat().st_size // 2
-    full = product.run(tmp_path, Mishap(most_bytes=room))
-    assert full.code == 5, full.err
-    assert str(tmp_path) in full.err and "free some space" in full.err
-    assert not product.path(tmp_path).exists()
-    assert not [p for p in tmp_path.iterdir() if ".part" in p.name or ".plain" in p.name]
+    """With more room the same command goes on."""
+    full = starved(product, undisturbed, tmp_path)
     again = product.run(tmp_path)
     assert again.code == 0, again.err
     assert not set(full.tasks[:-1]) & set(again.tasks)
@@ -270,7 +307,8 @@ def test_fault_05_a_task_that_fails_for_a_moment_is_tried_again(
     assert sorted(said.tasks) == sorted(quiet.tasks) and product.same(tmp_path, undisturbed)
 
 
-@pytest.mark.parametrize("workers", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [2, 4])
 def test_fault_26_more_workers_in_any_order(
     product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path, workers: int
 ) -> None:

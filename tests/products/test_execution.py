@@ -56,6 +56,7 @@ class TestFault26Equality:
             execute(plan, tmp_path, Run(2, cluster.scheduler_address, quicklook=False))
         assert products(tmp_path) == serial
 
+    @pytest.mark.slow
     def test_fault_26_a_mosaic_with_objects_on_a_dask_cluster(self, pristine: Block, tmp_path: Path) -> None:
         distributed = pytest.importorskip("distributed")
         made = []

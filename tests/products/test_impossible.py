@@ -98,6 +98,7 @@ def test_where_nothing_fits_this_is_said(tmp_path: Path) -> None:
     assert "do not determine" in result.failed["a"]
 
 
+@pytest.mark.slow
 def test_a_block_with_exchanged_axes_is_refused(tmp_path: Path) -> None:
     from tools.adjust_project import MIDDLE, Make, write_project
 

@@ -32,9 +32,13 @@ def search(image: LightImage) -> list[EdgeRegion]:
     return search_edges(image, 0, Window(0, 0, *image.size), EdgeRules()).regions
 
 
-def test_tiles_make_no_difference(image: LightImage, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def whole(image: LightImage) -> list[EdgeRegion]:
+    return search(image)
+
+
+def test_tiles_make_no_difference(image: LightImage, whole: list[EdgeRegion], monkeypatch: pytest.MonkeyPatch) -> None:
     """The same edges in one tile and in sixty-odd, which cut most of them: joined again, to a tenth of a pixel."""
-    whole = search(image)
     monkeypatch.setattr(mtf_search, "TILE", 90)
     assert len(tiles_of(Window(0, 0, *image.size))) == 40
     tiled = search(image)
@@ -58,15 +62,14 @@ def test_only_the_area_is_used(image: LightImage) -> None:
             assert 99 <= x <= 341 and 79 <= y <= 281
 
 
-def test_edges_are_spread(image: LightImage) -> None:
+def test_edges_are_spread(image: LightImage, whole: list[EdgeRegion]) -> None:
     """Twelve of 96 edges: both directions, and more cells of the field than the twelve best lie in."""
-    regions = search(image)
-    chosen = select_spread(regions, image.size, 12)
+    chosen = select_spread(whole, image.size, 12)
     cells = {(int(6 * r.line.x / 660), int(6 * r.line.y / 440)) for r in chosen}
     assert len(chosen) == 12
     assert len(cells) >= 6
     assert {abs(r.line.tx) > abs(r.line.ty) for r in chosen} == {True, False}
-    assert len(select_spread(regions, image.size, 1000)) == len(regions)
+    assert len(select_spread(whole, image.size, 1000)) == len(whole)
 
 
 def test_lines_are_joined_where_they_go_on() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,8 +103,7 @@ def test_a_good_block_is_plausible_and_its_figures_are_right() -> None:
         assert image.middle_on_terrain
 
 
-@pytest.mark.parametrize("tilt", [20.0, pytest.param(45.0, marks=pytest.mark.slow), 60.0])
-@pytest.mark.parametrize("count", [1, 2, pytest.param(5, marks=pytest.mark.slow), 12])
+@pytest.mark.parametrize(("count", "tilt"), some([*itertools.product((1, 2, 5, 12), (20.0, 45.0, 60.0))], 0, 5, 6))
 def test_oblique_images_are_left_alone(tilt: float, count: int) -> None:
     """Looking in all directions, and to one side only."""
     _, centers = strips(heading=0)
@@ -260,13 +260,17 @@ def test_every_reading_has_a_sentence_and_the_declared_one_none() -> None:
 
 @pytest.mark.parametrize(
     ("written", "unit", "says"),
-    [
-        (lambda a: a, "deg", None),
-        (np.radians, "deg", "`angle_unit` rad"),
-        (lambda a: a + np.array([180.0, 0, 0]), "deg", "turned by 180°"),
-        (np.degrees, "deg", "`angle_unit` deg"),
-        (lambda a: a, "rad", "degrees that were declared as radians; declare `angle_unit` deg"),
-    ],
+    some(
+        [
+            (lambda a: a, "deg", None),
+            (np.radians, "deg", "`angle_unit` rad"),
+            (lambda a: a + np.array([180.0, 0, 0]), "deg", "turned by 180°"),
+            (np.degrees, "deg", "`angle_unit` deg"),
+            (lambda a: a, "rad", "degrees that were declared as radians; declare `angle_unit` deg"),
+        ],
+        0,
+        2,
+    ),
 )
 def test_fault_14_on_the_real_drone_block(
     block: Path, written: Callable[[np.ndarray], Any], unit: str, says: str | None
@@ -303,4 +307,4 @@ def test_terrain_is_never_asked_for_in_a_large_window() -> None:
         assert np.ptp(XY, axis=0).max(initial=0) <= 1000
         return hills(XY)
 
-    assert len(assess(views(opk, centers), careful).images) == 12
+    assert len(assess(views(opk, centers)[::4], careful).images) == 3

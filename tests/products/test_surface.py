@@ -150,6 +150,7 @@ def test_a_surface_serves_as_terrain(scene: Scene, made: Path) -> None:
     assert said.code == 0, said.err
 
 
+@pytest.mark.slow
 def test_two_images_and_a_wrong_start(tmp_path: Path) -> None:
     """The start is 20 m below the ground, a tenth of the flying height: eight pixels of parallax."""
     scene = write_scene(tmp_path, 2, seed=7)

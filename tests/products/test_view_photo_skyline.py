@@ -180,6 +180,7 @@ def photo_project(folder: Path, dem: Path, photo: Path, off: np.ndarray, longer:
     return init_project(request).path
 
 
+@pytest.mark.slow
 def test_an_image_of_a_project_is_turned_in_its_own_angles(mountains: tuple[Path, Path], tmp_path: Path) -> None:
     """Its orientation is half a degree wrong in ω, φ and κ; the file that is written holds the right one."""
     dem, photo = mountains

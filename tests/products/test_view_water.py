@@ -10,6 +10,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 from tools.command import inside
+from tools.thinned import some
 
 LEVEL, SIDE, MESH = 100.0, 160, 25.0
 BLUE = (112, 150, 184)
@@ -55,7 +56,7 @@ def matrix(island: Path, out: Path, *more: object) -> np.ndarray:
         return file.read()
 
 
-@pytest.mark.parametrize("curvature", ["none", "bend"])
+@pytest.mark.parametrize("curvature", some(["none", "bend"], 1))
 def test_rays_end_on_the_ground_or_on_the_water_whichever_comes_first(
     island: Path, tmp_path: Path, curvature: str
 ) -> None:

@@ -124,10 +124,10 @@ def test_a_raster_of_another_crs_lies_where_it_belongs(small: Block, tmp_path: P
     step = crs_step("EPSG:32633", "EPSG:32632", (X0 - 500, Y0 - 500, X0 + 500, Y0 + 500))
     back = crs_step("EPSG:32632", "EPSG:32633", (0, 5_200_000, 1_000_000, 5_400_000))
     x, y = step(np.array([X0, Y0]))
-    at = np.stack(np.meshgrid(x + np.arange(-400, 400, 2.0) + 1, y - np.arange(-400, 400, 2.0) - 1), axis=-1)
+    at = np.stack(np.meshgrid(x + np.arange(-400, 400, 8.0) + 4, y - np.arange(-400, 400, 8.0) - 4), axis=-1)
     values = (back(at)[..., 1] - Y0).astype(np.float32)
-    profile = {"driver": "GTiff", "width": 400, "height": 400, "count": 1, "dtype": "float32", "crs": "EPSG:32632"}
-    transform = rasterio.transform.from_origin(x - 400, y + 400, 2, 2)
+    profile = {"driver": "GTiff", "width": 100, "height": 100, "count": 1, "dtype": "float32", "crs": "EPSG:32632"}
+    transform = rasterio.transform.from_origin(x - 400, y + 400, 8, 8)
     with rasterio.open(tmp_path / "north.tif", "w", transform=transform, **profile) as file:
         file.write(values, 1)
     look = LookRequest((ContentRequest.parse(str(tmp_path / "north.tif")),), samples=1)

@@ -43,6 +43,7 @@ def camera(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.drawn
 @pytest.mark.parametrize("name", some(SCANS, 0))
+@pytest.mark.slow
 def test_four_corner_marks_are_found_unaided(
     name: str, shared: Path, camera: Path, tmp_path: Path, photoplan: Here
 ) -> None:

@@ -74,6 +74,7 @@ def test_refined_points_fit_better_than_features(project: Path, free) -> None:
     assert np.isfinite(plain.sigma).all() and plain.sigma.min() >= 0.3
 
 
+@pytest.mark.slow
 def test_standard_deviations_come_from_loops(free) -> None:
     report, points, _ = free
     assert report.loops is not None and report.loops.measured

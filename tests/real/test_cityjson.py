@@ -22,12 +22,17 @@ from photoplan.targets.map import MapTarget
 
 @pytest.mark.parametrize(
     ("name", "objects", "crs", "heights"),
-    [
-        ("zurich_subset_lod2.json", 161, "EPSG:2056", (395.0, 622.0)),
-        ("delft.json", 163, "EPSG:28992", (-1.0, 60.0)),
-        ("rotterdam_subset.json", 16, None, (-1.0, 19.0)),
-        ("DH_01_subs.city.json", 9, None, (3.0, 30.0)),
-    ],
+    some(
+        [
+            ("zurich_subset_lod2.json", 161, "EPSG:2056", (395.0, 622.0)),
+            ("delft.json", 163, "EPSG:28992", (-1.0, 60.0)),
+            ("rotterdam_subset.json", 16, None, (-1.0, 19.0)),
+            ("DH_01_subs.city.json", 9, None, (3.0, 30.0)),
+        ],
+        0,
+        2,
+        3,
+    ),
 )
 def test_every_object_is_read(
     shared: Path, name: str, objects: int, crs: str | None, heights: tuple[float, float]

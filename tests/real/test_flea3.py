@@ -65,6 +65,7 @@ def test_response_at_500_nm_and_saturation(analyses):
     assert exposure["value"] == pytest.approx(255 / 0.7595, rel=0.02)
 
 
+@pytest.mark.slow
 def test_no_response_where_black_is_cut_off(analyses):
     result = analyses("linearity")["linearity"]
     known = {f["at"] for f in result["figures"] if f["name"] == "response_at" and f.get("plane") == "R"}
@@ -87,6 +88,7 @@ def test_hot_pixel_is_found_unaided(analyses, shared):
         assert data.read(1)[200, 109] in (HOT[-1], 173, 174, 175)
 
 
+@pytest.mark.slow
 def test_what_clipped_black_hides_is_refused(analyses):
     result = analyses("dark_signal", "fixed_pattern", "noise")
     assert not result["dark_signal"]["figures"]

@@ -21,6 +21,7 @@ from photoplan.products.control.run import ControlRequest, propose_control
     ],
     ids=["of the same flight", "of a satellite, 10 m"],
 )
+@pytest.mark.slow
 def test_control_fits_the_true_orientation_to_a_pixel(
     shared: Path, tmp_path: Path, orthos: list[str], limit: float
 ) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
+from tools.thinned import some
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.geometry.grid import Window
@@ -108,10 +109,10 @@ def one_of_each() -> list[Crop]:
     return [crops[k % len(crops)] for k, crops in enumerate(families.values())]
 
 
-@pytest.mark.parametrize("some", [one_of_each()[:2], pytest.param(CROPS, marks=pytest.mark.slow)], ids=["two", "all"])
-def test_marks_of_another_camera_are_refused(shared, some):
+@pytest.mark.parametrize("crops", [one_of_each()[:2], pytest.param(CROPS, marks=pytest.mark.slow)], ids=["two", "all"])
+def test_marks_of_another_camera_are_refused(shared, crops):
     taken = []
-    for crop in some:
+    for crop in crops:
         found = find_mark(crop.grey(shared), PATTERNS[OTHER[crop.family], crop.side], crop.mm_to_pixel)
         if found.accepted:
             taken.append(f"{OTHER[crop.family]} on {crop.file} at {found.x:.0f}, {found.y:.0f}")
@@ -140,7 +141,7 @@ def turned(degrees: int, mirrored: bool) -> NDArray[np.float64]:
     return rotation @ np.diag([-1.0 if mirrored else 1.0, 1.0])
 
 
-@pytest.mark.parametrize(("file", "box", "others"), CUT)
+@pytest.mark.parametrize(("file", "box", "others"), some(CUT, 2))
 def test_an_example_of_one_side_finds_the_mark_at_others(shared, file, box, others):
     source = next(crop for crop in CROPS if crop.file == file)
     cut = example(shared, source, box)
@@ -151,7 +152,7 @@ def test_an_example_of_one_side_finds_the_mark_at_others(shared, file, box, othe
         assert crop.off(found) <= LIMIT, (crop.file, found.x - crop.x, found.y - crop.y)
 
 
-@pytest.mark.parametrize(("side", "mirrored", "degrees"), [("B", True, 180), ("R", False, 270)])
+@pytest.mark.parametrize(("side", "mirrored", "degrees"), some([("B", True, 180), ("R", False, 270)], 0))
 def test_an_example_of_a_side_with_another_shape_is_refused(shared, side, mirrored, degrees):
     # The upper notch of this camera differs from its lower and right one: it would be placed 6 to 10 px off.
     source = next(crop for crop in CROPS if crop.file == "ee/notch/T.tif")

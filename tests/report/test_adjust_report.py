@@ -264,6 +264,5 @@ def test_thirty_check_points_are_enough(count: int, warned: bool) -> None:
     assert bool(found.warnings) == warned
 
 
-@pytest.mark.drawn
 def test_rates_of_a_drift_have_their_standard_deviations():
     assert "0.003 ± 0.0004" in "".join(Page(adjust_page(facts())).words)

@@ -178,6 +178,7 @@ def test_correlation_is_that_of_the_prediction(family):
     np.testing.assert_allclose(dtm_covariance.correlation_at(family, t), kernel, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_expected_products_are_the_mean_of_simulated_ones(built):
     """If the fitted function is the terrain's, residuals from the plane have just these products on average."""
     leaves = dtm_covariance._leaves(built.fit)

@@ -100,8 +100,7 @@ def write_project(folder: Path, make: Make = Make()) -> Made:
             refraction=make.refraction,
             mean_ground=GROUND,
         )
-        for point, XYZ in points.items():
-            xy = project(camera, XYZ)
+        for point, xy in zip(points, project(camera, np.array([*points.values()]))):
             if (xy > 0).all() and (xy < np.array(SIZE) - 1).all():
                 xy = xy + random.normal(scale=make.pixel_noise, size=2) if make.pixel_noise else xy
                 rows.append(f"{point},{name}.tif,{xy[0]:.8f},{xy[1]:.8f}")
@@ -237,7 +236,6 @@ def misses(made: Made, changed: Project, make: Make) -> NDArray[np.float64]:
             refraction=make.refraction,
             mean_ground=GROUND,
         )
-        for point, file, x, y in measured:
-            if file == f"{name}.tif":
-                out.append(project(camera, made.points[point]) - [float(x), float(y)])
-    return np.array(out)
+        own = [(point, float(x), float(y)) for point, file, x, y in measured if file == f"{name}.tif"]
+        out.append(project(camera, np.array([made.points[point] for point, *_ in own])) - [xy for _, *xy in own])
+    return np.concatenate(out)

@@ -208,14 +208,19 @@ def versions() -> dict[str, str]:
     """Versions of all that takes part in a result; no word of the machine's name, user or folders."""
     found = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
     for name in _PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
+        found[name] = _installed(name)
     found["GDAL"] = rasterio.__gdal_version__
     found["PROJ"] = rasterio.__proj_version__
     found["JPEG decoder"] = jpeg_decoder()
     return found
+
+
+@cache
+def _installed(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "not installed"
 
 
 @cache
