@@ -104,6 +104,23 @@ def test_fault_14_angles_of_another_unit_are_told(tmp_path: Path) -> None:
     assert "flight.csv" in told and "row" in told and "deg" in told
 
 
+def test_fault_14_angles_that_turn_by_less_than_a_circle_in_another_unit_are_told(tmp_path: Path) -> None:
+    """Lines then lie hundreds of pixels beside each other's course, which no flight does."""
+    project = written(ShakenStrip(lines=40, columns=40, vibration=(1, 0.2, 0.1), events=(8, 2, 1)), tmp_path)
+    assert "all plausible" in inside("check", project).out
+    edited(tmp_path / "strip.toml", "lever_arm", 'angle_unit = "rad"\nlever_arm')
+    said = inside("check", project)
+    assert said.code == 3 and "pixels from the smooth course: are angles in another unit" in said.out
+
+
+def test_fault_30_a_flight_whose_heights_are_in_feet_is_told(tmp_path: Path) -> None:
+    project = written(Strip(lines=60, columns=40), tmp_path)
+    table = np.loadtxt(tmp_path / "flight.csv", delimiter=",", skiprows=1)
+    table[:, 3] *= 3.2808
+    np.savetxt(tmp_path / "flight.csv", table, "%.9f", ",", header="time,x,y,z,omega,phi,kappa", comments="")
+    assert "times as long one way as the other on the ground" in inside("check", project).out
+
+
 @pytest.mark.parametrize(
     ("by", "told"),
     [

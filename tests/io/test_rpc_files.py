@@ -20,6 +20,7 @@ from photoplan.products.describe import describe
 RPC = functions()
 FORMS: dict[str, Callable[[RationalFunctions], str]] = {
     "scene_RPC.TXT": as_text,
+    "scene.rpc": as_text,
     "scene.RPB": as_rpb,
     "scene.XML": as_digitalglobe,
     "RPC_scene.XML": as_dimap,
@@ -121,6 +122,13 @@ def test_fault_10_18_wrong_numbers_are_named(tmp_path: Path, name: str, text: st
     with pytest.raises(InputError, match=told) as error:
         read_rpc(tmp_path / name)
     assert name in str(error.value)
+
+
+def test_information_of_another_document_says_what_it_is_without(tmp_path: Path) -> None:
+    """The general metadata of EnMAP, or of SPOT 5, are no virtual raster."""
+    (tmp_path / "a.xml").write_text("<level_X><a/></level_X>")
+    with pytest.raises(InputError, match="<level_X> without rational polynomials"):
+        describe(tmp_path / "a.xml")
 
 
 def test_an_image_without_them_says_what_may_be_given(tmp_path: Path) -> None:

@@ -41,6 +41,11 @@ class ImageField(Protocol):
 class Tremor(Protocol):
     """What of a mapping changes from line to line of the image, apart from the rest: a turbulent flight."""
 
+    @property
+    def largest(self) -> NDArray[np.float64]:
+        """Largest shifts along x and y of blocks of lines against the smooth part, (k, 2), pixels."""
+        ...
+
     def part(self, XYZ: NDArray[np.float64]) -> TremorPart | None:
         """For the ground that points (n, 3) enclose; None: the image does not show it.
 
@@ -221,8 +226,11 @@ def parts_of(projection: Projection) -> tuple[Part | None, ...]:
 
 def tremor_told(projection: Projection, height: float) -> str | None:
     """How strongly it shakes, see `Tremor.told`; None: it does not. Parts of one image shake alike."""
-    for part in parts_of(projection):
-        tremor = tremor_of(projection if part is None else part.projection)
-        if tremor is not None:
-            return tremor.told(height)
-    return None
+    tremors = tremors_of(projection)
+    return tremors[0].told(height) if tremors else None
+
+
+def tremors_of(projection: Projection) -> list[Tremor]:
+    """What of it and of the parts of its image changes from line to line; empty: nothing does."""
+    each = [tremor_of(projection if part is None else part.projection) for part in parts_of(projection)]
+    return [tremor for tremor in each if tremor is not None]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.cameras.base import Camera, tremor_told
+from photoplan.cameras.base import Camera, tremor_told, tremors_of
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.io.project.model import Project
@@ -27,6 +27,10 @@ _CURVATURE_MATTERS = 0.3
 
 #: Pixels that are so many times longer than wide on the ground are none of a scanner.
 _LONGEST = 50.0
+#: From here on it is told: speed, height above ground and line period fit each other in most flights.
+_LONG = 2.5
+#: Lines that lie by this part of the image beside the smooth course are none of a flight, and at least so many pixels.
+_TORN, _TORN_PIXELS = 0.5, 100.0
 
 
 @dataclass(frozen=True)
@@ -172,10 +176,13 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
     shaken = tremor_told(camera, float(np.nanmean(seen.outline[:, 2])))
     if shaken is not None:
         notes = (*notes, shaken)
+        fault = fault or _torn(camera)
     relief, curvature = _sensitivity(camera, seen)
     longer = _longer(camera, seen)
     if longer > _LONGEST:
         fault = fault or f"its pixels are {longer:.0f} times longer than wide on the ground: is a scale wrong?"
+    elif longer > _LONG:
+        notes = (*notes, f"its pixels are {longer:.1f} times as long one way as the other on the ground")
     xmin, ymin, xmax, ymax = seen.bounds
     return ImageCheck(
         image=name,
@@ -188,6 +195,17 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
         curvature_px=curvature,
         fault=fault,
         notes=notes,
+    )
+
+
+def _torn(camera: Camera) -> str | None:
+    """What no aircraft does: lines that lie far from the smooth course, as angles in another unit or sense put them."""
+    far = max(float(tremor.largest.max()) for tremor in tremors_of(camera))
+    if far <= max(_TORN * max(camera.size), _TORN_PIXELS):
+        return None
+    return (
+        f"its lines lie up to {far:.0f} pixels from the smooth course: are angles in another unit or order, or is κ a "
+        "heading (0 to the north, clockwise)?"
     )
 
 

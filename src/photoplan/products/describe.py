@@ -87,7 +87,7 @@ def describe(path: Path) -> dict[str, Any]:
         return _plan(path)
     if kind == ".json":
         return _record(path)
-    if is_rpc(path):
+    if is_rpc(path) or kind == ".xml":
         return {"file": str(path), **read_rpc(path).describe()}
     return _raster(read_info(path))
 

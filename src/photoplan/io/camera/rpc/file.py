@@ -33,6 +33,7 @@ def _plain(form: str, read: Callable[[Path], RationalFunctions]) -> Callable[[Pa
 #: Reader of every format, by file suffix.
 RPC_FORMATS: dict[str, Callable[[Path], StatedRpc]] = {
     ".txt": _plain(text.FORM, text.read),
+    ".rpc": _plain(text.FORM, text.read),
     ".rpb": _plain(rpb.FORM, rpb.read),
     ".xml": _document,
 }
@@ -77,7 +78,7 @@ def rpc_beside(image: Path) -> Path | None:
     """The file of rational polynomials that belongs to an image by its name; None: there is none."""
     stem = image.stem
     product = re.sub(r"^IMG_", "RPC_", re.sub(r"_R1C1$", "", stem))
-    names = {f"{stem}_rpc.txt", f"{stem}.rpb", f"{stem}.xml"}
+    names = {f"{stem}_rpc.txt", f"{stem}.rpc", f"{stem}.rpb", f"{stem}.xml"}
     names |= {f"{product}.xml".casefold()} if product.startswith("RPC_") else set()
     wanted = {name.casefold() for name in names}
     beside = sorted(p for p in image.parent.iterdir() if p.name.casefold() in wanted and p.is_file())
