@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ from cli import test_place_faults
 from tools.command import Here, Said, inside, patience, sabotage, start, wait_for
 from tools.effort import at_most
 from tools.facet_scene import write_scene
-from tools.small_block import X0, Y0, Block
+from tools.line_strip import Strip
+from tools.small_block import X0, Y0, Block, write_image
 
 BOUNDS = (X0 - 15, Y0 - 27, X0 + 15, Y0 + 27)
 
@@ -112,6 +114,49 @@ def test_fault_07_a_bomb_is_refused_from_its_header(project: Path) -> None:
     with at_most(1):
         said = surface(project)
     assert said.code == 3 and f"{bomb}: the header promises 400000 × 400000 pixels" in said.err
+
+
+def test_bands_that_are_none(project: Path) -> None:
+    for words, code, text in (
+        (["--bands", "2"], 2, "bands 2: image 'i1' has 1"),
+        (["--bands", "0"], 2, "numbers from 1 on"),
+        (["--bands", "1,1"], 2, "each once"),
+        (["--bands", "red"], 2, "bands red: numbers from 1 on are needed"),
+    ):
+        said = surface(project, *words, "--dry-run")
+        assert said.code == code and text in said.err, said.err
+
+
+def test_fault_18_records_of_strips_as_spreadsheets_leave_them(tmp_path: Path) -> None:
+    """A BOM and CRLF are read as what they are; a cell that is no number, ragged rows, a header alone: by line."""
+    strip = Strip(lines=120, columns=200, waves=0.0)
+    text = f'format = 1\ncrs = "{strip.crs}"\n[terrain]\nheight = 200.0\nheight_system = "ellipsoidal"\n'
+    for name, ahead in (("forward", 46.6), ("nadir", 0.0)):
+        (tmp_path / name).mkdir()
+        back = (strip.origin[0] - 28.0 * ahead, strip.origin[1])
+        replace(strip, origin=back).strip_file(tmp_path / name)
+        text += f'[[images]]\nname = "{name}"\nfile = "{name}.tif"\nline = "{name}/strip.toml"\ndetectors = "{name}"\n'
+        write_image(tmp_path / f"{name}.tif", np.full((1, 120, 200), 9, np.uint8))
+    project, table = tmp_path / "project.toml", tmp_path / "forward" / "flight.csv"
+    project.write_text(text)
+    plain = table.read_text()
+    rows = plain.splitlines()
+    words = ("surface", project, "--resolution", 1.0, "--dry-run", "--json")
+    said = inside(*words)
+    assert said.code == 0, said.err
+    table.write_bytes(b"\xef\xbb\xbf" + plain.replace("\n", "\r\n").encode())
+    again = inside(*words)
+    plans = [json.loads(one.out) for one in (said, again)]
+    assert plans[0].pop("key") != plans[1].pop("key") and plans[0] == plans[1]
+    no_number = ",".join([rows[5].split(",")[0], "nan", *rows[5].split(",")[2:]])
+    for changed, told in (
+        ([*rows[:5], no_number, *rows[6:]], "row 5"),
+        ([*rows[:5], "1,2", *rows[6:]], "columns changed from 7 to 2 at row 5)"),
+        (rows[:1], "flight.csv"),
+    ):
+        table.write_text("\n".join(changed) + "\n")
+        said = inside(*words)
+        assert said.code == 3 and told in said.err, said.err
 
 
 def test_fault_14_gon_declared_as_degrees(photoplan: Here, small: Block) -> None:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+import rasterio.shutil
 from tools.command import Said, inside
 from tools.facet_scene import GROUND, HEIGHT, Scene, write_scene
-from tools.small_block import X0, Y0
+from tools.small_block import X0, Y0, write_image
 
 from photoplan.geometry.frames import WallFrame
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
@@ -106,6 +107,14 @@ def test_the_scene_stood_up_is_a_wall(scene: Scene, on_map: Path, tmp_path: Path
     project.write_text(stated.replace('surface.tif"', 'surface.tif"\ncrs = "EPSG:32633"'))
     said = inside("ortho", project, "--images", "i2", "--resolution", 0.5, "--output", tmp_path / "o", "--no-quicklook")
     assert said.code == 3 and "which is no map" in said.err, said.err
+    # Nor is a copy on which somebody put a CRS.
+    with rasterio.open(tmp_path / "surface.tif") as file:
+        rasterio.shutil.copy(file, tmp_path / "copy.tif", driver="GTiff")
+    with rasterio.open(tmp_path / "copy.tif", "r+") as file:
+        file.crs = "EPSG:32633"
+    project.write_text(stated.replace("surface.tif", "copy.tif"))
+    said = inside("ortho", project, "--images", "i2", "--resolution", 0.5, "--output", tmp_path / "o", "--no-quicklook")
+    assert said.code == 3 and "which is no map" in said.err, said.err
 
 
 def test_a_picture_names_what_is_along_its_axes(on_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,6 +139,20 @@ def test_heights_along_an_image_are_the_ground(scene: Scene, tmp_path: Path) -> 
     print(len(found), np.sqrt(np.mean(off**2)) / scene.height_of_a_pixel, np.sqrt(np.mean((off / found["sigma"]) ** 2)))
     assert len(found) == 256 and np.sqrt(np.mean(off**2)) < 0.05 * scene.height_of_a_pixel
     assert 0.5 < np.sqrt(np.mean((off / found["sigma"]) ** 2)) < 1.6
+
+
+def test_bands_are_chosen(scene: Scene, on_map: Path, tmp_path: Path) -> None:
+    """Of images with noise in two bands that are not taken, the third gives what it gives alone."""
+    for path in scene.path.parent.glob("rendered/*.tif"):
+        with rasterio.open(path) as file:
+            own = file.read(1)
+        noise = np.random.default_rng(0).integers(1, 255, own.shape, np.uint8)
+        write_image(tmp_path / path.name, np.stack([noise, noise[::-1], own]))
+    project = scene.path.with_name("bands.toml")
+    project.write_text(scene.path.read_text().replace('"rendered/', f'"{tmp_path}/'))
+    said = surface(project, "--bands", 3, "--start", GROUND, *around(X, Y), "--output", tmp_path)
+    assert said.code == 0, said.err
+    assert layers(tmp_path)[0].tobytes() == layers(on_map)[0].tobytes()
 
 
 def test_an_image_has_its_own_bounds_and_the_distance_of_the_terrain(scene: Scene) -> None:

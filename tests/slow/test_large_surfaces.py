@@ -59,7 +59,7 @@ def test_seams_between_tiles(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, 4, seed=5, base=60, size=(280, 200))
     bounds = (X0 - 45, Y0 - 36, X0 + 45, Y0 + 36)
     plan = plan_surface(load_project(scene.path), SurfaceSettings(1.5, bounds=bounds))
-    job = SurfaceJob(plan.address, plan.grid, plan.scheme, "terrain")
+    job = SurfaceJob(address=plan.address, grid=plan.grid, scheme=plan.scheme, start="terrain")
     width, height = plan.grid.width, plan.grid.height
     windows = (Window(0, 0, width, height), Window(0, 0, width // 2, height))
     windows += (Window(width // 2, 0, width - width // 2, height),)

@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from tools.facet_scene import CONTRAST, GROUND, Field, Scene, waves
+from photoplan.cameras.rpc_fit import fit_rpc
+from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.io.project.file import load_project
+from photoplan.project.cameras import central_without_pixels
+from tools.facet_scene import CONTRAST, GROUND, Field, Scene, rendered, waves
+from tools.rpc_files import as_text
 from tools.shaken_strip import ShakenStrip
 from tools.small_block import write_image
 
@@ -32,11 +37,17 @@ HEIGHT_OF_A_PIXEL = GSD * SHAKEN.focal / (2 * AHEAD["forward"])
 _AROUND = 20.0
 
 
-def write_strips(folder: Path, like: ShakenStrip = SHAKEN, seed: int = 0, snr: float = 50.0) -> Scene:
-    """The same hills as each line of one flight sees them, one after the other; pixels of 0.29 m."""
+def write_strips(
+    folder: Path, like: ShakenStrip = SHAKEN, seed: int = 0, snr: float = 50.0, relief: float = 1.0
+) -> Scene:
+    """The same hills as each line of one flight sees them, one after the other; pixels of 0.29 m.
+
+    Pattern and hills have the sizes, in pixels and in pixels of parallax, of `facet_scene`; or hills `relief` times so
+    high.
+    """
     rng = np.random.default_rng(seed)
-    lengths = np.repeat((40.0, 100.0), 6)
-    hills = waves(seed + 1, lengths, lengths / 100.0, CENTRE)
+    lengths = np.repeat((80.0, 200.0), 6)
+    hills = waves(seed + 1, lengths * GSD, relief * 0.003 * lengths * HEIGHT_OF_A_PIXEL, CENTRE)
     sizes = np.full(64, CONTRAST * np.sqrt(2 / 64))
     pattern = waves(seed + 2, 3.0 * GSD * 12.0 ** np.linspace(0, 1, 64), sizes, CENTRE)
     entries = []
@@ -87,3 +98,47 @@ def _seen(
         XY = feet[0] + ((z + _AROUND) / (2 * _AROUND))[..., None] * (feet[1] - feet[0])
         z = hills(XY[..., 0], XY[..., 1])
     return np.asarray(120 + pattern(XY[..., 0], XY[..., 1]))
+
+
+def with_others(scene: Scene, seed: int = 9) -> Path:
+    """A project of the forward and the nadir line, a frame, a film scan and a satellite image of the same scene."""
+    rng = np.random.default_rng(seed)
+    lines = scene.path.read_text().partition('[[images]]\nname = "backward"')[0]
+    high = SHAKEN.flying - GROUND
+    marks = {name: (x, y) for name, (x, y) in zip("abcd", ((-90, -90), (90, -90), (90, 90), (-90, 90)))}
+    films = {name: (130.0 + x * 1.3, 130.5 - y * 1.301) for name, (x, y) in marks.items()}
+    listed = [", ".join(f"{name} = {list(at)}" for name, at in which.items()) for which in (marks, films)]
+    text = f"""
+[cameras.digital]
+type = "frame"
+size = [260, 260]
+focal_px = {SHAKEN.focal / SHAKEN.pitch}
+[cameras.film]
+type = "film"
+camera_constant_mm = {SHAKEN.focal / SHAKEN.pitch / 1.3}
+fiducials_mm = {{ {listed[0]} }}
+size = [260, 260]
+"""
+    for name, camera, x, y, more in (
+        ("frame", "digital", -600.0, 100.0, ""),
+        ("film", "film", 100.0, 650.0, f"fiducials = {{ {listed[1]} }}\n"),
+        ("satellite", "digital", 700.0, -300.0, ""),
+    ):
+        angles = np.degrees([-np.arctan2(y, high), np.arctan2(x, np.hypot(y, high)), 0.0])
+        center = (CENTRE[0] + x, CENTRE[1] + y, SHAKEN.flying)
+        text += f'[[images]]\nname = "{name}"\nfile = "{name}.tif"\ncamera = "{camera}"\n{more}'
+        text += f"center = {list(center)}\nangles = {angles.tolist()}\n"
+    path = scene.path.with_name("all.toml")
+    systems = '[orientation]\nheight_system = "ellipsoidal"\n'
+    path.write_text(lines.replace("[[images]]", f"{systems}[[images]]", 1) + text)
+    project = load_project(path)
+    for name in ("frame", "film", "satellite"):
+        camera = central_without_pixels(project, name)
+        noisy = np.rint(rendered(camera, scene) + rng.normal(0, CONTRAST / 50, (260, 260)))
+        write_image(scene.path.with_name(f"{name}.tif"), np.clip(noisy, 1, 255)[None].astype(np.uint8))
+        if name == "satellite":
+            fitted = fit_rpc(camera, GeodeticGround(SHAKEN.crs, "ellipsoidal"), (GROUND - 30, GROUND + 30))
+            scene.path.with_name("satellite_RPC.TXT").write_text(as_text(fitted.functions))
+    before = path.read_text().partition('name = "satellite"')[0]
+    path.write_text(f'{before}name = "satellite"\nfile = "satellite.tif"\nrpc = "satellite_RPC.TXT"\n')
+    return path

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import NEW_FOLDER, PATH, bounds_option, dry_run_option, executing, images_option
+from photoplan.cli.options import LISTED, NEW_FOLDER, PATH, bounds_option, dry_run_option, executing, images_option
 
 
 @click.command("surface")
@@ -34,6 +35,7 @@ from photoplan.cli.options import NEW_FOLDER, PATH, bounds_option, dry_run_optio
     default=None,
     help="Whether heights are searched within the reach first: strong relief [from a reach of 24 px of parallax on].",
 )
+@click.option("--bands", metavar="N,…", **LISTED, help="Bands whose mean is a grey value [all; of three luminance].")
 @click.option(
     "--points", type=PATH, multiple=True, metavar="FILE", help="Also as points, .las, .laz or .ply; may be repeated."
 )
@@ -64,6 +66,7 @@ def command(project: Path, **options: Any) -> None:
     from photoplan.report.surface import surface_page
 
     how = running.How.from_options(options)
+    options["bands"] = _bands(options["bands"])
     folder, dry_run, images, force = (options.pop(name) for name in ("output", "dry_run", "images", "force"))
     report = None if dry_run else open_report(options.pop("report"), [], overwrite=how.overwrite, project=project)
     options.pop("report", None)
@@ -88,6 +91,16 @@ def command(project: Path, **options: Any) -> None:
             for path in filter(None, (result.path, *result.others, told)):
                 show(path)
         _tell(result, plan, picture, events)
+
+
+def _bands(words: Sequence[str] | None) -> tuple[int, ...]:
+    """Bands from words."""
+    from photoplan.errors import UsageError
+
+    try:
+        return tuple(int(word) for word in words or ())
+    except ValueError:
+        raise UsageError(f"bands {', '.join(words or ())}: numbers from 1 on are needed") from None
 
 
 def _tell(result: Any, plan: Any, picture: Path | None, events: Any) -> None:

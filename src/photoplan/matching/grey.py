@@ -1,7 +1,7 @@
 """Images as one band of grey values, read by windows: what features and matching work on.
 
-Rule: one band is taken as it is, three are weighed 0.299, 0.587, 0.114 (ITU-R BT.601), of any other number the mean is
-taken. Grey values keep the scale of the pixels.
+Rule, if no bands are chosen: one band is taken as it is, three are weighed 0.299, 0.587, 0.114 (ITU-R BT.601), of any
+other number the mean is taken. Grey values keep the scale of the pixels.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ class GreyImage:
     pixels: GreyPixels
     area: tuple[float, float, float, float] | None = None
     """Columns and rows xmin, ymin, xmax, ymax of the picture on a scan, without its margin; None: everything."""
+    bands: tuple[int, ...] = ()
+    """Bands whose mean counts, from 1; empty: all, by the rule above."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -65,7 +67,7 @@ class GreyImage:
         if not inside.size:
             return out
         pixels, valid = self.pixels.read(inside)
-        grey = _grey(pixels)
+        grey = _grey(pixels) if not self.bands else pixels[[band - 1 for band in self.bands]].mean(0, np.float32)
         if valid is not None:
             grey[~valid] = np.nan
         if self.area is not None:

@@ -118,7 +118,7 @@ def _open_raster(path: Path, crs: str | None, option: str) -> OpenTerrain:
     info = reader.info
     assert info.to_map is not None
     found = info.crs or crs
-    target = target_of(info.path, info.driver) if info.crs is None else None
+    target = target_of(info.path, info.driver)
     if target is not None:
         raise InputError(
             f"{path}: heights over {target}, which is no map and no terrain; let `photoplan surface` write them as "

@@ -35,7 +35,7 @@ MISFIT = 2.0
 _EACH = 400
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SurfaceJob:
     """All that a worker is told."""
 
@@ -48,6 +48,8 @@ class SurfaceJob:
     """See `SurfaceSettings.residuals`."""
     frame: Frame | None = None
     """Of the target; None: the map."""
+    bands: tuple[int, ...] = ()
+    """See `SurfaceSettings.bands`."""
 
     @property
     def part(self) -> int:
@@ -62,7 +64,8 @@ class SurfaceJob:
     def __call__(self, tile: Tile) -> Made:
         """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""
         kept = _KEPT // len(self.address.scenes)
-        views = [_view(scene, kept, self.frame, self.grid.bounds) for scene in self.address.scenes]
+        target = self.frame, self.grid.bounds
+        views = [_view(scene, kept, target, self.bands) for scene in self.address.scenes]
         start = _start(self.address, self.start, self.grid.crs)
         window, m = tile.window, self.scheme.ratio
         shape, finest = (window.height, window.width), (m * window.height, m * window.width)
@@ -104,11 +107,17 @@ class SurfaceJob:
 
 
 @lru_cache(maxsize=256)
-def _view(address: SceneAddress, kept: int, frame: Frame | None, bounds: tuple[float, float, float, float]) -> View:
+def _view(
+    address: SceneAddress,
+    kept: int,
+    target: tuple[Frame | None, tuple[float, float, float, float]],
+    bands: tuple[int, ...],
+) -> View:
     """An image and its pyramid, kept for the next tile."""
     scene = address.open()
+    frame, bounds = target
     camera = scene.camera if frame is None else FramedCamera(scene.camera, frame, bounds)
-    return View(camera, Pyramid(GreyImage(scene.reader), kept=kept))
+    return View(camera, Pyramid(GreyImage(scene.reader, bands=bands), kept=kept))
 
 
 @lru_cache(maxsize=4)

@@ -25,6 +25,7 @@ from photoplan.plain import pick
 from photoplan.products.orthophoto.look import extent_text
 from photoplan.products.surface.target import Bounds, SeenTarget, frame_of, over_frame, over_map
 from photoplan.project.open_terrain import open_terrain
+from photoplan.project.scene import open_scene
 from photoplan.project.scenes import ScenesAddress
 
 #: Side of a tile of heights; those of grey values are as many times larger as they are finer.
@@ -73,6 +74,8 @@ class SurfaceSettings:
     search: bool | None = None
     """Whether heights are first searched post by post within the reach, for strong relief; None: where the reach is
     many pixels of parallax."""
+    bands: tuple[int, ...] = ()
+    """Bands of every image whose mean is its grey value, from 1; empty: luminance of three, the mean of others."""
     residuals: bool = False
     """Whether to write the residuals of every image, too."""
     points: tuple[Path, ...] = ()
@@ -206,6 +209,7 @@ def plan_surface(
         MapGrid.covering(bounds, settings.resolution, "")
         settings = replace(settings, bounds=bounds, start="0" if settings.start == "terrain" else settings.start)
         looked, blind = over_frame(project, names, frame, bounds, float(settings.start), events)
+    _check_bands(project, settings.bands, looked)
     bounds = _bounds(settings, looked, blind)
     gsd = float(np.median([one.gsd for one in looked]))
     if settings.resolution < _FINEST * gsd * 0.999:
@@ -292,6 +296,16 @@ def check_start(project: Project, settings: SurfaceSettings) -> None:
         if not Path(settings.start).exists():
             raise UsageError(f"start {settings.start!r}: is no height and no file; give `terrain`, a height, or a file")
         open_terrain(Path(settings.start)).in_crs(project.crs)
+
+
+def _check_bands(project: Project, bands: Sequence[int], looked: Sequence[SeenTarget]) -> None:
+    """Refuse bands that an image does not have, or that are stated twice."""
+    if len(set(bands)) < len(bands) or any(band < 1 for band in bands):
+        raise UsageError(f"bands {', '.join(map(str, bands))}; numbers from 1 on are needed, each once")
+    for one in looked if bands else ():
+        own = open_scene(project, one.name).reader.bands
+        if max(bands) > own:
+            raise UsageError(f"bands {', '.join(map(str, bands))}: image {one.name!r} has {own}")
 
 
 def _number(text: str) -> float | None:

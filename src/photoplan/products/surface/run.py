@@ -134,7 +134,15 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
     for place in (folder, *(path.parent for path in plan.settings.points)):
         make_folder(place)
     address = plan.address
-    job = SurfaceJob(address, plan.grid, plan.scheme, plan.settings.start, plan.settings.residuals, plan.frame)
+    job = SurfaceJob(
+        address=address,
+        grid=plan.grid,
+        scheme=plan.scheme,
+        start=plan.settings.start,
+        residuals=plan.settings.residuals,
+        frame=plan.frame,
+        bands=plan.settings.bands,
+    )
     inputs = tuple(str(Path(path).resolve()) for path, _ in address.digests)
     question = Question(versions, inputs, str(folder.resolve()))
     tiles = Tiles.every(plan.grid.window, TILE)

@@ -33,7 +33,8 @@ def read_numbers(path: Path, columns: str, max_bytes: int) -> NDArray[np.float64
                 raise InputError(f"{path}: holds nothing but its first line")
             table = np.loadtxt(body.splitlines(), delimiter=",", ndmin=2)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from None
+        # What NumPy advises behind the semicolon is for who programs.
+        raise InputError(f"{path}: cannot be read ({str(error).partition(';')[0]})") from None
     if table.ndim != 2 or table.shape[1] != count:
         raise InputError(f"{path}: a table of shape {table.shape}; needed are {count} numbers in each row")
     wrong = ~np.isfinite(table).all(axis=1)
