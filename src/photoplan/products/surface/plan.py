@@ -12,20 +12,16 @@ import numpy as np
 
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.bounds import MOST_HEIGHT, odd_place
 from photoplan.geometry.frames import Frame, ImageFrame
 from photoplan.geometry.grid import MapGrid
-from photoplan.io.names import safe_stem
-from photoplan.io.point_cloud import check_cloud
 from photoplan.io.project.model import Project
 from photoplan.io.run_record import run_key
 from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.matching.facets.search import Planes, Search
 from photoplan.plain import pick
 from photoplan.products.orthophoto.look import extent_text
-from photoplan.products.surface.target import Bounds, SeenTarget, frame_of, over_frame, over_map
-from photoplan.project.open_terrain import open_terrain
-from photoplan.project.scene import open_scene
+from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start, number
+from photoplan.products.surface.target import SeenTarget, frame_of, over_frame, over_map
 from photoplan.project.scenes import ScenesAddress
 
 #: Side of a tile of heights; those of grey values are as many times larger as they are finer.
@@ -53,40 +49,6 @@ _LEVELS = 8
 #: Pixels of parallax of the reach from which on heights are searched; those for which the coarsest level of a search
 #: has planes, up and down; and by how many pixels of parallax the facets may move what was found.
 _RELIEF, _PLANES, _ROOM = 24.0, 24.0, 3.0
-
-
-@dataclass(frozen=True)
-class SurfaceSettings:
-    """What a user may choose about a surface."""
-
-    resolution: float
-    """Distance of the height posts, metres."""
-    target: str = "map"
-    """What heights are over: `map`, `wall:X,Y,Z,AZIMUTH[,TILT]`, `vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`,
-    `column:X,Y,Z,AZIMUTH,RADIUS` or `image:NAME[,DISTANCE]`, see `frame_of`."""
-    bounds: Bounds | None = None
-    """xmin, ymin, xmax, ymax; None: all that two images see, or the image that is the target; others need them."""
-    start: str = "terrain"
-    """`terrain` (the project's), a height in metres, or a file of heights; on a target that is no map a height, for
-    `terrain` 0."""
-    reach: float | None = None
-    """How far the start may be wrong, metres; None: a tenth of the flying height."""
-    search: bool | None = None
-    """Whether heights are first searched post by post within the reach, for strong relief; None: where the reach is
-    many pixels of parallax."""
-    bands: tuple[int, ...] = ()
-    """Bands of every image whose mean is its grey value, from 1; empty: luminance of three, the mean of others."""
-    residuals: bool = False
-    """Whether to write the residuals of every image, too."""
-    points: tuple[Path, ...] = ()
-    """Files that the heights are written to as points, too: .las, .laz or .ply."""
-    name: str = "surface"
-    """Of the product, and of its files without the extension."""
-
-    @property
-    def seen(self) -> str:
-        """What images see, as messages call it."""
-        return "ground" if self.target == "map" else "target"
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +171,7 @@ def plan_surface(
         MapGrid.covering(bounds, settings.resolution, "")
         settings = replace(settings, bounds=bounds, start="0" if settings.start == "terrain" else settings.start)
         looked, blind = over_frame(project, names, frame, bounds, float(settings.start), events)
-    _check_bands(project, settings.bands, looked)
+    check_bands(project, settings.bands, [one.name for one in looked])
     bounds = _bounds(settings, looked, blind)
     gsd = float(np.median([one.gsd for one in looked]))
     if settings.resolution < _FINEST * gsd * 0.999:
@@ -239,7 +201,7 @@ def plan_surface(
         scheme = Scheme(ratio, 0, base, reach, search)
     used = tuple(one.name for one in looked)
     files = [Path(path) for path, _ in ScenesAddress.of(project, used).digests]
-    if settings.start not in ("terrain",) and _number(settings.start) is None:
+    if settings.start not in ("terrain",) and number(settings.start) is None:
         files.append(Path(settings.start))
     stated = {
         "settings": replace(settings, points=()),
@@ -261,58 +223,6 @@ def plan_surface(
         height_error=height_error,
         key=key,
     )
-
-
-def check_start(project: Project, settings: SurfaceSettings) -> None:
-    """Refuse a start that is none.
-
-    Raises
-    ------
-    UsageError
-        It is no height and no file, or a reach or name makes no sense.
-    InputError
-        The file cannot be used.
-    """
-    if settings.reach is not None and not 0 < settings.reach <= MOST_HEIGHT:
-        raise UsageError(f"reach {settings.reach}; a positive number of metres is needed, {MOST_HEIGHT:g} at most")
-    name = settings.name
-    if not any(c.isalnum() for c in name) or safe_stem(name) != name.replace(" ", "_"):
-        raise UsageError(
-            f"name {name!r}; give the name of a file without folder and extension, of letters, digits, - and _"
-        )
-    for path in settings.points:
-        check_cloud(path)
-    if settings.start == "terrain":
-        return
-    number = _number(settings.start)
-    if number is not None and not math.isfinite(number):
-        raise UsageError(f"start {settings.start}; give `terrain`, a height in metres, or a file of heights")
-    odd = None if number is None else odd_place((0.0, 0.0, number), camera=True)
-    if odd is not None:
-        raise UsageError(f"start: {odd}")
-    if number is None and settings.target != "map":
-        raise UsageError(f"start {settings.start!r}: on a target that is no map give a height in metres")
-    if number is None:
-        if not Path(settings.start).exists():
-            raise UsageError(f"start {settings.start!r}: is no height and no file; give `terrain`, a height, or a file")
-        open_terrain(Path(settings.start)).in_crs(project.crs)
-
-
-def _check_bands(project: Project, bands: Sequence[int], looked: Sequence[SeenTarget]) -> None:
-    """Refuse bands that an image does not have, or that are stated twice."""
-    if len(set(bands)) < len(bands) or any(band < 1 for band in bands):
-        raise UsageError(f"bands {', '.join(map(str, bands))}; numbers from 1 on are needed, each once")
-    for one in looked if bands else ():
-        own = open_scene(project, one.name).reader.bands
-        if max(bands) > own:
-            raise UsageError(f"bands {', '.join(map(str, bands))}: image {one.name!r} has {own}")
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
 
 
 def _inside(frame: Frame, start: float, reach: float, stated: float | None) -> float:

@@ -19,9 +19,8 @@ from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
 from photoplan.io.project.model import Project
 from photoplan.plan.footprint import image_border
 from photoplan.products.orthophoto.look import look_at
+from photoplan.products.surface.settings import Bounds
 from photoplan.project.scene import Scene, map_order, open_scene
-
-Bounds = tuple[float, float, float, float]
 
 #: Points along a side of a target that are projected to see which images show it.
 _POINTS = 33
