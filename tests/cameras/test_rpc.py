@@ -88,6 +88,26 @@ def test_scales_may_be_whole_degrees() -> None:
         replace(seen, coefficients=other)
 
 
+def with_factor(slope: float, beside: float) -> RationalFunctions:
+    """Sample L + 0.1 P and line −P + 0.1 H, each over and times (1 + slope L); `beside`: not quite."""
+    coefficients = np.zeros((4, 20))
+    coefficients[0, [1, 2, 7, 4]] = 1.0, 0.1, slope, 0.1 * slope
+    coefficients[2, [2, 3, 4, 5]] = -1.0, 0.1, -slope, 0.1 * slope
+    coefficients[1::2, 0], coefficients[1::2, 1] = 1.0, slope
+    coefficients[0, 0] = beside
+    return replace(functions(), coefficients=coefficients)
+
+
+def test_numerator_and_denominator_may_share_a_factor() -> None:
+    """Fitted without restraint, they vanish together inside the image, and positions go straight on."""
+    found, plain = with_factor(-2.0, 0.0)(places()), with_factor(0.0, 0.0)(places())
+    known = np.isfinite(found[:, 0])
+    assert known.mean() > 0.99 and np.abs(found - plain)[known].max() < 1e-6
+    # A pole is one: behind it there is no position.
+    behind = places()[:, 0] > functions().ground_offset[0] + 0.5 * functions().ground_scale[0]
+    assert np.isnan(with_factor(-2.0, 0.5)(places())[behind]).all()
+
+
 @pytest.mark.parametrize("correction", [None, Affine2D(1.0 + 1e-4, 2e-4, -3.5, -1e-4, 1.0 - 2e-4, 8.25)])
 def test_rays_are_the_inverse_and_derivatives_are_right(correction: Affine2D | None) -> None:
     seen = replace(camera(), correction=correction)

@@ -23,6 +23,9 @@ from photoplan.geometry.geodetic import GeodeticGround
 BOUND = 1.5
 #: A denominator below this part of its value in the middle is near a pole: no position.
 _POLE = 1e-3
+#: Where positions lie this near to a linear function of the ground, no pole is (normalised); seen where denominators
+#: are this part of their value in the middle at least.
+_STRAIGHT, _APART = 0.1, 0.2
 #: Normalised image coordinates beyond this are no part of an image, and at so many of 27 places no accident.
 _FAR, _MOST_FAR = 100.0, 6
 #: Powers of longitude, latitude and height of the 20 terms, in the order of RPC00B.
@@ -121,6 +124,27 @@ class RationalFunctions:
                 "is wrong: get a fresh copy"
             )
 
+    @cached_property
+    def _shares(self) -> NDArray[np.bool_]:
+        """Whether numerator and denominator, of sample and line (2,), vanish together inside the box.
+
+        Polynomials that were fitted without restraint can share a factor: it changes its sign, and positions go
+        straight on behind, as they never do behind a pole.
+        """
+        nodes = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 7)] * 3), axis=-1).reshape(-1, 3)
+        p, plane = terms(nodes) @ self.coefficients.T, np.column_stack([np.ones(len(nodes)), nodes])
+        shares = np.zeros(2, np.bool_)
+        for k in range(2):
+            bottom = p[:, 2 * k + 1] / self.coefficients[2 * k + 1, 0]
+            seen = np.abs(bottom) > _APART
+            if (bottom > _POLE).all() or not (bottom[seen] < 0).any():
+                continue
+            value = p[seen, 2 * k] / p[seen, 2 * k + 1]
+            if np.abs(value).max() < _FAR:
+                miss = value - plane[seen] @ np.linalg.lstsq(plane[seen], value, rcond=None)[0]
+                shares[k] = np.abs(miss).max() < _STRAIGHT
+        return shares
+
     @property
     def heights(self) -> tuple[float, float]:
         """Lowest and highest ellipsoidal height at which there are positions, metres."""
@@ -171,7 +195,9 @@ class RationalFunctions:
         powers = _powers_of(n)
         p = _terms(powers, _POWERS) @ C.T
         with np.errstate(all="ignore"):
-            good = np.all(np.abs(n) <= bound, axis=-1) & np.all(p[..., 1::2] / C[1::2, 0] > _POLE, axis=-1)
+            part = p[..., 1::2] / C[1::2, 0]
+            part = np.where(self._shares, np.abs(part), part)
+            good = np.all(np.abs(n) <= bound, axis=-1) & np.all(part > _POLE, axis=-1)
             top, bottom = p[..., ::2], np.where(np.expand_dims(good, -1), p[..., 1::2], np.nan)
             value = top / bottom
             xy = value * self.image_scale + self.image_offset
