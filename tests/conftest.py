@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
     sketched.begin(item)
     compiled_once.wait_for_each_other()
+
+
+@pytest.fixture(scope="module")
+def searched_once() -> Iterator[None]:
+    """For files whose tests measure edges of the same images again and again."""
+    from tools import searched_once
+
+    with searched_once.searched_once():
+        yield
 
 
 @pytest.fixture(scope="session")

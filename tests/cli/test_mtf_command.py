@@ -16,6 +16,8 @@ from tools.optics import stray
 from tools.recorded import recorded
 from tools.thinned import some
 
+pytestmark = pytest.mark.usefixtures("searched_once")
+
 SIZE = (330, 220)
 TOPS = {"uint8": 255, "uint16": 65535, "int16": 32767}
 CUT_OFF = [(t, *ends) for t in ("uint8", "uint16", "float32") for ends in ((0.0, 0.695), (0.0, 0.62), (0.33, 1.0))]

@@ -10,6 +10,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.products.restore.design import DesignRequest, design_restoration
 from photoplan.quality.restoration.design import DesignOptions
 
+pytestmark = pytest.mark.usefixtures("searched_once")
+
 SIZE = 320
 MOST = 24
 FEW = 8

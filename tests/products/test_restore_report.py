@@ -34,6 +34,8 @@ from photoplan.report.restore.page import (
 )
 from photoplan.report.restore.plots import compare
 
+pytestmark = pytest.mark.usefixtures("searched_once")
+
 PNG = "data:image/png;base64,"
 
 
