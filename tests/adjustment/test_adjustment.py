@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from photoplan.adjustment.blocks import Kind, Layout
 from photoplan.adjustment.chances import chance_chi_square, chance_f, chance_gain, chance_normal, chance_t
@@ -111,6 +110,8 @@ def test_weights_fall_from_one(weight):
 
 
 def test_chances_are_those_of_the_distributions():
+    from scipy import stats  # a second of each collection
+
     assert chance_normal(-1.7) == pytest.approx(2 * stats.norm.sf(1.7))
     assert chance_t(2.1, 7.5) == pytest.approx(2 * stats.t.sf(2.1, 7.5))
     assert chance_chi_square(11.0, 6) == pytest.approx(stats.chi2.sf(11.0, 6))

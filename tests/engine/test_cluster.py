@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from photoplan.engine.cluster import Answer, Cluster, Parcel, Question, RemoteJo
 from photoplan.engine.executors import Workers, executor_factory, open_workers, run_tiles
 from photoplan.errors import InputError, ResourceError, UsageError
 
-distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs distributed")
 
 
 def versions() -> dict[str, str]:
@@ -25,6 +26,8 @@ def versions() -> dict[str, str]:
 
 
 def local(workers: int) -> Any:
+    import distributed  # half a second of each collection
+
     return distributed.LocalCluster(
         n_workers=workers, threads_per_worker=3, processes=False, dashboard_address=None, protocol="tcp"
     )

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 from tools.plain_block import FOCAL, Make, Truth, plain_block
 
 from photoplan.adjustment.components import variance_components
@@ -149,5 +148,7 @@ def test_likelihood_of_components_against_written_out_densities() -> None:
     between = means.var(ddof=1) - within / each
     assert found.variances == pytest.approx([within, between], rel=1e-3)
     V = found.variances[0] * np.eye(len(y)) + found.variances[1] * Z @ Z.T
+    from scipy.stats import multivariate_normal  # a second of each collection
+
     density = multivariate_normal(np.zeros(len(y) - 1), K.T @ V @ K).logpdf(K.T @ y)
     assert found.deviance == pytest.approx(-2 * density - (len(y) - 1) * np.log(2 * np.pi))

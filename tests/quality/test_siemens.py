@@ -115,17 +115,17 @@ def edge_picture():
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        (np.random.default_rng(0).normal(100, 10, (120, 120)), "star"),
-        (edge_picture(), "star"),
-        (bars((120, 120), 0.1, 20.0), "star"),
-        (np.full((50, 50), 3.0), "no pattern"),
-        (star((120, 120), (60, 60), 16)[:20], "at least 32"),
-        (star((60, 60), (30, 30), 72, radius=26.0), r"(star|sectors)"),
+        (lambda: np.random.default_rng(0).normal(100, 10, (120, 120)), "star"),
+        (lambda: edge_picture(), "star"),
+        (lambda: bars((120, 120), 0.1, 20.0), "star"),
+        (lambda: np.full((50, 50), 3.0), "no pattern"),
+        (lambda: star((120, 120), (60, 60), 16)[:20], "at least 32"),
+        (lambda: star((60, 60), (30, 30), 72, radius=26.0), r"(star|sectors)"),
     ],
 )
 def test_no_number_without_a_star(picture, message):
     with pytest.raises(InputError, match=message):
-        measure_star(picture)
+        measure_star(picture())
 
 
 def test_clipped_stars_and_unknown_contrast_are_refused():

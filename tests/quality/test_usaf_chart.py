@@ -103,14 +103,14 @@ def test_clipped_target_is_refused():
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        (np.random.default_rng(0).normal(100, 10, (200, 200)), "no USAF-1951 target"),
-        (bars((200, 200), 0.05, 0.0), "no USAF-1951 target"),
-        (star((200, 200), (100, 100), 24), "no USAF-1951 target"),
-        (np.full((100, 100), 5.0), "no pattern"),
-        (usaf_chart(SHAPE, SCALE, ORIGIN, over=2)[:150, :150], "no USAF-1951 target"),
-        (usaf_chart((220, 240), 9.0, (115.0, 105.0), 1.6, over=4), r"(no bars are wide enough|no USAF)"),
+        (lambda: np.random.default_rng(0).normal(100, 10, (200, 200)), "no USAF-1951 target"),
+        (lambda: bars((200, 200), 0.05, 0.0), "no USAF-1951 target"),
+        (lambda: star((200, 200), (100, 100), 24), "no USAF-1951 target"),
+        (lambda: np.full((100, 100), 5.0), "no pattern"),
+        (lambda: usaf_chart(SHAPE, SCALE, ORIGIN, over=2)[:150, :150], "no USAF-1951 target"),
+        (lambda: usaf_chart((220, 240), 9.0, (115.0, 105.0), 1.6, over=4), r"(no bars are wide enough|no USAF)"),
     ],
 )
 def test_no_number_without_a_target(picture, message):
     with pytest.raises(InputError, match=message):
-        measure_usaf(picture, UsafRules(group=0))
+        measure_usaf(picture(), UsafRules(group=0))

@@ -24,6 +24,8 @@ def points(side: float = 60.0, count: int = 700, seed: int = 1, noise: float = 0
 
 
 INSIDE = np.random.default_rng(3).uniform(4, 47, (400, 2))
+#: Units of 32 m with few posts: places are predicted themselves.
+WIDE: dict[str, Any] = {"grid_width": 2.0, "unit_meshes": 16, "adapt": 0.0}
 
 
 class TestPlane:
@@ -65,7 +67,7 @@ class TestPlane:
 class TestExactInterpolation:
     def test_heights_at_the_data(self) -> None:
         xyz = points()
-        model = built(terrain(xyz), filters={"mass": 0.0}, gross=0.0)
+        model = built(terrain(xyz), filters={"mass": 0.0}, gross=0.0, **WIDE)
         inner = xyz[(np.abs(xyz[:, :2] - 30) < 28).all(axis=1)]
         heights, sigmas = directly(model, np.ascontiguousarray(inner[:, :2]))
         np.testing.assert_allclose(heights, inner[:, 2], atol=1e-4)
@@ -81,7 +83,7 @@ class TestExactInterpolation:
     def test_a_breakline_without_noise_keeps_its_heights(self) -> None:
         xyz, way = points(noise=0.1), np.column_stack([np.linspace(5, 55, 61), np.linspace(30, 34, 61)])
         ridge = line(np.column_stack([way, hills(way)]))
-        model = built(terrain(xyz, ridge), filters={"mass": 0.1, "breakline": 0.0})
+        model = built(terrain(xyz, ridge), filters={"mass": 0.1, "breakline": 0.0}, **WIDE)
         (element,) = predict_lines(model.fit)
         # Every variance gets 1e-8 of the signal's, so that matrices can be factorised.
         assert np.abs(element.xyz[:, 2] - ridge.xyz[:, 2]).max() < 2e-3
@@ -97,10 +99,6 @@ def test_noise_is_filtered_at_nine_points_per_mesh() -> None:
     posts = posts[(np.abs(posts - 45) < 44).all(axis=1)]
     error = surface_of(model).heights(posts) - hills(posts)
     assert np.sqrt(np.mean(error**2)) <= 0.5 * noise
-
-
-#: Units of 32 m with few posts: places are predicted themselves.
-WIDE = {"grid_width": 2.0, "unit_meshes": 16, "adapt": 0.0}
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 """Simulated scenes and their images: Gaussian blur, the aperture of a pixel, noise."""
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.design import Sharpness
@@ -17,7 +17,7 @@ def discrete_spread(sigma):
     """Of a Gaussian and the sensor's aperture, as an edge on the border of two pixels shows it."""
 
     def ramp(z):
-        return z * norm.cdf(z / sigma) + sigma * norm.pdf(z / sigma)
+        return z * ndtr(z / sigma) + sigma * np.exp(-((z / sigma) ** 2) / 2.0) / np.sqrt(2.0 * np.pi)
 
     borders = np.arange(-20.5, 21.0)
     response = ramp(borders + 0.5) - ramp(borders - 0.5)

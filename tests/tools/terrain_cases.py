@@ -121,12 +121,12 @@ class _Sums:
     squares: float = 0.0
 
 
-def spreads(name: str, seeds: range, places: int) -> tuple[dict[str, float], Built]:
+def spreads(name: str, seeds: range, places: int, **settings: float) -> tuple[dict[str, float], Built]:
     """Root mean squares of true errors over stated standard deviations, by class of places; and the last model."""
     sums: dict[str, _Sums] = {}
     for seed in seeds:
         ground, measured, classes = CASES[name](seed)
-        model = built(measured)
+        model = built(measured, **settings)
         xyz = np.vstack([group.xyz for group in measured.points] + [line.xyz for line in measured.lines])
         low, high = xyz[:, :2].min(axis=0) + 1, xyz[:, :2].max(axis=0) - 1
         xy = np.random.default_rng(seed + 77).uniform(low, high, (places, 2))
