@@ -159,6 +159,7 @@ def test_fault_18_records_of_strips_as_spreadsheets_leave_them(tmp_path: Path) -
         assert said.code == 3 and told in said.err, said.err
 
 
+@pytest.mark.slow
 def test_fault_14_gon_declared_as_degrees(photoplan: Here, small: Block) -> None:
     """Refused before any pixel is touched, with the unit that fits."""
     test_place_faults.TestFaults14And18Tables.strip(small, [0, 90, 180, 270, 90, 0, 270, 180], 400 / 360)

@@ -196,8 +196,8 @@ class Product:
         return content(self.path(out)) == content(self.path(undisturbed))
 
 
-#: Of these the loop is that of a product beside them: maps of terrain are all made as `shade` is, `true` as `ortho`.
-LIKE_OTHERS = ("true", "slope", "aspect", "tint", "export")
+#: Of these the loop is that of a product beside them: maps of terrain are all made as `shade` is, the first two as `ortho`.
+LIKE_OTHERS = ("true", "direct", "slope", "aspect", "tint", "export")
 
 
 @pytest.fixture(

@@ -97,7 +97,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in ("terrain", "all") else pytest.mark.slow) for name in CASES]
+    "name", [pytest.param(name, marks=[] if name == "all" else pytest.mark.slow) for name in CASES]
 )
 def test_standard_deviations_are_those_of_simulated_errors(name):
     """Within 10 %, on smooth hills, from 400 trials of 25 points."""

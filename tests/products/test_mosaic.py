@@ -120,6 +120,7 @@ def test_a_preferred_image_and_the_weights(mosaic) -> None:  # type: ignore[no-u
         assert wrong.code == 2 and text in wrong.err
 
 
+@pytest.mark.slow
 def test_a_plan_of_a_mosaic_gives_the_same_bytes(mosaic, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     block, photoplan, _ = mosaic
     plan = tmp_path / "plan.gpkg"

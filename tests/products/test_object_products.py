@@ -169,6 +169,7 @@ def test_other_formats_give_the_same(town: Block, capsys, name: str, driver: str
     np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_a_plan_gives_the_same_bytes_and_another_object_is_another_product(town: Block, capsys) -> None:  # type: ignore[no-untyped-def]
     photoplan = Here(capsys)
     town.project.write_text(town.project.read_text() + '\n[[objects]]\nfile = "town.gpkg"\nheight_system = "same"\n')

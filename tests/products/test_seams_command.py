@@ -133,6 +133,7 @@ def test_fault_22_an_image_owns_nothing_where_it_has_no_data(block: Block, capsy
     assert not found["one"].intersects(middle) and shapely.union_all(list(found.values())).contains(middle)
 
 
+@pytest.mark.slow
 def test_fault_26_more_workers_and_a_second_run(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
     photoplan, words = Here(capsys), ("seams", block.project, "--resolution", 4, "--no-picture", "-q")
     one, more = block.folder / "one.gpkg", block.folder / "more.gpkg"

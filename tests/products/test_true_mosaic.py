@@ -60,7 +60,7 @@ def town(small: Block) -> Block:
     return small
 
 
-@pytest.mark.parametrize(("feather", "blend"), some([(0, "mean"), (30, "mean"), (30, "multiband")], 0, 2))
+@pytest.mark.parametrize(("feather", "blend"), some([(0, "mean"), (30, "mean"), (30, "multiband")], 2))
 def test_what_any_image_sees_is_there_once_and_where_it_stands(
     town: Block, capsys: pytest.CaptureFixture[str], feather: float, blend: str
 ) -> None:
