@@ -196,7 +196,7 @@ class Product:
         return content(self.path(out)) == content(self.path(undisturbed))
 
 
-#: Of these the loop is that of a product beside them: maps of terrain are all made as `shade` is, the first two as `ortho`.
+#: Of these the loop is that of a product beside them: of `ortho` and, for maps of terrain, of `shade`.
 LIKE_OTHERS = ("true", "direct", "slope", "aspect", "tint", "export")
 
 
