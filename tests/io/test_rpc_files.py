@@ -83,6 +83,15 @@ def test_rows_and_columns_of_dimap_begin_with_one(tmp_path: Path) -> None:
     )
 
 
+def test_pleiades_neo_names_what_models_do_and_counts_from_zero(tmp_path: Path) -> None:
+    text = as_dimap(RPC, 0)
+    for old, new in (("Inverse_Model", "GroundtoImage_Values"), ("Direct_Model_V", "ImagetoGround_V")):
+        assert f"<{old}" in text
+        text = text.replace(old, new)
+    (tmp_path / "RPC_PNEO.XML").write_text(text)
+    assert equal(read_rpc(tmp_path / "RPC_PNEO.XML").functions, RPC, 1e-12)
+
+
 def test_a_delivery_of_pleiades_is_found_by_its_name(image: Path) -> None:
     assert rpc_beside(image) is None
     (image.parent / "RPC_scene.XML").write_text(as_dimap(RPC))

@@ -105,6 +105,21 @@ def test_fault_14_a_scale_that_is_a_thousand_times_too_small(tmp_path: Path) -> 
     assert said.code == 3 and "times longer than wide" in said.out
 
 
+def test_fault_14_a_tile_of_a_product_with_the_polynomials_of_the_whole(tmp_path: Path) -> None:
+    """They count from the first tile; of that one, of a tile with its own, and where it begins, nothing is wrong."""
+    project = written(tmp_path)
+    for name in ("IMG_P_R1C2.tif", "IMG_P_R1C1.tif"):
+        (tmp_path / name).write_bytes((tmp_path / "a.tif").read_bytes())
+    told = refused("check", edited(project, '"a.tif"', '"IMG_P_R1C2.tif"'))
+    assert "a tile of a product" in told and "shift = [-COLUMN, -ROW]" in told
+    (tmp_path / "IMG_P_R1C2_RPC.TXT").write_bytes((tmp_path / "rpc.txt").read_bytes())
+    assert "all plausible" in inside("check", edited(project, '"rpc.txt"', '"IMG_P_R1C2_RPC.TXT"')).out
+    edited(project, '"IMG_P_R1C2_RPC.TXT"', '"rpc.txt"\nshift = [0, 0]')
+    assert "all plausible" in inside("check", project).out
+    edited(edited(project, "R1C2", "R1C1"), "\nshift = [0, 0]", "")
+    assert "all plausible" in inside("check", project).out
+
+
 def test_fault_14_longitude_and_latitude_exchanged(tmp_path: Path) -> None:
     """Nothing of the image is where the project is: said by name, and nothing is made."""
     project = written(tmp_path)

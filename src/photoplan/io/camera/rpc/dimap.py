@@ -1,7 +1,8 @@
-"""DIMAP: ``RPC_*.XML`` of Pléiades and SPOT 6/7, and the document of a Pléiades system product.
+"""DIMAP: ``RPC_*.XML`` of Pléiades, Pléiades Neo and SPOT 6/7, and the document of a Pléiades system product.
 
-Both count rows and columns from 1: the centre of the upper-left pixel is (1, 1), as the validity domain of the direct
-model says. The inverse model is the one from the ground to the image (Pléiades Imagery User Guide, section 5.2.3).
+All but Pléiades Neo count rows and columns from 1: the centre of the upper-left pixel is (1, 1), as the validity domain
+of the model from the image to the ground says. That from the ground to the image is called inverse (Pléiades Imagery
+User Guide, section 5.2.3); Pléiades Neo (DIMAP 3) calls both by what they do.
 """
 
 from __future__ import annotations
@@ -33,14 +34,21 @@ def read(root: Element, path: Path) -> RationalFunctions:
     """
     model = root.find(".//Global_RFM")
     assert model is not None
-    inverse, validity = model.find("Inverse_Model"), model.find("RFM_Validity")
+    validity = model.find("RFM_Validity")
+    inverse = _first(model, "Inverse_Model", "GroundtoImage_Values")
     if inverse is None or validity is None:
-        raise InputError(f"{path}: no Inverse_Model or no RFM_Validity in Global_RFM; get a fresh copy")
+        missing = "no Inverse_Model (or GroundtoImage_Values) or no RFM_Validity in Global_RFM"
+        raise InputError(f"{path}: {missing}; get a fresh copy")
     values = _system(inverse, validity) if inverse.find("F_COL") is not None else _delivered(inverse, validity)
-    domain = validity.find("Direct_Model_Validity_Domain")
+    domain = _first(validity, "Direct_Model_Validity_Domain", "ImagetoGround_Validity_Domain")
     begins = [None if domain is None else domain.findtext(name) for name in ("FIRST_COL", "FIRST_ROW")]
     from_zero = all(text is not None and text.strip() in ("0", "0.0") for text in begins)
     return stated(values, str(path), (0.0, 0.0) if from_zero else (1.0, 1.0))
+
+
+def _first(element: Element, *names: str) -> Element | None:
+    """The first of the elements that is there."""
+    return next((found for name in names if (found := element.find(name)) is not None), None)
 
 
 def _delivered(inverse: Element, validity: Element) -> dict[str, str | list[str]]:
