@@ -40,7 +40,7 @@ def test_frequency_of_groups_and_elements():
 
 @pytest.mark.parametrize(
     ("turn", "mirrored", "dark"),
-    some([(0.0, False, False), (0.06, False, False), (1.3, True, False), (3.0, False, True)], 2, 3),
+    some([(0.0, False, False), (0.06, False, False), (1.3, True, False), (3.0, False, True), (1.3, True, True)], 2, 4),
 )
 def test_contrast_of_all_elements_of_a_known_chart(turn, mirrored, dark):
     if dark:
