@@ -47,6 +47,8 @@ _BETTER = 0.8
 _TRUSTED = 0.1
 #: Posts around those at a step that do not tell it either.
 _BESIDE = 5
+#: The multiple of the usual misfit above which a post does not, either.
+_MISFIT = 2.0
 #: Standard deviation of grey values until it is estimated, part of their contrast.
 _NOISE = 0.1
 
@@ -160,11 +162,14 @@ def reconstruct(
 
 
 def _telling(block: FacetBlock, found: Searched | None) -> NDArray[np.bool_] | None:
-    """Posts that tell noise and roughness of a block: not those beside steps, nor where a search is not sure.
+    """Posts that tell noise and roughness of a block: not those beside steps, where pixels fit far worse than they
+    usually do, nor where a search is not sure.
 
     None: all, also where those that would are too few.
     """
+    misfit = np.nan_to_num(fit(block))
     told = ~ndimage.maximum_filter(edge_variances(block) > 0, _BESIDE)
+    told &= misfit <= _MISFIT * np.median(misfit[misfit > 0])
     if found is not None:
         told &= found.sure
     return told if _TRUSTED < told.mean() < 1 else None
