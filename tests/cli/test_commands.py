@@ -26,6 +26,8 @@ def test_help_answers_at_once() -> None:
         done = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, check=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         best = min(best, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+        if best < 0.3:
+            break
     assert best < 0.3
     for verb in VERBS:
         assert re.search(rf"^  {verb} ", done.stdout, re.MULTILINE)
