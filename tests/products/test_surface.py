@@ -225,6 +225,12 @@ def test_pixels_of_reduced_images_are_those_that_count() -> None:
     assert len(told[1]) == 1 and "the relief is finer than" in told[1][0] and "finer than" not in told[0][0]
 
 
+def test_that_there_is_no_height_is_told() -> None:
+    plan: Any = SimpleNamespace(scheme=SimpleNamespace(base=0))
+    told = findings(plan, {"a": None, "b": None}, 0.0, None, 0.0, 0.0, 0.0)
+    assert len(told) == 1 and told[0].startswith("there is no height: within `reach`")
+
+
 def test_heights_that_fit_badly_are_told_with_what_helps() -> None:
     told = []
     for search in (None, object()):

@@ -21,10 +21,10 @@ BOUNDS = (CENTRE[0] - WIDE, CENTRE[1] - LONG, CENTRE[0] + WIDE, CENTRE[1] + LONG
 SLOW = replace(SHAKEN, vibration=(0.0, 0.0, 0.0))
 
 
-def judged(scene: Scene, project: Path, folder: Path) -> tuple[float, float, float]:
+def judged(scene: Scene, project: Path, folder: Path, *how: object) -> tuple[float, float, float]:
     """Mean squares of the heights' errors, pixels of parallax of the outermost lines, and of the same by their standard
     deviations; mean error."""
-    words = ["--resolution", 0.9, "--bounds", *BOUNDS, "--no-search", "--reach", 6, "--no-quicklook", "-q"]
+    words = ["--resolution", 0.9, "--bounds", *BOUNDS, *(how or ("--no-search", "--reach", 6)), "--no-quicklook", "-q"]
     said = inside("surface", project, *words)
     assert said.code == 0, said.err
     heights, X, Y = places(folder / "surface.tif")
@@ -58,6 +58,14 @@ def test_three_lines(tmp_path: Path, like: ShakenStrip, snr: float, relief: floa
     both = np.sqrt(squares)
     print("rms", both[0], "normalised", both[1], "bias", biases)
     assert both[0] < rms and 0.8 < both[1] < told and np.abs(biases).max() < 0.03
+
+
+def test_three_lines_of_which_nothing_is_known_but_the_terrain(tmp_path: Path) -> None:
+    """With the usual reach, 32 px of parallax: from coarse to fine, as a search does not follow how a flight shakes."""
+    scene = write_strips(tmp_path)
+    square, normalised, bias = judged(scene, scene.path, tmp_path / "products", "--start", "terrain")
+    print("rms", np.sqrt(square), "normalised", np.sqrt(normalised), "bias", bias)
+    assert np.sqrt(square) < 0.06 and np.sqrt(normalised) < 1.4 and abs(bias) < 0.03
 
 
 def test_lines_frames_films_and_polynomials_together(tmp_path: Path) -> None:

@@ -25,8 +25,9 @@ _STEP, _OFF = 32, 0.001
 #: Times by which pixels lie closer on a facet than on level ground from which on they are left out: on a wall, whose
 #: grey values are finer than the facets of the map, or beside the edge of what hides the ground behind it.
 _WALL = 3.0
-#: Points along a side of a block that are projected to find its pixels.
-_POINTS = 9
+#: Points along a side of a block that are projected to find its pixels, and heights: some may lie beyond where a line
+#: has seen.
+_POINTS, _HEIGHTS = 9, 5
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ def _window(view: View, level: int, facets: Facets, heights: tuple[float, float]
     rows, columns = facets.shape
     v, u = np.meshgrid(np.linspace(0, rows - 1, _POINTS), np.linspace(0, columns - 1, _POINTS), indexing="ij")
     XY = facets.to_map(np.stack([u, v], axis=-1)).reshape(-1, 2)
-    XYZ = np.concatenate([np.column_stack([XY, np.full(len(XY), z)]) for z in heights])
+    XYZ = np.concatenate([np.column_stack([XY, np.full(len(XY), z)]) for z in np.linspace(*heights, _HEIGHTS)])
     xy = project(view.camera, XYZ) / 2**level
     xy = xy[np.isfinite(xy).all(axis=1)]
     if not len(xy):

@@ -35,7 +35,8 @@ _FIRST, _THEN = (4, 2), (((3, 1), (2, 2)), ((3, 1),))
 _LOOSE = 0.5
 #: A view that has fewer pixels of a block is left out.
 _FEW = 16
-#: How far a surface may move on a level: grey facets, and on the coarsest level part of the flying height.
+#: How far a surface may move on a level: grey facets, and on the coarsest level part of the flying height, or as far as
+#: it keeps to, if that is known.
 _ROOM, _FAR = 16.0, 0.15
 #: Distance of the heights that are tried on the coarsest level, pixels of parallax, and how many up and down at most.
 _TRIAL, _MOST_TRIALS = 0.5, 24
@@ -138,7 +139,7 @@ def reconstruct(
         heights = _start_heights(start, facets) if block is None else _finer(block, facets, start)
         if heights is None:
             return None
-        block = _opened(views, level + scheme.base, facets, heights, block) or block
+        block = _opened(views, level + scheme.base, facets, heights, block, reach) or block
         if block is None or block.facets is not facets:
             continue
         block.limits = _limits(start, facets, reach)
@@ -176,14 +177,14 @@ def _telling(block: FacetBlock, found: Searched | None) -> NDArray[np.bool_] | N
 
 
 def _opened(
-    views: Sequence[View], level: int, facets: Facets, heights: _Doubles, before: FacetBlock | None
+    views: Sequence[View], level: int, facets: Facets, heights: _Doubles, before: FacetBlock | None, reach: float
 ) -> FacetBlock | None:
     """A block at the start of a level; None if fewer than two views see it."""
     span = float(heights.min()), float(heights.max())
     sights: list[Sight] = []
     own: list[View] = []
     for view in views:
-        room = _room(view, facets, span, before)
+        room = _room(view, facets, span, before, reach)
         sight = look(view, level, facets, (span[0] - room, span[1] + room))
         if sight is None:
             continue
@@ -219,10 +220,11 @@ def _lifted(block: FacetBlock, reach: float) -> _Doubles:
     return lifted[best if misfits[best] < _BETTER * misfits[0] else 0]
 
 
-def _room(view: View, facets: Facets, span: tuple[float, float], before: FacetBlock | None) -> float:
+def _room(view: View, facets: Facets, span: tuple[float, float], before: FacetBlock | None, reach: float) -> float:
     """How far the surface may still move on a level, metres."""
     distance = abs(float(view.camera.vantage.point[2]) - sum(span) / 2)
-    return _ROOM * facets.pitch / facets.ratio + (_FAR * distance if before is None else 0.0)
+    far = min(_FAR * distance, _BEYOND * reach) if reach > 0 else _FAR * distance
+    return _ROOM * facets.pitch / facets.ratio + (far if before is None else 0.0)
 
 
 def _radiometry(

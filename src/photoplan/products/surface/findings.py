@@ -41,6 +41,11 @@ def findings(
     }
     alone = [name for name, usual in others.items() if known[name] > _ALONE * usual]
     usual = float(np.median([*known.values()])) if known else 0.0
+    if not known:
+        lines.append(
+            "there is no height: within `reach` of the start (`start`) no two images see the same, or the start has no "
+            "heights there. `photoplan check` tells where each image lies"
+        )
     if alone:
         listed = ", ".join(f"{name} {known[name]:.3g} ({others[name]:.3g})" for name in alone[:6])
         lines.append(

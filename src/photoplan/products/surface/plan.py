@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from photoplan.cameras.base import tremor_of
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.frames import Frame, ImageFrame
@@ -195,7 +196,10 @@ def plan_surface(
         reach = _inside(frame, float(settings.start), reach, settings.reach)
     coarsest = _coarsest(reach, looked, height_error, base)
     scheme = Scheme(ratio, coarsest, base, reach)
-    wanted = reach > _RELIEF * height_error if settings.search is None else settings.search
+    # Planes are swept over lattices of cells, between which a turbulent flight shakes by more than a cell.
+    shaken = any(tremor_of(one.camera) is not None for one in looked)
+    strong = reach > _RELIEF * height_error and not shaken
+    wanted = strong if settings.search is None else settings.search
     if wanted:
         search = _search(looked, settings.resolution / gsd, usual, reach, coarsest)
         scheme = Scheme(ratio, 0, base, reach, search)

@@ -36,7 +36,7 @@ class SurfaceSettings:
     """How far the start may be wrong, metres; None: a tenth of the flying height."""
     search: bool | None = None
     """Whether heights are first searched post by post within the reach, for strong relief; None: where the reach is
-    many pixels of parallax."""
+    many pixels of parallax, and no image was taken on a turbulent flight."""
     bands: tuple[int, ...] = ()
     """Bands of every image whose mean is its grey value, from 1; empty: luminance of three, the mean of others."""
     residuals: bool = False
