@@ -14,6 +14,7 @@ from photoplan.kernels.position import positions
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
+from photoplan.plan.visibility import sight_lines
 from photoplan.targets.map import MapTarget
 
 WINDOW = Window(64, 40, 220, 200)
@@ -69,6 +70,18 @@ def test_the_reported_residual_holds_everywhere(camera: LineCamera, tolerance: f
     assert anchors.residual < (1.5 if tolerance < 0.1 else 8.0)
     # Of several moments kernels take the same, but for points that turn round within a line.
     assert (miss[inside & ~once] < 0.5).mean() > 0.97
+
+
+def test_lines_of_sight_lead_to_where_the_camera_was(camera: LineCamera) -> None:
+    """Roll and pitch move positions in the image, not the place from which ground is seen: no hidden ground by them."""
+    xy = np.random.default_rng(2).uniform((20.0, 40.0), (380.0, 460.0), (200, 2))
+    ground = camera.rays(xy, 300.0)[0]
+    grid = MapGrid(ground[:, 0].min(), ground[:, 1].max(), 0.3, 600, 500, camera.ground.crs)
+    uvh = np.column_stack([grid.to_pixel(ground[:, :2]), ground[:, 2]])
+    step = sight_lines(camera, MapTarget(grid), uvh).step
+    found = step[:, :2] / step[:, 2:] * (0.3, -0.3)
+    up = camera.ground.to_map(camera.track(xy[:, 1])[0]) - ground
+    assert np.abs(found - up[:, :2] / up[:, 2:]).max() < 0.01
 
 
 def test_a_reduced_image_has_the_same_shifts(camera: LineCamera) -> None:

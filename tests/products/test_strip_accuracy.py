@@ -11,16 +11,27 @@ import rasterio
 from test_adjust_satellites import flown
 from tools.command import inside
 from tools.line_strip import Strip
+from tools.sim_strip import lines, places, projection, seen_by, simulated
 
 from photoplan.cameras.base import project
+from photoplan.cameras.line import LineCamera
+from photoplan.cameras.line_correctable import TrackPriors
+from photoplan.cameras.line_correction import PoseErrors, displaced, map_axes
 from photoplan.io.camera.line.correction import read_pose_errors
 from photoplan.io.project.file import load_project
+from photoplan.orientation.bundle.adjust import adjust_block
+from photoplan.orientation.bundle.block import AdjustSettings
+from photoplan.products.adjust.by_line import LINES
 from photoplan.products.adjust.run import AdjustRequest, adjust_project
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import ground_of
 from photoplan.project.uncertain import source_errors
 
 HEIGHT = 100.0
+PRIORS = TrackPriors(
+    boresight=2e-3, lever_arm=0.1, time_offset=0.01, knots=10.0, position=0.05, attitude=5e-5, smooth_position=0.03,
+    smooth_attitude=3e-5,
+)  # fmt: skip
 
 
 def strip_project(folder: Path, rows: dict[float, list[float]]) -> Path:
@@ -106,3 +117,38 @@ def test_an_adjustment_tells_how_exactly_the_trajectory_is_known(tmp_path: Path,
         print(f"\n{name}: σ {np.median(sigma, axis=0)} px, normalised {np.sqrt((normal[-1] ** 2).mean(axis=0))}")
     # The noise is half of what the project states.
     assert 0.3 < np.sqrt((np.array(normal) ** 2).mean()) < 1.2
+
+
+def carried(camera: LineCamera, errors: PoseErrors, XYZ: np.ndarray) -> np.ndarray:
+    """Standard deviations in the image, (n, 2), of what six independent errors of the poses do."""
+    axes, at = map_axes(camera.track), project(camera, XYZ)
+    moved = [camera.along(displaced(camera.track, errors.course(part), axes)) for part in np.eye(6)]
+    return np.sqrt(sum((project(each, XYZ) - at) ** 2 for each in moved))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("runs", [200])
+def test_simulated_trajectories_are_as_exact_as_is_said(tmp_path: Path, runs: int) -> None:
+    """Truth drawn from what is known beforehand: normalised errors of positions in the images, 200 runs."""
+    geometries, squares = lines(PRIORS), []
+    settings = AdjustSettings(robust=False, variance_components=False, correlation=False)
+    for seed in range(runs):
+        made = simulated([projection(n, "lines", g, 250.0, 2250.0) for n, g in geometries.items()], places(60, 1), seed)
+        found = adjust_block(made.block, settings)
+        sets = {each.key: each for each in found.corrections}
+        text = LINES.found(geometries["nadir"], sets).file
+        assert text is not None
+        (tmp_path / "c.toml").write_text(text)
+        errors = read_pose_errors(tmp_path / "c.toml")
+        assert errors is not None
+        for row, geometry in enumerate(geometries.values()):
+            used = geometry.camera({key: each.values for key, each in sets.items()})
+            true = geometry.camera(made.true)
+            XYZ = places(18, 3)[seen_by(true, places(18, 3))]
+            off = (project(used, XYZ) - project(true, XYZ)) / carried(used, errors, XYZ) * found.sigma0
+            squares.append((row, *(off**2).mean(axis=0)))
+    table = np.array(squares)
+    each = [np.sqrt(table[table[:, 0] == k, 1:].mean(axis=0)).round(3) for k in range(len(geometries))]
+    whole = float(np.sqrt(table[:, 1:].mean()))
+    print(f"\n{runs} runs: normalised {whole:.3f}; by line, across and along: {each}")
+    assert 0.9 < whole < 1.1

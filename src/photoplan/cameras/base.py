@@ -46,6 +46,11 @@ class Tremor(Protocol):
         """Largest shifts along x and y of blocks of lines against the smooth part, (k, 2), pixels."""
         ...
 
+    @property
+    def smooth(self) -> Projection:
+        """The mapping without it."""
+        ...
+
     def part(self, XYZ: NDArray[np.float64]) -> TremorPart | None:
         """For the ground that points (n, 3) enclose; None: the image does not show it.
 
@@ -222,6 +227,12 @@ def parts_of(projection: Projection) -> tuple[Part | None, ...]:
     """The parts of its image; (None,): it is one."""
     breaks = projection.breaks
     return breaks.parts if isinstance(breaks, Parts) else (None,)
+
+
+def steady(projection: Projection) -> Projection:
+    """A mapping without its tremor: the place from which ground is seen does not shake, and moves on evenly."""
+    tremor = tremor_of(projection)
+    return projection if tremor is None else tremor.smooth
 
 
 def tremor_told(projection: Projection, height: float) -> str | None:

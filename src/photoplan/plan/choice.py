@@ -24,7 +24,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Projection
+from photoplan.cameras.base import Projection, steady
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.choose import add_penalties, between_nodes
@@ -222,7 +222,7 @@ class BestImage:
         with np.errstate(divide="ignore", invalid="ignore"):
             slant = np.where(up > 0, np.minimum(across / up, _LEVEL), _LEVEL)
         around = uvh[..., None, :] + np.array([(-0.5, 0, 0), (0.5, 0, 0), (0, -0.5, 0), (0, 0.5, 0)])
-        position = camera.project_homogeneous(target.to_ground(around))
+        position = steady(camera).project_homogeneous(target.to_ground(around))
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = position[..., :2] / position[..., 2:]
             size = np.sqrt(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Projection, project
+from photoplan.cameras.base import Projection, project, steady
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.pyramid import pyramid_of
@@ -71,9 +71,12 @@ class SightLines:
 def sight_lines(projection: Projection, target: Target, uvh: NDArray[np.float64]) -> SightLines:
     """Directions in which the image position of places (..., 3) stays the same, towards the source.
 
+    Of a turbulent flight those without tremor, which moves positions in the image, but not the place that sees.
+
     With homogeneous positions (X, Y, w) and their gradients they are w ∇X×∇Y + X ∇Y×∇w + Y ∇w×∇X, which for a central
     projection is linear in (u, v, h) and points to the centre.
     """
+    projection = steady(projection)
     metre = np.linalg.norm(target.to_ground(uvh + np.array([1.0, 0, 0])) - target.to_ground(uvh), axis=-1)
     size = np.stack(np.broadcast_arrays(1.0, 1.0, metre), axis=-1) * _STEP
     offsets = np.eye(3)[:, None] * np.array([-1.0, 1.0])[:, None] * size[..., None, None, :]
