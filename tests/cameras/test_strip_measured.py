@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_chips import FIRST, strip_file
 from tools.shaken_strip import ShakenStrip
 
 from photoplan.cameras.base import project
 from photoplan.cameras.line import LineCamera
+from photoplan.cameras.line_chips import ChippedLine
 from photoplan.cameras.line_correctable import CorrectableLine, TrackPriors
 from photoplan.cameras.line_correction import LineCorrection
 from photoplan.io.camera.line.file import read_line
@@ -28,6 +30,21 @@ def shaken(tmp_path_factory: pytest.TempPathFactory) -> tuple[CorrectableLine, n
     assert isinstance(camera, LineCamera)
     xy = np.random.default_rng(3).uniform((5.0, 20.0), (115.0, 380.0), (150, 2))
     return CorrectableLine(camera, "m", "f", PRIORS, LineCorrection.none()), xy, camera.rays(xy, 300.0)[0]
+
+
+def test_each_chip_of_a_line_is_compared_by_its_own(tmp_path: Path) -> None:
+    """Of what both chips see, the one counts in which it was measured."""
+    like = ShakenStrip(lines=200, vibration=(3.0, 0.4, 0.5), events=(20.0, 15.0, 8.0), event_lines=30.0)
+    camera = read_line(strip_file(tmp_path, like, 12.0), "nadir").camera(like.crs, "ellipsoidal")
+    assert isinstance(camera, ChippedLine)
+    strip = CorrectableLine(camera, "m", "f", PRIORS, LineCorrection.none())
+    xy = np.random.default_rng(1).uniform((FIRST - 30.0, 20.0), (FIRST + 30.0, 180.0), (60, 2)).round()
+    nothing = {each.key: 0.0 * each.values for each in strip.corrections}
+    XYZ = camera.rays(xy, 100.0)[0]
+    assert np.abs(strip.seen(strip.camera(nothing), XYZ, xy) - xy).max() < 1e-6
+    moved = strip.seen(strip.camera(nothing), XYZ + np.array([0.3, 0.0, 0.0]), xy) - xy
+    by_ground = strip.by_ground(strip.camera(nothing), XYZ, xy)[:, :, 0]
+    assert np.abs(moved - 0.3 * by_ground).max() < 1e-3 and np.abs(moved[:, 1] - 1.0).max() < 0.1
 
 
 def test_what_was_measured_is_the_moment_that_is_meant(
