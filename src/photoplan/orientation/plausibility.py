@@ -168,6 +168,7 @@ def other_reading(views: Sequence[JudgedView], images: Sequence[ImagePlausibilit
     evidence = _Evidence.of(views, declared, DECLARED)
     if not evidence.doubtful:
         return None
+    beside = sum(not image.middle_on_terrain for image in declared)
     ranked: list[tuple[tuple[float, ...], OtherReading, list[ImagePlausibility]]] = []
     for reading in readings(sample[0].order, sample[0].unit):
         # What one change explains needs no second, except where only the second makes the images upright.
@@ -175,7 +176,9 @@ def other_reading(views: Sequence[JudgedView], images: Sequence[ImagePlausibilit
             break
         if not _possible(reading, evidence.largest):
             continue
-        seen = [_look(v, *reading.apply(v.center, v.angles, v.order), heights) for v in sample]
+        seen = _seen(sample, reading, heights, beside)
+        if seen is None:
+            continue
         other = _Evidence.of(views, seen, reading)
         if other.better_than(evidence, reading):
             upright = -float(other.steepest < UPRIGHT)
@@ -187,6 +190,21 @@ def other_reading(views: Sequence[JudgedView], images: Sequence[ImagePlausibilit
     equal = [r.sentence for rank, r, _ in ranked if rank == ranked[0][0]]
     lines = _alignment(views, DECLARED), _alignment(views, ranked[0][1])
     return _sentence(" — or: ".join(equal[:3]), (declared, ranked[0][2]), lines)
+
+
+def _seen(
+    views: list[JudgedView], reading: OtherReading, heights: Heights, most: int
+) -> list[ImagePlausibility] | None:
+    """What images show by a reading; None as soon as `_Evidence.better_than` is out of reach.
+
+    That is where one has a fault, or more than `most` of them look beside the terrain.
+    """
+    seen: list[ImagePlausibility] = []
+    for view in views:
+        seen.append(_look(view, *reading.apply(view.center, view.angles, view.order), heights))
+        if seen[-1].fault is not None or sum(not image.middle_on_terrain for image in seen) > most:
+            return None
+    return seen
 
 
 @dataclass(frozen=True)
