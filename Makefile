@@ -77,6 +77,7 @@ bench: $(STAMP)
 	$(BIN)/python bench/run.py
 	$(BIN)/python bench/overhead.py
 	$(BIN)/python bench/startup.py
+	$(BIN)/python bench/surface_rate.py
 
 clean:
 	rm -rf $(VENV) $(OLDEST) demo build docs/_build .pytest_cache .mypy_cache .ruff_cache

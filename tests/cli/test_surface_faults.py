@@ -69,6 +69,9 @@ def test_images_without_texture_are_told(project: Path) -> None:
         change(image, lambda pixels: 120 + noise.normal(0, 1.0, pixels.shape))
     said = surface(project, "--json")
     assert "no texture" in notes(said)
+    # Hills of a metre cannot be known: only that the start is wrong by no more than a tenth of the flying height.
+    with rasterio.open(project.parent / "products" / "surface_sigma.tif") as file:
+        assert np.median(file.read(1)) > 5
 
 
 def test_heights_that_texture_does_not_tell_have_a_large_sigma(tmp_path: Path) -> None:
@@ -83,7 +86,7 @@ def test_heights_that_texture_does_not_tell_have_a_large_sigma(tmp_path: Path) -
     X, Y = to_map @ (col, row)
     off = heights - scene.heights(X, Y)
     bare, textured = np.abs(Y - Y0) < 7, np.abs(Y - Y0) > 16
-    assert np.median(sigma[bare]) > 2 * np.median(sigma[textured])
+    assert np.median(sigma[bare]) > 3 * np.median(sigma[textured])
     assert np.sqrt(np.mean((off / sigma)[bare] ** 2)) < 3 and np.sqrt(np.mean((off / sigma)[textured] ** 2)) < 1.5
 
 

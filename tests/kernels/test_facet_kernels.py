@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.kernels import facets_grey, facets_height, facets_radiometry, facets_solve, facets_transfer
+from photoplan.kernels import facets_grey, facets_height, facets_radiometry, facets_signs, facets_solve, facets_transfer
 from photoplan.kernels.jit import COMPILED
 
 
@@ -100,6 +100,21 @@ def test_grey_values_are_those_of_least_squares() -> None:
     assert np.abs(values.reshape(-1) - expected).max() < 1e-2
 
 
+def test_errors_have_the_covariance_of_the_equations() -> None:
+    """One standard deviation each, of a pixel of an image always the same."""
+    _, places, weights, shape, A = grey_equations()
+    right, moved = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    facets_grey.add_errors(places, (7, 3), weights, 2, right)
+    facets_grey.add_errors(places[4:, 5:], (12, 7), weights[4:, 5:], 2, moved)
+    layers = np.empty((4, 14, 5))  # of column c the layer c % 4
+    facets_signs.signs_at(1, 3, layers)
+    signs = layers.transpose(1, 2, 0).reshape(14, -1)[:, 3:19]
+    drawn = np.sqrt(weights) * signs
+    assert np.abs(right.reshape(-1) - A.T @ drawn.reshape(-1)).max() < 1e-4 and abs(signs.mean()) < 0.2
+    drawn[:4], drawn[:, :5] = 0, 0
+    assert np.abs(moved.reshape(-1) - A.T @ drawn.reshape(-1)).max() < 1e-4
+
+
 def test_heights_get_the_equations_of_the_pixels() -> None:
     """Against the same equations written out; the mean change of a facet counts nothing."""
     rng, places, weights, shape, A = grey_equations(1)
@@ -110,25 +125,43 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
     noise = np.zeros((3, 4))
     residuals, factors, sums = np.empty((14, 16), np.float32), np.ones((14, 16), np.float32), np.zeros(3)
     facets_height.add_heights(
-        (0, 0), places, seen, weights, values, 2, means, 8.0, 2.0, system, right, noise, residuals, factors, sums
+        (0, 0),
+        places,
+        seen,
+        weights,
+        values,
+        2,
+        means,
+        8.0,
+        2.0,
+        system,
+        right,
+        noise,
+        residuals,
+        factors,
+        sums,
     )
     misfit = (A @ values.reshape(-1)).reshape(14, 16) - seen
     used = weights > 0
     assert np.abs(residuals - misfit)[used].max() < 1e-3 and np.isnan(residuals[3, 4])
     assert np.abs(factors - np.minimum(1, 16.0 / np.abs(misfit)))[used].max() < 1e-3
     assert sums[2] == 14 * 16 - 1 and sums[1] == pytest.approx((factors * (misfit / 8) ** 2)[used].sum(), rel=1e-4)
+    whole, squares = np.zeros((2, 3)), np.zeros((2, 3))
+    facets_height.add_sensitivities(places, weights, values, 2, means, whole)
     N, b = np.zeros((12, 12)), np.zeros(12)
     step = np.array([(1e-4, 0), (-1e-4, 0), (0, 1e-4), (0, -1e-4)])
     for (u, v, ku, kv), p, m in zip(places.reshape(-1, 4).astype(float), weights.reshape(-1), misfit.reshape(-1)):
         i, j = min(int(u), 2), min(int(v), 1)
         g = grey(values, np.array([u, v]) + step)
         a = ((g[0] - g[1]) * (ku - means[j, i, 0]) + (g[2] - g[3]) * (kv - means[j, i, 1])) / 2e-4
+        squares[j, i] += p * a * a
         phi = np.zeros((3, 4))
         f, g = u - i, v - j
         phi[j : j + 2, i : i + 2] = np.outer((1 - g, g), (1 - f, f))
         N += p * a * a * np.outer(phi, phi)
         b -= p * a * m * phi.reshape(-1)
     assert np.abs(right.reshape(-1) - b).max() < 1e-3 * np.abs(b).max()
+    assert np.abs(whole - squares).max() < 1e-3 * squares.max()
     # Errors of one standard deviation have the variances of the equations.
     assert 0.4 < np.mean(noise**2 / system[0]) < 2.0
     assert np.abs(dense(system, np.zeros((3, 3, 4))) - N).max() < 1e-4 * np.abs(N).max()

@@ -221,7 +221,10 @@ def test_pixels_of_reduced_images_are_those_that_count() -> None:
     for base in (0, 3):
         plan: Any = SimpleNamespace(scheme=SimpleNamespace(base=base), settings=SimpleNamespace(name="surface"))
         told.append(findings(plan, {"a": 5.0}, 8.0, 2.0, 0.0, 0.5, 0.0))
-    assert len(told[0]) == 3 and "had not settled" in told[0][1] and "hardly any texture" in told[0][2]
+    assert (
+        len(told[0]) == 3 and "not settled; a coarser `resolution`" in told[0][1] and "hardly any texture" in told[0][2]
+    )
+    assert "not settled; a finer `resolution`" in findings(plan, {"a": 0.1}, 8.0, 0.05, 0.0, 5.0, 0.0)[0]
     assert len(told[1]) == 1 and "the relief is finer than" in told[1][0] and "finer than" not in told[0][0]
 
 

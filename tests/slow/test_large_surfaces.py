@@ -32,6 +32,9 @@ BOUNDS = (X0 - 30, Y0 - 45, X0 + 30, Y0 + 45)
         (2, 48, 10, 3, 0.030),
         (5, 60, 50, 6, 0.015),
         (5, 60, 50, 12, 0.030),
+        # Contrast of little more than the noise.
+        (4, 60, 2.5, 6, 0.13),
+        (3, 60, 3, 12, 0.25),
     ],
 )
 def test_heights_and_what_they_claim(
@@ -52,7 +55,7 @@ def test_heights_and_what_they_claim(
     print(images, snr, finest, both)
     assert both[0] < rms and 0.8 < both[1] < 1.3
     # Waves of three pixels are more than the facets can follow where there is hardly any noise.
-    assert 0.9 < both[2] < (1.25 if finest == 3 and snr == 50 else 1.1)
+    assert snr < 5 or 0.9 < both[2] < (1.25 if finest == 3 and snr == 50 else 1.1)
 
 
 def test_seams_between_tiles(tmp_path: Path) -> None:
@@ -69,4 +72,4 @@ def test_seams_between_tiles(tmp_path: Path) -> None:
     off = np.abs(np.hstack([heights for heights, _ in halves]) - whole) / sigma
     seam = off[:, width // 2 - 4 : width // 2 + 4]
     print("sigma apart", np.median(off), np.percentile(off, 95), off.max(), "at the seam", np.median(seam), seam.max())
-    assert np.median(seam) < 0.1 and seam.max() < 0.7
+    assert np.median(seam) < 0.03 and seam.max() < 0.2 and np.percentile(off, 95) < 0.1

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from photoplan.kernels.facets_rows import add_product, add_share, dot
+from photoplan.kernels.facets_signs import sign_at
 from photoplan.kernels.jit import inner, kernel, maker
 
 PAD = 2
@@ -81,6 +82,29 @@ def add_grey(places, grey, weights, ratio, system, right, density):
                         row[k + 1] += both * x1
                         row[k + 2] += both * x2
                         row[k + 3] += both * x3
+
+
+@kernel
+def add_errors(places, first, weights, ratio, right):
+    """Add to a right-hand side what independent errors of an image's pixels are in it, one standard deviation each.
+
+    `first` is column and row of the first pixel in its image: errors are the same whatever window is looked at. See
+    `add_grey`.
+    """
+    x, y = np.empty(4), np.empty(4)
+    for r in range(places.shape[0]):
+        for c in range(places.shape[1]):
+            if not weights[r, c] > 0.0:
+                continue
+            s, t = places[r, c, 0] * ratio, places[r, c, 1] * ratio
+            i, j = int(s), int(t)
+            spline(s - i, x)
+            spline(t - j, y)
+            i, j = i + PAD - 1, j + PAD - 1
+            error = np.sqrt(weights[r, c]) * sign_at(first[0] + c, first[1] + r)
+            for b in range(4):
+                for a in range(4):
+                    right[j + b, i + a] += np.float32(error * y[b] * x[a])
 
 
 @inner

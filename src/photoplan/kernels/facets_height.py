@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from photoplan.kernels.facets_grey import grey_at
-from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.facets_signs import sign_at
+from photoplan.kernels.jit import kernel
 
 #: Rows and columns between the two posts of an entry.
 OFFSETS = ((0, 0), (0, 1), (0, 2), (1, -1), (1, 0), (1, 1), (2, 0))
@@ -31,24 +32,6 @@ def add_means(places, weights, sums):
                 sums[j, i, 0] += p
                 sums[j, i, 1] += p * places[r, c, 2]
                 sums[j, i, 2] += p * places[r, c, 3]
-
-
-@inner
-def sign_at(i, j):
-    """1 or −1, by chance, but always the same at a place (MurmurHash3's mixing, Appleby 2011)."""
-    mixed = np.uint64(i) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(j) * np.uint64(0xC2B2AE3D27D4EB4F)
-    mixed = (mixed ^ (mixed >> np.uint64(33))) * np.uint64(0xFF51AFD7ED558CCD)
-    mixed = (mixed ^ (mixed >> np.uint64(33))) * np.uint64(0xC4CEB9FE1A85EC53)
-    return 1.0 if (mixed >> np.uint64(40)) & np.uint64(1) else -1.0
-
-
-@kernel
-def signs_at(col, row, out):
-    """`sign_at` of the places of a grid whose first one is (col, row), for each of the layers of `out`, (k, m, n)."""
-    for k in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            for i in range(out.shape[2]):
-                out[k, j, i] = sign_at((col + i) * 4 + k, row + j)
 
 
 @kernel
@@ -114,3 +97,22 @@ def add_heights(
             system[4, j, i] += paa * phi[0] * phi[2]
             system[4, j, i + 1] += paa * phi[1] * phi[3]
             system[5, j, i] += paa * phi[0] * phi[3]
+
+
+@kernel
+def add_sensitivities(places, weights, values, ratio, means, sums):
+    """Add squared sensitivities of an image's pixels to height, Σ p (a − ā)², by facet: (rows − 1, columns − 1).
+
+    See `add_heights`.
+    """
+    x, y, dx, dy, found = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(3)
+    for r in range(places.shape[0]):
+        for c in range(places.shape[1]):
+            p = weights[r, c]
+            if not p > 0.0:
+                continue
+            u, v = places[r, c, 0], places[r, c, 1]
+            grey_at(values, u * ratio, v * ratio, x, y, dx, dy, found)
+            i, j = min(int(u), sums.shape[1] - 1), min(int(v), sums.shape[0] - 1)
+            a = ratio * (found[1] * (places[r, c, 2] - means[j, i, 0]) + found[2] * (places[r, c, 3] - means[j, i, 1]))
+            sums[j, i] += p * a * a

@@ -14,12 +14,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.facets_grey import OFFSETS, PAD, add_grey, sample_grey, solve_grey
-from photoplan.kernels.facets_height import add_heights, add_means, signs_at
+from photoplan.kernels.facets_grey import OFFSETS, PAD, add_errors, add_grey, sample_grey, solve_grey
+from photoplan.kernels.facets_height import add_heights, add_means
+from photoplan.kernels.facets_signs import signs_at
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
 from photoplan.matching.facets.curvature import Roughness, Smoother
+from photoplan.matching.facets.means import corners, smoothed
 from photoplan.matching.facets.observe import Facets, Sight, View
 from photoplan.matching.facets.radiometry import Transfer, first_guess, levelled
+from photoplan.matching.facets.texture import Texture
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
@@ -31,12 +34,15 @@ _FARTHEST = 2.0
 #: Residuals from so many standard deviations on count less (Huber 1964), and what that takes from their variance.
 _LIMIT, _TAKEN = 2.5, 0.978
 #: Conjugate gradients of grey values: rounds at most, and the part of their standard deviations that is exact enough.
-_ROUNDS, _EXACT = 25, 0.1
+#: The same for errors that are drawn, whose slopes count.
+_ROUNDS, _FULLY = (25, 0.1), (60, 0.03)
 #: Pixels beyond those that grey values need, part of all, without which a surface is not tried.
 _TELLING = 0.05
 _NONE = np.empty((0, 0), np.float32)
 #: Conjugate gradients of heights: rounds at most, and the part of the equations that may be left.
 _MOST, _LEFT = 400, 0.01
+#: Part of the variance of grey values that is not noise from which on images are taken to show the same.
+_COMMON = 0.5
 #: Posts of a part whose variances are computed at once, and around it.
 _SIDE, _MARGIN = 24, 8
 #: Posts along the border of a block from which nothing is learnt about its roughness.
@@ -63,6 +69,8 @@ class FacetBlock:
     """See `parallax`."""
     limits: tuple[_Doubles | float, _Doubles | float] = (-np.inf, np.inf)
     """Heights between which the surface stays, metres, of all or shape (rows, columns)."""
+    reach: float = 0.0
+    """How far the start of the heights may be wrong, metres."""
     trusted: NDArray[np.bool_] | None = None
     """Posts around which pixels tell their noise, and heights how rough they are; None: all."""
     views: list[View] = field(default_factory=list)
@@ -81,28 +89,33 @@ class FacetBlock:
     """Of each view: Σ of robust factors times squared residuals in its own grey values; redundancy."""
     ways: _Doubles = field(default_factory=lambda: np.empty((0, 0, 2)))
     """Mean change of the pixels' places with height in each facet, posts per metre, (rows − 1, columns − 1, 2)."""
+    density: _Floats = field(default_factory=lambda: _NONE)
+    """Weights that lie on each coefficient."""
+    texture: Texture | None = None
+    """None: not told from noise, which is as if all were texture."""
     _factors: list[_Floats] = field(default_factory=list)
     _pull: tuple[_Doubles, _Doubles] = (np.empty((0, 0)), np.empty((0, 0)))
     """Heights where the last equations were set up, and their right-hand side, of the pixels alone."""
 
-    def adjust(self, most: int, radiometry: bool) -> None:
-        """Iterate until the heights stay; perhaps with parameters of the radiometry improved in the first iteration."""
+    def adjust(self, most: int, radiometry: bool, texture: bool = False) -> None:
+        """Iterate until the heights stay; perhaps with the radiometry improved in the first iteration, and texture told
+        from noise."""
         for k in range(most):
-            self.iterate(radiometry and k == 0)
+            self.iterate(radiometry and k == 0, texture and k == 0)
             if self.moves[-1] < ENOUGH:
                 break
 
-    def iterate(self, radiometry: bool = True) -> None:
-        """One correction of everything."""
+    def iterate(self, radiometry: bool = True, texture: bool = False) -> None:
+        """One correction of everything; perhaps with texture told from noise from then on."""
         self.sights = [sight.onto(self.heights) for sight in self.sights]
         grey, weights = self.observed()
         if not len(self.values):
             self._start(grey, weights)
-        density = self._solve_grey(grey, weights)
+        self.density, errors = self._solve_grey(grey, weights, texture)
         if radiometry:
             self._improve_radiometry(weights)
             grey, weights = self.observed()
-        self._pull = self.heights, self._heights(grey, weights, density)
+        self._pull = self.heights, self._heights(grey, weights, errors)
         self._settle()
         known = self.counted > 1
         change = self.heights - self._pull[0]
@@ -126,7 +139,7 @@ class FacetBlock:
         grey, weights = trial.observed()
         weights = [(w > 0).astype(np.float32) for w in weights]
         trial._start(grey, weights)
-        density = trial._solve_grey(grey, weights)
+        density, _ = trial._solve_grey(grey, weights)
         total = sum(float(w.sum()) for w in weights)
         free = total - int((density > 0).sum())
         if free < _TELLING * sum(s.raw.size for s in self.sights):
@@ -140,7 +153,13 @@ class FacetBlock:
         found = np.empty((2, *self.facets.shape))
         for out, stiffer in zip(found, (1.0, _STIFFER)):
             variances(self._equations(stiffer), _SIDE, _MARGIN, out)
-        return self.roughness.sandwich(self.heights, self._smoother(), found, _STIFFER)
+        noise, taken = self.roughness.sandwich(self.heights, self._smoother(), found, _STIFFER)
+        if self.texture is None:
+            return noise + taken
+        # Where nothing tells heights, what is known is how far the start may be wrong.
+        if not self.texture.common(self.values, self.facets.ratio, self.counted) > _COMMON and self.reach > 0:
+            return np.full(self.facets.shape, self.reach**2 / 3)
+        return noise / self.texture.at_posts + taken
 
     def roughen(self, times: int) -> None:
         """Estimate the variances of the curvatures, and the heights with them."""
@@ -215,15 +234,23 @@ class FacetBlock:
         shape = tuple((n - 1) * self.facets.ratio + 1 + 2 * PAD for n in self.facets.shape)
         self.values = np.full(shape, mean, np.float32)
 
-    def _solve_grey(self, grey: Sequence[_Floats], weights: Sequence[_Floats]) -> _Floats:
-        """The grey values of the surface; returns the weights that lie on each of them."""
-        shape = self.values.shape
+    def _solve_grey(
+        self, grey: Sequence[_Floats], weights: Sequence[_Floats], drawn: bool = False
+    ) -> tuple[_Floats, _Floats | None]:
+        """The grey values of the surface; returns the weights that lie on each, and perhaps errors of theirs."""
+        shape, ratio, errors = self.values.shape, self.facets.ratio, None
         system = np.zeros((*shape, OFFSETS), np.float32)
         right, density = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         for sight, g, w in zip(self.sights, grey, weights):
-            add_grey(sight.places, g, w, self.facets.ratio, system, right, density)
-        self.values = solved_exactly(system, right, density, self.values)
-        return density
+            add_grey(sight.places, g, w, ratio, system, right, density)
+        self.values = _solved_exactly(system, right, density, self.values, _ROUNDS)
+        if drawn:
+            right[:] = 0.0
+            for n, (sight, w) in enumerate(zip(self.sights, weights)):
+                # Of each image others.
+                add_errors(sight.places, (sight.first[0] + (n << 20), sight.first[1]), w, ratio, right)
+            errors = _solved_exactly(system, right, density, np.zeros(shape, np.float32), _FULLY)
+        return density, errors
 
     def surface_at(self, sight: Sight, weights: _Floats) -> _Floats:
         """Grey values of the surface where a view's pixels lie; 0 where none is used."""
@@ -240,29 +267,33 @@ class FacetBlock:
         ]
         self.transfers = levelled(new)
 
-    def _heights(self, grey: Sequence[_Floats], weights: Sequence[_Floats], density: _Floats) -> _Doubles:
+    def _heights(self, grey: Sequence[_Floats], weights: Sequence[_Floats], errors: _Floats | None) -> _Doubles:
         """Normal equations of the heights (kept) and their right-hand side; new standard deviations and factors."""
         rows, columns = self.facets.shape
-        sums = np.zeros((rows - 1, columns - 1, 3))
+        sums, counted = np.zeros((rows - 1, columns - 1, 3)), np.zeros((rows, columns), np.uint8)
         for sight, w in zip(self.sights, weights):
-            add_means(sight.places, w, sums)
+            own = np.zeros_like(sums)
+            add_means(sight.places, w, own)
+            counted += corners(own[..., 0] > 0)
+            sums += own
         self.ways = sums[..., 1:] / np.maximum(sums[..., :1], 1e-30)
+        if errors is not None:
+            self.texture = Texture.of(
+                self.sights, weights, self.values, errors, self.density, self.facets.ratio, self.ways
+            )
         self.system, right = np.zeros((7, rows, columns)), np.zeros((rows, columns))
         self.noise = np.zeros((rows, columns))
-        counted = np.zeros((rows, columns), np.uint8)
         found, residuals = np.zeros((len(self.sights), 3)), _NONE
         for n, (sight, g, w) in enumerate(zip(self.sights, grey, weights)):
             residuals = np.empty(g.shape, np.float32)
-            before = self.system[0].copy()
             add_heights(
                 sight.first, sight.places, g, w, self.values, self.facets.ratio, self.ways,
                 self.sigmas[n], _LIMIT, self.system, right, self.noise, residuals, self._factors[n], found[n],
             )  # fmt: skip
-            counted += self.system[0] > before
             found[n] = self._telling(sight, residuals, n, found[n])
         self.counted = counted
         pixels = sum(float(np.count_nonzero(w)) for w in weights)
-        self._weigh(found, int((density > 0).sum()) * float(found[:, 2].sum()) / max(pixels, 1.0))
+        self._weigh(found, int((self.density > 0).sum()) * float(found[:, 2].sum()) / max(pixels, 1.0))
         return right
 
     def _telling(self, sight: Sight, residuals: _Floats, n: int, sums: _Doubles) -> _Doubles:
@@ -290,32 +321,13 @@ class FacetBlock:
         self.sigmas = np.where(used, np.maximum(self.sigmas * np.clip(factor, 0.2, 5.0), quiet), self.sigmas)
 
 
-def solved_exactly(system: _Floats, right: _Floats, density: _Floats, values: _Floats) -> _Floats:
+def _solved_exactly(
+    system: _Floats, right: _Floats, density: _Floats, values: _Floats, rounds: tuple[int, float]
+) -> _Floats:
     """Coefficients of grey facets from their normal equations and the weights on each of them, beginning with `values`:
     as exact as a part of their own standard deviations. Those that hardly any pixel knows stay near what they were."""
     usual = np.float32(density[density > 0].mean() if (density > 0).any() else 1.0)
     system[..., 3] += np.float32(1e-4) * usual
     right += np.float32(1e-4) * usual * values
-    solve_grey(system, right, smoothed(density) + np.float32(0.05) * usual, values, _ROUNDS, _EXACT)
+    solve_grey(system, right, smoothed(density) + np.float32(0.05) * usual, values, *rounds)
     return values
-
-
-def means_around(values: NDArray[np.floating], patch: int) -> _Doubles:
-    """Means over patches of patch × patch values, fewer at the border."""
-    out = np.asarray(values, float)
-    half = patch // 2
-    for axis in (0, 1):
-        count = out.shape[axis]
-        sums = np.insert(np.cumsum(out, axis=axis), 0, 0.0, axis=axis)
-        k = np.arange(count)
-        first, last = np.maximum(k - half, 0), np.minimum(k + half + 1, count)
-        sizes = (last - first).reshape((-1, 1) if axis == 0 else (1, -1))
-        out = (sums.take(last, axis) - sums.take(first, axis)) / sizes
-    return out
-
-
-def smoothed(values: _Floats) -> _Floats:
-    """Means of three by three."""
-    padded = np.pad(values, 1, mode="edge")
-    across = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
-    return (across[:-2] + across[1:-1] + across[2:]) / np.float32(9)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ _PATCH = 24
 #: Degrees of freedom of the curvatures.
 _FREEDOM = 4.0
 #: The part with which the mean of a block takes part in the variances of each patch, and what these change at once.
-_SHARED, _MOST = 0.25, 64.0
+_SHARED, _STEADY, _MOST = 0.25, 0.5, 64.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +44,12 @@ class Smoother:
     signs: _Doubles
     """Of the curvatures that are drawn, 1 or −1, shape (3, rows, columns)."""
 
-    def mean(self, values: _Doubles, shared: float) -> _Doubles:
-        """Means of what tells over patches and, in the part `shared`, of all of the block, (rows, columns)."""
+    def mean(self, values: _Doubles, shared: float, wide: bool = False) -> _Doubles:
+        """Means of what tells over patches, twice if `wide`, and in the part `shared` of the block, (rows, columns)."""
         number = max(float(np.count_nonzero(self.inside)), 1.0)
         telling = np.where(self.inside, values, 0.0)
         whole = float(telling.sum()) / number
-        own, share = _means(telling), _means(self.inside.astype(float))
+        own, share = (_means(_means(part) if wide else part) for part in (telling, self.inside.astype(float)))
         few = 1.0 / _PATCH**2
         return np.asarray((1 - shared) * (own + few * whole) / (share + few) + shared * whole)
 
@@ -87,16 +88,18 @@ class Roughness:
 
     def estimated(self, heights: _Doubles, smoother: Smoother) -> Roughness:
         """Variances with which the band around the smoothing length holds what it does in heights (rows, columns)."""
-        mean = smoother.mean
+        mean = partial(smoother.mean, wide=True)
         seen, drawn, noise = (band**2 for band in self._bands(heights, smoother, 1)[0][0])
         usual = np.maximum(mean(drawn + noise, 0.0), 1e-300)
         weighed = seen * (_FREEDOM + 1) / (_FREEDOM + seen / usual)
         # In parts of what is usual at a place, all places count alike.
-        change = mean((weighed - noise) / usual, _SHARED) / np.maximum(mean(drawn / usual, _SHARED), 1e-30)
+        change = mean((weighed - noise) / usual, _STEADY) / np.maximum(mean(drawn / usual, _STEADY), 1e-30)
         # Of smooth terrain it falls with the 2.5th power of the variance: whole steps would not settle.
         return Roughness(self.squares * np.sqrt(np.clip(change, 1 / _MOST, _MOST)), self.factors).around(heights)
 
-    def sandwich(self, heights: _Doubles, smoother: Smoother, variances: _Doubles, stiffer: float) -> _Doubles:
+    def sandwich(
+        self, heights: _Doubles, smoother: Smoother, variances: _Doubles, stiffer: float
+    ) -> tuple[_Doubles, _Doubles]:
         """Variances of heights (rows, columns), of the pixels' noise and of what smoothing takes away.
 
         `variances` are the diagonals of N⁻¹ with these weights and with weights `stiffer` times as large, (2, rows,
@@ -117,7 +120,7 @@ class Roughness:
             rest -= (n + 1) * mean(drawn, _SHARED)
         times = mean(seen - noise, 1.0) / np.maximum(mean(drawn, 1.0), 1e-30)
         share = np.clip(known + np.maximum(times, 0.0) * np.maximum(rest, 0.0), 0.0, _MOST)
-        return np.asarray(whole - prior + share * prior)
+        return whole - prior, share * prior
 
     def _bands(self, heights: _Doubles, smoother: Smoother, count: int) -> tuple[list[_Doubles], _Doubles]:
         """(N⁻¹ R)ⁿ of a smoothed surface, n = 1 … count: of heights, and expected ones of independent curvatures and
@@ -158,7 +161,7 @@ def _inside(shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def _means(values: _Doubles) -> _Doubles:
-    """Means around each post over patches of about `_PATCH` posts, shape (rows, columns)."""
+    """Means around each post over squares of `_PATCH` posts, shape (rows, columns)."""
     out = values
     for axis in (0, 1):
         count, half = values.shape[axis], _PATCH // 2

@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.geometry.grid import Window
-from photoplan.kernels.facets_grey import OFFSETS, add_grey, sample_grey
+from photoplan.kernels.facets_grey import sample_grey
 from photoplan.kernels.facets_residuals import add_residuals, sample_slopes
-from photoplan.matching.facets.block import FacetBlock, means_around, smoothed, solved_exactly
+from photoplan.matching.facets.block import FacetBlock
+from photoplan.matching.facets.means import means_around, smoothed
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
@@ -49,22 +50,15 @@ def grey_sigmas(block: FacetBlock, at: _Doubles, height_variances: _Doubles) -> 
     height_variances : ndarray, shape (n, m)
         Of the heights there, m².
     """
-    ratio = block.facets.ratio
-    shape = block.values.shape
-    system, right = np.zeros((*shape, OFFSETS), np.float32), np.zeros(shape, np.float32)
-    density = np.zeros(shape, np.float32)
-    _, weights = block.observed()
-    signs = np.random.default_rng(11)
-    for sight, w in zip(block.sights, weights):
-        drawn = (signs.integers(0, 2, w.shape) * 2 - 1) / np.sqrt(np.maximum(w, np.float32(1e-30)))
-        add_grey(sight.places, drawn.astype(np.float32), w, ratio, system, right, density)
-    error = solved_exactly(system, right, density, np.zeros(shape, np.float32))
-    places = at.reshape(-1, 2)
-    drawn_there, known = np.empty(len(places), np.float32), np.empty(len(places), np.float32)
-    sample_grey(error, ratio, places, drawn_there)
-    sample_grey(smoothed(density), ratio, places, known)
-    single = 1 / np.maximum(known.reshape(at.shape[:2]), np.float32(1e-3 * max(float(density.mean()), 1e-30)))
-    times = means_around(drawn_there.reshape(at.shape[:2]) ** 2 / single, _PATCH)
+    assert block.texture is not None
+    ratio, places = block.facets.ratio, at.reshape(-1, 2)
+    drawn, known, before = (np.empty(len(places), np.float32) for _ in range(3))
+    fields = block.texture.errors, smoothed(block.density), smoothed(block.texture.density)
+    for out, values in zip((drawn, known, before), fields):
+        sample_grey(values, ratio, places, out)
+    least = np.float32(1e-3 * max(float(block.density.mean()), 1e-30))
+    single = 1 / np.maximum(known.reshape(at.shape[:2]), least)
+    times = means_around((drawn**2 * np.maximum(before, least)).reshape(at.shape[:2]), _PATCH)
     slopes = np.empty((len(places), 2), np.float32)
     sample_slopes(block.values, ratio, places, slopes)
     j, i = (

@@ -142,7 +142,7 @@ def reconstruct(
         block = _opened(views, level + scheme.base, facets, heights, block, reach) or block
         if block is None or block.facets is not facets:
             continue
-        block.limits = _limits(start, facets, reach)
+        block.limits, block.reach = _limits(start, facets, reach), reach
         if level == scheme.coarsest:
             if found is None:
                 block.heights = _lifted(block, reach)
@@ -150,11 +150,12 @@ def reconstruct(
                 block.roughness = block.roughness.around(block.heights)
                 block.trusted = found.sure if found.sure.mean() > _TRUSTED else None
         block.adjust(_FIRST[level < scheme.coarsest], True)
-        for estimates, iterations in _THEN[level > 0]:
+        for k, (estimates, iterations) in enumerate(_THEN[level > 0]):
             if level == 0:
                 block.trusted = _telling(block, found)
             block.roughen(estimates)
-            block.adjust(iterations, level == 0)
+            # Not before the noise has settled, nor where heights are still on their way, which looks like noise.
+            block.adjust(iterations, level == 0, texture=level == k == 0)
         moves[level] = block.moves[-1]
     if block is None or block.facets.pitch != grid.resolution:
         return None

@@ -10,6 +10,8 @@ from photoplan.products.surface.plan import SurfacePlan
 #: contrast of the surface. Parts of the heights that fit badly, last corrections, and standard deviations, pixels of
 #: parallax, from which it is told; so many of them without a height.
 _ALONE, _NOISY, _MISFITS, _MOVING, _VAGUE, _ASTRAY = 1.6, 0.35, 0.02, 0.2, 1.0, 0.001
+#: Standard deviations by which noise alone may still move heights in the last iteration.
+_NOISE_MOVES = 1.0
 
 
 def findings(
@@ -75,7 +77,14 @@ def findings(
     # Reduced images are all that a coarse surface sees: their pixels count.
     pixel = 2**plan.scheme.base
     if correction > _MOVING * pixel:
-        lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; `resolution` helps")
+        # Noise moves heights by no more than their standard deviations; what is more, facets cannot follow.
+        noisy = sigma_px is not None and correction < _NOISE_MOVES * sigma_px
+        helps = (
+            "coarser `resolution` helps, as noise moves"
+            if noisy
+            else "finer `resolution` helps, as relief is finer than"
+        )
+        lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; a {helps} them")
     if sigma_px is not None and sigma_px > _VAGUE * pixel:
         lines.append(
             f"the median standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "

@@ -1,0 +1,36 @@
+"""Means of neighbouring values."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Floats = NDArray[np.float32]
+_Doubles = NDArray[np.float64]
+
+
+def means_around(values: NDArray[np.floating], patch: int) -> _Doubles:
+    """Means over patches of patch × patch values, fewer at the border."""
+    out = np.asarray(values, float)
+    half = patch // 2
+    for axis in (0, 1):
+        count = out.shape[axis]
+        sums = np.insert(np.cumsum(out, axis=axis), 0, 0.0, axis=axis)
+        k = np.arange(count)
+        first, last = np.maximum(k - half, 0), np.minimum(k + half + 1, count)
+        sizes = (last - first).reshape((-1, 1) if axis == 0 else (1, -1))
+        out = (sums.take(last, axis) - sums.take(first, axis)) / sizes
+    return out
+
+
+def smoothed(values: _Floats) -> _Floats:
+    """Means of three by three."""
+    padded = np.pad(values, 1, mode="edge")
+    across = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+    return (across[:-2] + across[1:-1] + across[2:]) / np.float32(9)
+
+
+def corners(facets: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Posts at the corners of any of these facets: shape (rows, columns) of (rows − 1, columns − 1)."""
+    around = np.pad(facets, 1)
+    return around[:-1, :-1] | around[:-1, 1:] | around[1:, :-1] | around[1:, 1:]
