@@ -22,7 +22,7 @@ from photoplan.matching.facets.curvature import Roughness, Smoother
 from photoplan.matching.facets.means import corners, smoothed
 from photoplan.matching.facets.observe import Facets, Sight, View
 from photoplan.matching.facets.radiometry import Transfer, first_guess, levelled
-from photoplan.matching.facets.texture import Texture
+from photoplan.matching.facets.texture import GreyTexture
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
@@ -91,7 +91,7 @@ class FacetBlock:
     """Mean change of the pixels' places with height in each facet, posts per metre, (rows − 1, columns − 1, 2)."""
     density: _Floats = field(default_factory=lambda: _NONE)
     """Weights that lie on each coefficient."""
-    texture: Texture | None = None
+    texture: GreyTexture | None = None
     """None: not told from noise, which is as if all were texture."""
     _factors: list[_Floats] = field(default_factory=list)
     _pull: tuple[_Doubles, _Doubles] = (np.empty((0, 0)), np.empty((0, 0)))
@@ -278,7 +278,7 @@ class FacetBlock:
             sums += own
         self.ways = sums[..., 1:] / np.maximum(sums[..., :1], 1e-30)
         if errors is not None:
-            self.texture = Texture.of(
+            self.texture = GreyTexture.of(
                 self.sights, weights, self.values, errors, self.density, self.facets.ratio, self.ways
             )
         self.system, right = np.zeros((7, rows, columns)), np.zeros((rows, columns))

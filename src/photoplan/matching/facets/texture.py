@@ -31,7 +31,7 @@ _LEAST = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Texture:
+class GreyTexture:
     """What errors that are drawn tell of the grey values of a block."""
 
     errors: _Floats
@@ -51,7 +51,7 @@ class Texture:
         density: _Floats,
         ratio: int,
         ways: _Doubles,
-    ) -> Texture:
+    ) -> GreyTexture:
         """From coefficients and errors of theirs: see `FacetBlock`."""
         found = np.zeros((2, *ways.shape[:2]))
         for coefficients, sums in zip((values, errors), found):
