@@ -251,9 +251,3 @@ def test_what_is_wrong_in_a_file_is_named(entry: str, value: object, told: str) 
     with pytest.raises(InputError, match=told) as error:
         csm.read(isd, Path("some.json"))
     assert str(error.value).startswith("some.json: ")
-
-
-def test_support_data_of_a_frame_camera_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "frame.json").write_text('{"name_model": "USGS_ASTRO_FRAME_SENSOR_MODEL", "image_lines": 3}')
-    with pytest.raises(InputError, match="of USGS_ASTRO_FRAME_SENSOR_MODEL"):
-        read_line(tmp_path / "frame.json")

@@ -42,6 +42,8 @@ ALLOWED = {
     "cameras/corrected.py": "a kind",
     "cameras/curved.py": "a kind",
     "cameras/build.py": "registry of cameras that compute",
+    "cameras/body_frame.py": "a kind in the axes of a body",
+    "io/camera/csm_frame.py": "makes a kind of what files state",
     "io/camera/frame.py": "a kind",
     "io/camera/film.py": "a kind",
     "io/camera/kinds.py": "registry of cameras that are described",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Vantage
+from photoplan.cameras.body_sight import meet, radius_below, vantage_over
 from photoplan.cameras.line_look import LineLook
 from photoplan.cameras.line_sight import FOUND, LineSight, to_sphere
 from photoplan.cameras.line_track import LineTrack
@@ -19,10 +20,6 @@ from photoplan.geometry.body import BodyGround
 _Floats = NDArray[np.float64]
 #: Rows beyond either end of the image that still have positions: a part of its height, and lines.
 _ROOM = (0.25, 256.0)
-#: Heights of any ground, metres: of the earth, and of other bodies.
-_EARTH, _ELSEWHERE = (-500.0, 9_000.0), (-10_000.0, 25_000.0)
-#: Half the distance over which the change of a ray on the map is taken, metres.
-_REACH = 50.0
 #: Half the time over which the change of what a shaken line sees is taken, lines.
 _SHORT = 1e-3
 
@@ -140,10 +137,7 @@ class LineCamera:
         xy = np.asarray(xy, float)
         flat = xy.reshape(-1, 2)
         S, d = self.body_rays(flat)
-        with np.errstate(all="ignore"):
-            point, at = self._meet(S, d, np.broadcast_to(np.asarray(height, float), xy.shape[:-1]).ravel())
-            tangent = self.ground.to_map(at + _REACH * d) - self.ground.to_map(at - _REACH * d)
-            tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        point, tangent = meet(self.ground, S, d, np.broadcast_to(np.asarray(height, float), xy.shape[:-1]).ravel())
         return point.reshape(*xy.shape[:-1], 3), tangent.reshape(*xy.shape[:-1], 3)
 
     def body_rays(self, xy: _Floats) -> tuple[_Floats, _Floats]:
@@ -156,18 +150,11 @@ class LineCamera:
     @cached_property
     def vantage(self) -> Vantage:
         """Above the middle of what it sees: the highest ground there is, but not above the camera."""
-        low, high = _EARTH if self.ground.on_earth else _ELSEWHERE
         first, last = self.track.oriented
         rows, columns = np.linspace(first, last, 17), np.linspace(-0.5, self.size[0] - 0.5, 9)
         xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         flying = float(np.nanmin(self.ground.to_map(self.body_rays(xy)[0])[:, 2]))
-        high = min(high, flying - 1.0)
-        feet = np.concatenate([self.rays(xy, level)[0][:, :2] for level in (min(low, high - 1.0), high)])
-        if np.isnan(feet).all():
-            raise InputError("the image does not show the ground of the project; is its CRS that of the right body?")
-        middle = (np.nanmin(feet, axis=0) + np.nanmax(feet, axis=0)) / 2
-        reach = 1.1 * float(np.nanmax(np.linalg.norm(feet - middle, axis=1)))
-        return Vantage(np.array([*middle, high]), low, reach)
+        return vantage_over(self.ground, flying, lambda level: self.rays(xy, level)[0])
 
     def unoriented(self, y: _Floats) -> NDArray[np.bool_]:
         """Rows inside the image whose orientation is not known."""
@@ -205,7 +192,7 @@ class LineCamera:
         rows, columns = np.linspace(first, last, 9), np.linspace(0, self.size[0] - 1, 5)
         xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         S, d = self.body_rays(xy)
-        r = to_sphere(S, d, self._radius(S))
+        r = to_sphere(S, d, radius_below(self.ground, S))
         good = np.isfinite(r)
         if not good.any():
             raise InputError("the camera does not look at the body; are positions and attitudes in the same axes?")
@@ -213,24 +200,3 @@ class LineCamera:
         origin, scale = places.mean(axis=0), float(np.ptp(places, axis=0).max())
         A = np.column_stack([np.ones(len(places)), (places - origin) / scale])
         return origin, scale, np.linalg.lstsq(A, np.tile(xy[good, 1], 2), rcond=1e-9)[0]
-
-    def _radius(self, S: _Floats) -> _Floats:
-        """Radius of the body below points (n, 3), metres."""
-        return np.asarray(np.linalg.norm(S, axis=1) - self.ground.height(S))
-
-    def _meet(self, S: _Floats, d: _Floats, heights: _Floats) -> tuple[_Floats, _Floats]:
-        """Map points (n, 3) of rays at heights (n,), and the same in the axes of the body."""
-        r = to_sphere(S, d, self._radius(S) + heights)
-        at = S + r[:, None] * d
-        cos = np.einsum("ni,ni->n", at, d) / np.linalg.norm(at, axis=1)
-        for _ in range(12):
-            point = self.ground.to_map(S + r[:, None] * d)
-            miss = point[:, 2] - heights
-            r = r - miss / cos
-            if not (np.abs(miss) > 1e-9).any():
-                break
-        at = S + r[:, None] * d
-        point = self.ground.to_map(at)
-        point[~(np.abs(point[:, 2] - heights) < 1e-6)] = np.nan
-        point[:, 2] = np.where(np.isnan(point[:, 0]), np.nan, heights)
-        return point, at

@@ -15,6 +15,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.appearance import looks_like
+from photoplan.io.camera.csm_frame import is_frame, read_frame
 from photoplan.io.camera.line.file import describe_line, is_line
 from photoplan.io.camera.rpc.file import is_rpc, read_rpc, rpc_beside, rpc_in
 from photoplan.io.filter_file import is_filter
@@ -77,6 +78,8 @@ def describe(path: Path) -> dict[str, Any]:
     kind = path.suffix.lower()
     if is_line(path):
         return {"file": str(path), **describe_line(path), **(read_rpc(path).describe() if is_rpc(path) else {})}
+    if is_frame(path):
+        return {"file": str(path), **read_frame(path).describe()}
     if kind == ".csv" or (kind == ".toml" and is_filter(path)):
         return describe_filter(path)
     if kind == ".toml":

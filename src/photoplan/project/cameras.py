@@ -8,12 +8,14 @@ from typing import Any
 
 from photoplan.cameras.base import Camera, CentralCamera
 from photoplan.errors import InputError
+from photoplan.io.project.frame import FrameImage
 from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.line import LineImage
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.io.project.rpc import RpcImage
 from photoplan.io.raster_info import read_info
+from photoplan.project.by_frame import frame_camera
 from photoplan.project.by_line import line_camera
 from photoplan.project.by_rpc import rpc_camera
 from photoplan.project.ground import Ground, ground_of
@@ -24,6 +26,7 @@ _MAKERS: dict[type[ImageEntry], Callable[[Project, Any, Ground, tuple[int, int]]
     Image: posed_camera,
     RpcImage: rpc_camera,
     LineImage: line_camera,
+    FrameImage: frame_camera,
 }
 
 

@@ -34,7 +34,12 @@ _REACH = 1000.0
 
 
 def geometry_of(image: ImageEntry) -> Geometry:
-    """The geometry of an image's entry."""
+    """The geometry of an image's entry; InputError where it is none that can be corrected."""
+    if type(image) not in GEOMETRIES:
+        raise InputError(
+            f"image {image.name!r}: its orientation stands in {image.geometry_file}, and is not corrected by an "
+            "adjustment; leave the image out"
+        )
     return GEOMETRIES[type(image)]
 
 

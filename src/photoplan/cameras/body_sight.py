@@ -1,0 +1,87 @@
+"""Where rays in the axes of a body meet its ground, for all cameras that are oriented there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Vantage
+from photoplan.cameras.line_sight import to_sphere
+from photoplan.errors import InputError
+from photoplan.geometry.body import BodyGround
+
+_Floats = NDArray[np.float64]
+#: Heights of any ground, metres: of the earth, and of other bodies, where they are at most this part of the radius.
+_EARTH, _ELSEWHERE, _PART = (-500.0, 9_000.0), (-10_000.0, 25_000.0), 0.1
+#: Half the distance over which the change of a ray on the map is taken, metres.
+_REACH = 50.0
+
+
+def heights_of(ground: BodyGround) -> tuple[float, float]:
+    """Between which heights all ground of the body lies, metres."""
+    low, high = _EARTH if ground.on_earth else _ELSEWHERE
+    room = _PART * ground.radii[1]
+    return max(low, -room), min(high, room)
+
+
+def radius_below(ground: BodyGround, S: _Floats) -> _Floats:
+    """Radius of the body below points (n, 3), metres."""
+    return np.asarray(np.linalg.norm(S, axis=1) - ground.height(S))
+
+
+def meet(ground: BodyGround, S: _Floats, d: _Floats, heights: _Floats) -> tuple[_Floats, _Floats]:
+    """Rays from points (n, 3) with unit directions (n, 3), in the axes of the body, at heights (n,).
+
+    Returns
+    -------
+    point : ndarray, shape (n, 3)
+        Where they meet the heights, on the map; NaN where they do not.
+    tangent : ndarray, shape (n, 3)
+        Unit direction there, on the map.
+    """
+    with np.errstate(all="ignore"):
+        r = to_sphere(S, d, radius_below(ground, S) + heights)
+        at = S + r[:, None] * d
+        cos = np.einsum("ni,ni->n", at, d) / np.linalg.norm(at, axis=1)
+        for _ in range(12):
+            point = ground.to_map(S + r[:, None] * d)
+            miss = point[:, 2] - heights
+            r = r - miss / cos
+            if not (np.abs(miss) > 1e-9).any():
+                break
+        at = S + r[:, None] * d
+        point = ground.to_map(at)
+        # Places far away from the body are rounded.
+        point[~((np.abs(point[:, 2] - heights) < 1e-6 + 1e-14 * r) & (r > 0))] = np.nan
+        point[:, 2] = np.where(np.isnan(point[:, 0]), np.nan, heights)
+        tangent = ground.to_map(at + _REACH * d) - ground.to_map(at - _REACH * d)
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return point, tangent
+
+
+def vantage_over(ground: BodyGround, flying: float, seen: Callable[[float], _Floats]) -> Vantage:
+    """Above the middle of what a camera sees: the highest ground there is, but not above the camera.
+
+    Parameters
+    ----------
+    ground : BodyGround
+    flying : float
+        Height of the camera, metres.
+    seen : callable
+        Map points (n, 3) of rays all over the image at a height.
+
+    Raises
+    ------
+    InputError
+        It does not see the ground.
+    """
+    low, high = heights_of(ground)
+    high = min(high, flying - 1.0)
+    feet = np.concatenate([seen(level)[:, :2] for level in (min(low, high - 1.0), high)])
+    if np.isnan(feet).all():
+        raise InputError("the image does not show the ground of the project; is its CRS that of the right body?")
+    middle = (np.nanmin(feet, axis=0) + np.nanmax(feet, axis=0)) / 2
+    reach = 1.1 * float(np.nanmax(np.linalg.norm(feet - middle, axis=1)))
+    return Vantage(np.array([*middle, high]), low, reach)

@@ -1,0 +1,222 @@
+"""Support data of the Community Sensor Model (ISD, JSON): frame cameras of planetary missions.
+
+The camera looks along z; x and y of its focal plane, millimetres, lead to lines and samples of the detector from the
+outer corner of its first pixel, so that the middle of that pixel is at 0.5. Line and sample of the image are those of
+the detector less the first that was read, over how many were summed. With u without and d with distortion, both in
+millimetres, r² = x² + y² (USGS, usgscsm, `Distortion.cpp`, public domain; names are its own):
+
+    radial      u = d (1 − k0 − k1 r² − k2 r⁴), r of d
+    transverse  dx, dy = cubic polynomials of u with ten coefficients each, in the order of `Cubic`
+    dawnfc      d = u (1 + k r²), r of u
+    radtan      d / f = OpenCV's lens of u / f: k1, k2, p1, p2, k3
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.body_frame import BodyFrameCamera
+from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.base import Lens
+from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses.cubic import Cubic
+from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.cameras.lenses.reversed import Reversed
+from photoplan.cameras.line_sight import to_sphere
+from photoplan.cameras.plane import Affine2D
+from photoplan.errors import InputError
+from photoplan.geometry.body import BodyGround
+from photoplan.geometry.motion import conjugate, cubic, rotations, times
+from photoplan.geometry.pose import Pose
+from photoplan.io.camera.isd import FORM, FRAME_MODEL, Isd
+from photoplan.io.plain_files import read_json
+
+_Floats = NDArray[np.float64]
+#: Support data of a frame are small.
+_MAX_BYTES = 20_000_000
+#: Suffixes of support data.
+SUFFIXES = (".json", ".isd")
+#: From the axes of an ISD's camera (x, y, forwards) to those of a camera here (x, y up, backwards).
+_TURNED = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class StatedFrame:
+    """A frame camera with its orientation, as a file states them."""
+
+    file: Path
+    frame: FrameCamera
+    """In the axes of the body."""
+    radii: tuple[float, float]
+    """Equatorial and polar radius of the body, metres."""
+    focal: float
+    """Focal length, millimetres."""
+    distortion: str | None
+    """Its name; None: there is none."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in pixels."""
+        return self.frame.size
+
+    def camera(self, crs: str, heights: str) -> BodyFrameCamera:
+        """The camera over a ground; a CRS of another body is an InputError."""
+        return BodyFrameCamera(self.frame, BodyGround(crs, heights, self.radii))
+
+    def describe(self) -> dict[str, str]:
+        """In words, by name."""
+        x, y = self.size[0] / 2.0 - 0.5, self.size[1] / 2.0 - 0.5
+        d = self.frame.rays(np.array([(x - 0.5, y), (x + 0.5, y)]))[1]
+        away = float(np.linalg.norm(self.frame.center))
+        return {
+            "frame camera": FORM,
+            "image": f"{self.size[0]} columns, {self.size[1]} lines",
+            "focal length": f"{self.focal:.6g} mm, distortion {self.distortion or 'none'}",
+            "directions": f"{1e6 * float(np.linalg.norm(d[1] - d[0])):.4g} µrad from column to column in the middle",
+            "position": f"{away / 1000:.3f} km from the middle of the body",
+            "body": f"radii {self.radii[0] / 1000:.3f} and {self.radii[1] / 1000:.3f} km",
+        }
+
+
+def read_frame(path: Path) -> StatedFrame:
+    """The frame camera of an ISD.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, is of another kind of camera, or a number is missing, wrong or of unknown meaning.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: not a file of a frame camera with its orientation ({', '.join(SUFFIXES)})")
+    return read(read_json(path, _MAX_BYTES), path)
+
+
+def is_frame(path: Path) -> bool:
+    """Whether a file states a frame camera; a file that cannot be read does not."""
+    if path.suffix.lower() not in SUFFIXES:
+        return False
+    try:
+        isd = read_json(path, _MAX_BYTES)
+    except InputError:
+        return False
+    return isinstance(isd, dict) and isd.get("name_model") == FRAME_MODEL
+
+
+def read(isd: Any, path: Path) -> StatedFrame:
+    """The frame camera of the contents of a file; see `read_frame`."""
+    name = isd.get("name_model") if isinstance(isd, dict) else None
+    if name != FRAME_MODEL:
+        advice = "; state the file as `line`" if isinstance(isd, dict) and "line_scan_rate" in isd else ""
+        raise InputError(f"{path}: support data of {name or 'no name_model'}, not of {FRAME_MODEL}{advice}")
+    source = Isd(isd, path)
+    try:
+        if source.has("jitter"):
+            raise InputError("its lines were exposed one after the other (jitter); such cameras are not known")
+        c, lens = _lens(source)
+        focal = source.focal_plane().focal
+        frame = FrameCamera(_interior(source, c), lens, _pose(source))
+        _refuse_away(frame, max(source.radii))
+        return StatedFrame(path, frame, source.radii, focal, source.distortion if lens != NoLens() else None)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def _interior(isd: Isd, c: float) -> Interior:
+    """From tangents to pixels, with a camera constant in millimetres."""
+    plane = isd.focal_plane()
+    summing = np.array([isd.summing("line"), isd.summing("sample")])
+    # Rows: line and sample. The middle of the first pixel is 0 here; y of tangents is up.
+    A = plane.to_detector * (1.0, -1.0) / summing[:, None]
+    line, sample = ((plane.axis - plane.first) / summing - 0.5).tolist()
+    (a4, a5), (a1, a2) = A.tolist()
+    return Interior(c, (0.0, 0.0), Affine2D(a1=a1, a2=a2, a3=sample, a4=a4, a5=a5, a6=line), (isd.samples, isd.lines))
+
+
+def _pose(isd: Isd) -> Pose:
+    """Projection centre and axes in those of the body, at the middle of the exposure."""
+    t = np.array([isd.numbers("center_ephemeris_time", ())])
+    for name in ("instrument_position", "instrument_pointing", "body_rotation"):
+        at = isd.moments(name)
+        # A single value holds always; a table only as far as it goes.
+        if len(at) > 1 and not at[0] <= t[0] <= at[-1]:
+            raise InputError(f"{name} is stated from {at[0]:.3f} to {at[-1]:.3f} s, the image is of {t[0]:.3f} s")
+    at = isd.moments("instrument_position")
+    positions, speeds = isd.positions()
+    inertial = positions if len(at) == 1 else cubic(at, positions, speeds, t)
+    body = isd.turns("body_rotation", t)
+    center = rotations(body)[0] @ inertial[0]
+    return Pose(center, rotations(times(body, conjugate(isd.turns("instrument_pointing", t))))[0] @ _TURNED)
+
+
+def _refuse_away(frame: FrameCamera, radius: float) -> None:
+    """Refuse a camera that would see its body if it looked the other way."""
+    columns, rows = (np.linspace(-0.5, side - 0.5, 9) for side in frame.size)
+    S, d = frame.rays(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2))
+    if not (to_sphere(S, d, radius) > 0).any() and (to_sphere(S, -d, radius) > 0).any():
+        raise InputError(
+            "the camera looks away from its body: positions and pointing are not in the same axes, or the focal plane "
+            "is meant to lie behind the lens, which is not known here"
+        )
+
+
+def _lens(isd: Isd) -> tuple[float, Lens]:
+    """The camera constant, millimetres, and the lens by its tangents."""
+    f, kind = isd.focal_plane().focal, isd.distortion
+    if kind is None:
+        return f, NoLens()
+    if kind not in _LENSES:
+        raise InputError(
+            f"the distortion {kind!r} is not known; {', '.join(_LENSES)} are. Where all its coefficients are 0, or are "
+            "not needed, take optical_distortion out of the file"
+        )
+    return _LENSES[kind](isd, f)
+
+
+def _radial(isd: Isd, f: float) -> tuple[float, Lens]:
+    k0, k1, k2 = _coefficients(isd, "radial.coefficients", 3)
+    if not k0 < 1.0:
+        raise InputError(f"radial distortion with a constant part of {k0:g}")
+    # The constant part changes the scale of the image, and nothing else.
+    c = f / (1.0 - k0)
+    lens = Brown.from_image_units(c, k=(-k1 / (1.0 - k0), -k2 / (1.0 - k0)))
+    return c, Reversed(lens) if k1 or k2 else NoLens()
+
+
+def _transverse(isd: Isd, f: float) -> tuple[float, Lens]:
+    x, y = (tuple(_coefficients(isd, f"transverse.{axis}", 10)) for axis in "xy")
+    return f, Cubic.from_y_down(f, x, y)
+
+
+def _dawn(isd: Isd, f: float) -> tuple[float, Lens]:
+    return f, Brown.from_image_units(f, k=tuple(_coefficients(isd, "dawnfc.coefficients", 1)))
+
+
+def _radtan(isd: Isd, f: float) -> tuple[float, Lens]:
+    k1, k2, p1, p2, k3 = _coefficients(isd, "radtan.coefficients", 5)
+    return f, OpenCV(k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
+
+
+#: Camera constant and lens of every distortion that is known.
+_LENSES: dict[str, Callable[[Isd, float], tuple[float, Lens]]] = {
+    "radial": _radial,
+    "transverse": _transverse,
+    "dawnfc": _dawn,
+    "radtan": _radtan,
+}
+
+
+def _coefficients(isd: Isd, name: str, count: int) -> list[float]:
+    """So many coefficients of a distortion; more or fewer have no certain meaning."""
+    found: _Floats = isd.numbers(f"optical_distortion.{name}", (-1,))
+    if len(found) != count:
+        raise InputError(f"optical_distortion.{name} has {len(found)} numbers, not {count}: which they are is not said")
+    return [float(v) for v in found]
