@@ -155,6 +155,7 @@ class TestOverItsBody:
         ("detector_center", {"line": None, "sample": None}, "detector_center.line is missing"),
         ("focal2pixel_lines", [0.0, 71.0, 0.0], "parallel"),
         ("focal_length_model", {"focal_length": "long"}, "not a table of numbers"),
+        ("focal_length_model", {"focal_length": 1e300}, "or such as cannot be"),
         ("optical_distortion", {"cahvor": {"coefficients": [0] * 5}}, "'cahvor' is not known; radial, transverse"),
         ("optical_distortion", {"lunarorbiter": {"perspective_x": 0}}, "'lunarorbiter' is not known"),
         ("optical_distortion", {"kaguyalism": {"x": [0] * 4}}, "'kaguyalism' is not known"),

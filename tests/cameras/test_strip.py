@@ -119,7 +119,7 @@ def test_detectors_are_chosen_by_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("record", "told"),
     [
-        (np.zeros((5, 7), complex), "complex128; real numbers are needed"),
+        (np.zeros((5, 7), complex), "complex128: real numbers are needed"),
         (np.zeros(5, [("a", "f8")]), "real numbers are needed"),
         (b"\x93NUMPY\x01\x00\x06\x00{'a(9\n", "flight.npy: cannot be read"),
         (np.zeros((5, 7))[:, :6], "needed are 7 numbers in each row"),

@@ -23,6 +23,8 @@ FORM = "CSM support data (ISD)"
 FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
 #: An image and its tables hold no more than this.
 _MAX_SIZE, _MAX_ROWS = 10_000_000, 2_000_000
+#: No number of an ISD, in whatever unit, is larger.
+_LARGEST = 1e30
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +65,8 @@ class Isd:
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"{self._path}: {name} is not a table of numbers") from None
         fits = values.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, values.shape))
-        if not fits or not np.isfinite(values).all() or values.shape[:1] > (_MAX_ROWS,):
-            raise InputError(f"{self._path}: {name} holds numbers of shape {values.shape}, or such that are not finite")
+        if not fits or not (np.abs(values) <= _LARGEST).all() or values.shape[:1] > (_MAX_ROWS,):
+            raise InputError(f"{self._path}: {name} holds numbers of shape {values.shape}, or such as cannot be")
         return values if shape else float(values)
 
     @property

@@ -53,5 +53,5 @@ def _from_npy(path: Path) -> NDArray[np.float64]:
         # Its header is a line of Python: a damaged one ends in whatever the parser raises.
         raise ValueError(f"no array in NPY form: {error}") from None
     if kind.kind not in "fiu":
-        raise ValueError(f"it holds {kind}; real numbers are needed")
+        raise ValueError(f"it holds {kind}: real numbers are needed")
     return np.asarray(table, float)
