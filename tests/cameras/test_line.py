@@ -223,7 +223,8 @@ class TestStrip:
     ("entry", "value", "told"),
     [
         ("image_lines", None, "image_lines is missing"),
-        ("image_lines", 1e300, "an image of"),
+        ("image_lines", 1e20, "an image of"),
+        ("image_lines", 1e300, "image_lines holds numbers"),
         ("line_scan_rate", [[0.5, -1.0, 0.0]], "times of the image's lines do not grow"),
         ("line_scan_rate", [[0.5, 900.0, 0.004]], "no line of the image is oriented"),
         ("optical_distortion", {"cahvor": {"coefficients": [0]}}, "the distortion 'cahvor' is not known"),
