@@ -58,6 +58,12 @@ def test_nothing_is_seen_upwards_or_beside_the_terrain() -> None:
     assert beside.bounds is None
 
 
+def test_the_usual_height_is_known_where_no_border_point_meets_the_surface() -> None:
+    seen = footprint(vertical(), GROUND, SEARCH)
+    assert seen.usual_height == 100.0
+    assert replace(seen, outline=np.full((8, 3), np.nan), height_range=(80.0, 90.0)).usual_height == 85.0
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
 def test_tiles_that_hold_a_pixel_are_kept(tilt: float) -> None:
     camera = Pinhole(Pose.from_angles((1000, 2000, 800), (tilt, 0.1, 0.7)), 2000, (1600, 1200))

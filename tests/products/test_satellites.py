@@ -9,7 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import shapely
+from rasterio.transform import RPCTransformer
 from rasterio.warp import Resampling, reproject
+from rasterio.warp import transform as warp
 from tools.command import Here
 from tools.rpc_files import as_text, tagged
 from tools.rpc_images import CRS, camera, functions
@@ -18,6 +21,7 @@ from photoplan.cameras.rpc import RationalFunctions, RpcCamera
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.camera.rpc.file import read_rpc
+from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.project.file import load_project
 from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
@@ -188,3 +192,37 @@ def test_cells_of_a_tile_stay_few() -> None:
     anchors = compile_anchors(seen, TileGround.of(MapTarget(grid), grid.window, relief), AnchorRule.of("bicubic", 0.02))
     assert anchors is not None
     assert len(anchors.box_heights) <= 8
+
+
+def test_a_roof_stands_where_it_is(project: Path, photoplan: Here) -> None:
+    """Its pixels are where GDAL projects its points, and the ground behind it is hidden."""
+    middle = plan_orthophotos(load_project(project), ["a"], resolution=100.0)["a"].grid.bounds
+    X, Y = np.round([(middle[0] + middle[2]) / 2, (middle[1] + middle[3]) / 2], -2)
+    roof = shapely.box(X - 1500, Y - 1000, X + 1500, Y + 1000)
+    shape = shapely.force_3d(roof, 750.0)
+    layer = VectorLayer("objects", "Polygon Z", [shape], {"name": np.array(["roof"], object)})
+    write_geopackage(project.parent / "roof.gpkg", [layer], CRS)
+    project.write_text(project.read_text() + '\n[[objects]]\nfile = "roof.gpkg"\nheight_system = "same"\n')
+    # So much ground that the polynomials end within the one tile.
+    words = ("--images", "a", "--bounds", X - 19000, Y - 19000, X + 19000, Y + 19000)
+    words += ("--resolution", 100, "--kernel", "nearest", "--tolerance", 0.001, "--no-quicklook", "-q")
+    made = []
+    for folder, way in (("true", ["--true", "--hidden", "nodata"]), ("bare", [])):
+        said = photoplan("ortho", project, "-o", project.parent / folder, *words, *way)
+        assert said.code == 0, said.err
+        with rasterio.open(project.parent / folder / "a_ortho.tif") as file:
+            made.append((file.read(1), file.read_masks(1) > 0))
+            affine, crs = file.transform, file.crs
+    (true, valid), (bare, _) = made
+    row, col = np.indices(true.shape)
+    x, y = affine @ (col + 0.5, row + 0.5)
+    inside = shapely.contains_xy(roof.buffer(-150), x, y)
+    lon, lat = warp(crs, "EPSG:4326", x[inside], y[inside])
+    with rasterio.open(project.parent.parent / "a.tif") as image, RPCTransformer(image.rpcs) as gdal:
+        rows, cols = gdal.rowcol(lon, lat, np.full(len(lon), 750.0), op=np.floor)
+        there = image.read(1)[np.asarray(rows, int), np.asarray(cols, int)]
+    assert valid[inside].all() and (true[inside] == there).mean() > 0.99
+    assert (bare[inside] == there).mean() < 0.5
+    outside = ~shapely.contains_xy(roof.buffer(60), x, y)
+    hidden = outside & ~valid & made[1][1]
+    assert hidden.sum() > 20 and (true == bare)[outside & valid].all()

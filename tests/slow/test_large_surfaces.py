@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from products.test_surface import judge
+import rasterio
+from products.test_surface import judge, places
 from tools.command import inside
-from tools.facet_scene import write_scene
-from tools.small_block import X0, Y0
+from tools.facet_scene import GROUND, GSD, write_scene
+from tools.small_block import CRS, X0, Y0
 
 from photoplan.geometry.grid import Window
 from photoplan.io.project.file import load_project
@@ -73,3 +74,44 @@ def test_seams_between_tiles(tmp_path: Path) -> None:
     seam = off[:, width // 2 - 4 : width // 2 + 4]
     print("sigma apart", np.median(off), np.percentile(off, 95), off.max(), "at the seam", np.median(seam), seam.max())
     assert np.median(seam) < 0.03 and seam.max() < 0.2 and np.percentile(off, 95) < 0.1
+
+
+@pytest.mark.parametrize("snr", [50, 10])
+def test_grey_values_are_closer_to_the_truth_than_any_orthophoto(tmp_path: Path, snr: float) -> None:
+    """Of one image each, over the heights that were found and over the true ones."""
+    scene = write_scene(tmp_path, 5, seed=3, base=60, size=(240, 220), snr=snr)
+    words = ("--no-quicklook", "-q")
+    said = inside("surface", scene.path, "--resolution", 1.5, "--bounds", *BOUNDS, *words)
+    assert said.code == 0, said.err
+    grey, X, Y = places(tmp_path / "products" / "surface_grey.tif")
+    with rasterio.open(tmp_path / "products" / "surface_grey.tif") as file:
+        bounds, transform = file.bounds, file.transform
+    profile = {"driver": "GTiff", "width": X.shape[1], "height": X.shape[0], "count": 1, "dtype": "float64"}
+    with rasterio.open(tmp_path / "true.tif", "w", **profile, crs=CRS, transform=transform) as file:
+        file.write(scene.heights(X, Y), 1)
+    around = [scene.grey(X + i, Y + j) for i in (-GSD / 4, GSD / 4) for j in (-GSD / 4, GSD / 4)]
+    true = np.mean(around, axis=0)
+    text = scene.path.read_text()
+    errors = {}
+    for name in ("products/surface.tif", "true.tif"):
+        edit = text.replace(f"height = {GROUND}", f'file = "{name}"')
+        assert edit != text
+        scene.path.write_text(edit)
+        folder = tmp_path / f"over_{Path(name).stem}"
+        said = inside("ortho", scene.path, "-o", folder, "--resolution", GSD, "--bounds", *bounds, *words)
+        assert said.code == 0, said.err
+        for path in sorted(folder.glob("*.tif")):
+            with rasterio.open(path) as file:
+                one, there = file.read(1).astype(float), file.read_masks(1) > 0
+            there &= np.isfinite(grey)
+            errors[f"{name} {path.stem}"] = [_rms(values[there], true[there]) for values in (grey, one)]
+            assert there.mean() > 0.9
+    for name, (of_all, of_one) in errors.items():
+        print(snr, name, f"{of_all:.3f} {of_one:.3f}")
+    assert len(errors) == 10 and all(of_all < of_one for of_all, of_one in errors.values())
+
+
+def _rms(values: np.ndarray, true: np.ndarray) -> float:
+    """Of what is left beside a line; images may differ by gain and offset."""
+    line = np.polyfit(true, values, 1)
+    return float(np.std(values - np.polyval(line, true)) / line[0])

@@ -56,6 +56,12 @@ class Footprint:
     height_range: tuple[float, float]
     """Bounds of the heights inside the bounds, metres; NaN, NaN without bounds."""
 
+    @property
+    def usual_height(self) -> float:
+        """Mean of the border's heights; where no border point meets the surface, the middle of the range."""
+        met = self.outline[np.isfinite(self.outline[:, 2]), 2]
+        return float(met.mean() if len(met) else np.mean(self.height_range))
+
 
 @dataclass(frozen=True, eq=False)
 class ImageExtent:

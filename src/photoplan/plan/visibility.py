@@ -32,8 +32,12 @@ _NODES = 5
 #: Posts along a side of what is looked at together, and around that to each side; longer lines are followed to the
 #: terrain itself.
 MOST_POSTS, MOST_AROUND = 768, 512
+#: Fewer nodes do not tell how lines change over a tile.
+_LEAST_NODES = 4
 #: Points from which derivatives of the projection are taken are so far apart, pixels.
 _STEP = 8.0
+#: The same where these are not in the image's range.
+_NARROW = 0.1
 #: A source is at a point only if that is less than this many pixels away; else its lines of sight are parallel.
 _FAR = 1e8
 #: No line is followed further than this, pixels.
@@ -78,18 +82,26 @@ def sight_lines(projection: Projection, target: Target, uvh: NDArray[np.float64]
     """
     projection = steady(projection)
     metre = np.linalg.norm(target.to_ground(uvh + np.array([1.0, 0, 0])) - target.to_ground(uvh), axis=-1)
-    size = np.stack(np.broadcast_arrays(1.0, 1.0, metre), axis=-1) * _STEP
-    offsets = np.eye(3)[:, None] * np.array([-1.0, 1.0])[:, None] * size[..., None, None, :]
-    ends = projection.project_homogeneous(target.to_ground(uvh[..., None, None, :] + offsets))
+    pixel = np.stack(np.broadcast_arrays(1.0, 1.0, metre), axis=-1)
+    offsets = np.eye(3)[:, None] * np.array([-1.0, 1.0])[:, None] * pixel[..., None, None, :]
+    slopes = np.full((*uvh.shape, 3), np.nan)
+    for apart in (_STEP, _NARROW):
+        # Where polynomials or a flight end, what lies close by is still known.
+        lost = ~np.isfinite(slopes).all(axis=(-1, -2))
+        if lost.any():
+            places = uvh[lost][:, None, None] + apart * offsets[lost]
+            ends = projection.project_homogeneous(target.to_ground(places))
+            slopes[lost] = (ends[..., 1, :] - ends[..., 0, :]) / (2 * apart * pixel[lost][..., None])
     # Gradients of X, Y and w by (u, v, h), which is the axis that held the offsets.
-    dX, dY, dw = np.moveaxis((ends[..., 1, :] - ends[..., 0, :]) / (2 * size[..., None]), -1, 0)
+    dX, dY, dw = np.moveaxis(slopes, -1, 0)
     X, Y, w = np.moveaxis(projection.project_homogeneous(target.to_ground(uvh)), -1, 0)
     step = w[..., None] * np.cross(dX, dY) + X[..., None] * np.cross(dY, dw) + Y[..., None] * np.cross(dw, dX)
-    step /= np.abs(step).max(initial=1e-300)
+    step /= np.nanmax(np.abs(step), initial=1e-300)
     nearing = -(dw * step).sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = np.abs(w / nearing) * np.linalg.norm(step * (_STEP / size), axis=-1)
-    parallel = not np.median(pixels) < _FAR
+        pixels = np.abs(w / nearing) * np.linalg.norm(step / pixel, axis=-1)
+    known = pixels[np.isfinite(pixels)]
+    parallel = not (len(known) and np.median(known) < _FAR)
     sign = np.where(step[..., 2] < 0 if parallel else nearing * w < 0, -1.0, 1.0)
     depth = np.stack([w, np.zeros_like(w) if parallel else sign * nearing], axis=-1)
     return SightLines(sign[..., None] * step, depth)
@@ -128,8 +140,8 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
         raise UsageError(f"visibility over {type(target).__name__}; it is known for maps")
     pad = 0.01 + 1e-6 * max(abs(low), abs(high))
     levels = low - pad, high + pad
-    lines = sight_lines(projection, target, _nodes(window, levels))
-    if not np.isfinite(lines.step).all() or not (lines.depth[..., 0] > 0).any():
+    lines = _lines_over(projection, target, window, levels)
+    if lines is None or not (lines.depth[..., 0] > 0).any():
         return none
     # Over a map every surface is terrain.
     whole: Any = surface
@@ -138,8 +150,9 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
     found = np.zeros(none.shape, np.uint8)
     for part in window.tiles(max(1, int(MOST_POSTS / terrain.lattice(target.grid, window).per_pixel))):
         at = part.slices(window)
-        toward = lines if part == window else sight_lines(projection, target, _nodes(part, levels))
-        found[at] = over.behind(part, np.ascontiguousarray(ground.relief[at]), toward)
+        toward = lines if part == window else _lines_over(projection, target, part, levels)
+        if toward is not None:
+            found[at] = over.behind(part, np.ascontiguousarray(ground.relief[at]), toward)
     if isinstance(surface, ObjectSurface):
         local, cells, origin = surface.faces.in_cells
         x, y = (target.grid.to_map((window.col, window.row)) - origin[:2]).tolist()
@@ -196,6 +209,27 @@ class _OverTerrain:
         hits = self.terrain.first_hit(paths)
         before = np.linalg.norm((hits.XYZ - paths[:, 1])[:, :2], axis=1) > short
         return np.asarray(np.isfinite(hits.along) & before)
+
+
+def _lines_over(
+    projection: Projection, target: Target, window: Window, levels: tuple[float, float]
+) -> SightLines | None:
+    """Lines of sight at the nodes of a tile; None: nothing of it is seen, or too little to tell.
+
+    Where polynomials or a flight end, in the middle of a tile, nodes beyond go on as linear functions of the others:
+    pixels beside them are seen along lines between the two.
+    """
+    nodes = _nodes(window, levels)
+    lines = sight_lines(projection, target, nodes)
+    values, known = lines.nodes, np.isfinite(lines.nodes).all(axis=-1)
+    if known.all():
+        return lines
+    if known.sum() < _LEAST_NODES:
+        return None
+    places = nodes - nodes[known].mean(axis=0)
+    places = np.concatenate([places / np.abs(places).max(axis=(0, 1, 2)), np.ones((*known.shape, 1))], axis=-1)
+    values[~known] = places[~known] @ np.linalg.lstsq(places[known], values[known])[0]
+    return SightLines(values[..., :3], values[..., 3:])
 
 
 def _nodes(window: Window, levels: tuple[float, float]) -> NDArray[np.float64]:

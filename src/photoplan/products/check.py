@@ -173,7 +173,7 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
             fault=fault,
             notes=notes,
         )
-    shaken = tremor_told(camera, float(np.nanmean(seen.outline[:, 2])))
+    shaken = tremor_told(camera, seen.usual_height)
     if shaken is not None:
         notes = (*notes, shaken)
         fault = fault or _torn(camera)

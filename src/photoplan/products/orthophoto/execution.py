@@ -333,5 +333,5 @@ def _image_record(name: str, scene: Scene, look: Look) -> dict[str, Any]:
         "gsd_m": look.gsd,
         "blur": look.blur,
         "restored": None if step is None else step.describe(),
-        "tremor": tremor_told(scene.camera, float(np.nanmean(look.footprint.outline[:, 2]))),
+        "tremor": tremor_told(scene.camera, look.footprint.usual_height),
     }
