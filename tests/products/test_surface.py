@@ -219,12 +219,15 @@ def test_the_median_of_tiles_is_counted_in_classes() -> None:
 def test_pixels_of_reduced_images_are_those_that_count() -> None:
     told = []
     for base in (0, 3):
-        plan: Any = SimpleNamespace(scheme=SimpleNamespace(base=base), settings=SimpleNamespace(name="surface"))
+        scheme = SimpleNamespace(base=base, search=None)
+        plan: Any = SimpleNamespace(scheme=scheme, settings=SimpleNamespace(name="surface"))
         told.append(findings(plan, {"a": 5.0}, 8.0, 2.0, 0.0, 0.5, 0.0))
     assert (
         len(told[0]) == 3 and "not settled; a coarser `resolution`" in told[0][1] and "hardly any texture" in told[0][2]
     )
     assert "not settled; a finer `resolution`" in findings(plan, {"a": 0.1}, 8.0, 0.05, 0.0, 5.0, 0.0)[0]
+    vague = [findings(plan, {"a": 1.0}, 80.0, 11.0, part, 0.01, 0.0) for part in (0.1, 0.4)]
+    assert ["hardly any texture" in "".join(lines) for lines in vague] == [True, False]
     assert len(told[1]) == 1 and "the relief is finer than" in told[1][0] and "finer than" not in told[0][0]
 
 

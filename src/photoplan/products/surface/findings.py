@@ -10,6 +10,8 @@ from photoplan.products.surface.plan import SurfacePlan
 #: contrast of the surface. Parts of the heights that fit badly, last corrections, and standard deviations, pixels of
 #: parallax, from which it is told; so many of them without a height.
 _ALONE, _NOISY, _MISFITS, _MOVING, _VAGUE, _ASTRAY = 1.6, 0.35, 0.02, 0.2, 1.0, 0.001
+#: Where this part of the heights fits badly, the median standard deviation tells that, and nothing of texture.
+_MOST_MISFIT = 0.25
 #: Standard deviations by which noise alone may still move heights in the last iteration.
 _NOISE_MOVES = 1.0
 
@@ -85,7 +87,7 @@ def findings(
             else "finer `resolution` helps, as relief is finer than"
         )
         lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; a {helps} them")
-    if sigma_px is not None and sigma_px > _VAGUE * pixel:
+    if sigma_px is not None and sigma_px > _VAGUE * pixel and misfit_share < _MOST_MISFIT:
         lines.append(
             f"the median standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "
             "images do not determine follows its surroundings; mask it by the standard deviations, or choose a coarser "
