@@ -6,11 +6,11 @@ from functools import lru_cache
 from pathlib import Path
 
 from photoplan.cameras.base import Camera
-from photoplan.errors import InputError
 from photoplan.io.camera.csm_frame import StatedFrame, read_frame
 from photoplan.io.project.frame import FrameImage
 from photoplan.io.project.model import Project
 from photoplan.project.ground import Ground, stamp_of
+from photoplan.project.image_size import check_size
 
 
 def frame_camera(project: Project, image: FrameImage, ground: Ground, size: tuple[int, int]) -> Camera:
@@ -26,11 +26,7 @@ def frame_camera(project: Project, image: FrameImage, ground: Ground, size: tupl
     file = project.resolve(image.frame)
     stated = _read(file, stamp_of(file))
     for given, where in ((stated.size, image.frame), (image.size, "the project")):
-        if given is not None and tuple(given) != size:
-            raise InputError(
-                f"{image.file}: {size[0]} × {size[1]} pixels, but {where} states {given[0]} × {given[1]}; its camera "
-                "fits an image of full size only"
-            )
+        check_size(image.file, size, given, f"{where} states", "its camera fits an image of full size only")
     return stated.camera(project.crs, ground.working_system)
 
 

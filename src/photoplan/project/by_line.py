@@ -16,6 +16,7 @@ from photoplan.io.camera.line.model import StatedLine
 from photoplan.io.project.line import LineImage
 from photoplan.io.project.model import Project
 from photoplan.project.ground import Ground, stamp_of
+from photoplan.project.image_size import check_size
 
 
 def line_camera(project: Project, image: LineImage, ground: Ground, size: tuple[int, int]) -> Camera:
@@ -32,11 +33,7 @@ def line_camera(project: Project, image: LineImage, ground: Ground, size: tuple[
     stamps = tuple(stamp_of(each) for each in image.geometry_files(project.resolve))
     stated = _read(file, stamps, image.detectors)
     for given, where in ((stated.size, image.line), (image.size, "the project")):
-        if given is not None and tuple(given) != size:
-            raise InputError(
-                f"{image.file}: {size[0]} × {size[1]} pixels, but {where} states {given[0]} × {given[1]}; a line "
-                "camera fits an image of full size only"
-            )
+        check_size(image.file, size, given, f"{where} states", "a line camera fits an image of full size only")
     camera = stated.camera(project.crs, ground.working_system)
     if image.correction is None:
         return camera

@@ -13,6 +13,7 @@ from photoplan.io.camera.rpc.file import read_rpc
 from photoplan.io.project.model import Project
 from photoplan.io.project.rpc import RpcImage
 from photoplan.project.ground import Ground, stamp_of
+from photoplan.project.image_size import check_size
 
 
 def rpc_camera(project: Project, image: RpcImage, ground: Ground, size: tuple[int, int]) -> RpcCamera:
@@ -25,11 +26,7 @@ def rpc_camera(project: Project, image: RpcImage, ground: Ground, size: tuple[in
     HeightSystemError
         The grid that leads from the ground's heights to the ellipsoid is missing.
     """
-    if image.size is not None and tuple(image.size) != size:
-        raise InputError(
-            f"{image.file}: {size[0]} × {size[1]} pixels, but {image.size[0]} × {image.size[1]} are stated; "
-            "polynomials fit an image of full size only"
-        )
+    check_size(image.file, size, image.size, "the project states", "polynomials fit an image of full size only")
     file = project.resolve(image.geometry_file or image.file)
     _refuse_tile(image, file)
     functions = _read(file, stamp_of(file))

@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike
 
 from photoplan.cameras.base import CentralCamera
 from photoplan.cameras.build import oriented_camera
-from photoplan.errors import InputError
 from photoplan.geometry.heights import height_step
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
@@ -18,6 +17,7 @@ from photoplan.io.project.model import Orientation, Project
 from photoplan.io.project.posed import Image
 from photoplan.orientation.plausibility import JudgedView
 from photoplan.project.ground import Ground
+from photoplan.project.image_size import check_camera_size
 
 
 def stated_pose(project: Project, image: Image) -> Pose:
@@ -45,12 +45,7 @@ def pose_of(project: Project, image: Image, ground: Ground) -> Pose:
 def posed_camera(project: Project, image: Image, ground: Ground, size: tuple[int, int]) -> CentralCamera:
     """Camera of an image by the project's numbers; `size` is that of its file, another one stated is an InputError."""
     description = project.cameras[image.camera]
-    stated = image.size or description.size
-    if stated is not None and tuple(stated) != size:
-        raise InputError(
-            f"{image.file}: {size[0]} × {size[1]} pixels, but camera {image.camera!r} has {stated[0]} × {stated[1]}; "
-            "an image that was cropped or scaled needs a camera of its own"
-        )
+    check_camera_size(project, image, size)
     interior = interior_of(description, image, size)
     pose = pose_of(project, image, ground)
     nadir = float(ground.bare.heights(pose.center[:2]))

@@ -204,17 +204,6 @@ def plan_surface(
         search = _search(looked, settings.resolution / gsd, usual, reach, coarsest)
         scheme = Scheme(ratio, 0, base, reach, search)
     used = tuple(one.name for one in looked)
-    files = [Path(path) for path, _ in ScenesAddress.of(project, used).digests]
-    if settings.start not in ("terrain",) and number(settings.start) is None:
-        files.append(Path(settings.start))
-    stated = {
-        "settings": replace(settings, points=()),
-        "scheme": scheme,
-        "grid": grid,
-        "frame": frame,
-        "facts": ScenesAddress.of(project, used).facts,
-    }
-    key = run_key("surface", stated, files)
     return SurfacePlan(
         project=project,
         settings=settings,
@@ -225,8 +214,18 @@ def plan_surface(
         scheme=scheme,
         gsd=gsd,
         height_error=height_error,
-        key=key,
+        key=_key(project, used, settings, scheme=scheme, grid=grid, frame=frame),
     )
+
+
+def _key(project: Project, images: tuple[str, ...], settings: SurfaceSettings, **stated: object) -> str:
+    """What all decides about heights: files, what the project says of the images, settings."""
+    address = ScenesAddress.of(project, images)
+    files = [Path(path) for path, _ in address.digests]
+    if settings.start != "terrain" and number(settings.start) is None:
+        files.append(Path(settings.start))
+    stated |= {"settings": replace(settings, points=()), "facts": address.facts}
+    return run_key("surface", stated, files)
 
 
 def _inside(frame: Frame, start: float, reach: float, stated: float | None) -> float:

@@ -41,6 +41,7 @@ from photoplan.matching.pairs import (
 from photoplan.matching.tracks import Tracks
 from photoplan.matching.verify import Calibration, PairMatches, VerifySettings, verify_pair
 from photoplan.project.ground import ground_of
+from photoplan.project.image_size import check_camera_size
 from photoplan.project.posed import pose_of
 
 #: Up to so many images all pairs are tried where nothing is known of their places.
@@ -128,12 +129,7 @@ def open_images(project_: Project, names: Sequence[str], use_orientation: bool) 
 
 def _calibration(project_: Project, image: Image, size: tuple[int, int]) -> Calibration | None:
     description = project_.cameras[image.camera]
-    stated = image.size or description.size
-    if stated is not None and tuple(stated) != size:
-        raise InputError(
-            f"{image.file}: {size[0]} × {size[1]} pixels, but camera {image.camera!r} has {stated[0]} × {stated[1]}; "
-            "an image that was cropped or scaled needs a camera of its own"
-        )
+    check_camera_size(project_, image, size)
     if not description.places(image.fiducials):
         return None
     return Calibration(interior_of(description, image, size), lens_of(description))
