@@ -18,7 +18,7 @@ from tools.command import Here, Said, inside, patience, sabotage, start, wait_fo
 from tools.effort import at_most
 from tools.facet_scene import write_scene
 from tools.line_strip import Strip
-from tools.small_block import X0, Y0, Block, write_image
+from tools.small_block import CRS, X0, Y0, Block, write_image
 
 BOUNDS = (X0 - 15, Y0 - 27, X0 + 15, Y0 + 27)
 
@@ -95,6 +95,27 @@ def test_a_start_that_is_farther_away_than_stated(project: Path) -> None:
     said = surface(project, "--start", 80, "--reach", 5, "--json")
     assert "larger one if the start is that wrong" in notes(said)
     assert json.loads(said.out)["valid_share"] < 0.8
+
+
+def test_a_start_above_the_images_is_refused_and_one_far_from_the_terrain_told(project: Path, tmp_path: Path) -> None:
+    """As a height and as a file: 100 m of ground, images at 300 m."""
+    for height, code in ((320, 2), (170, 0), (30, 0)):
+        file = tmp_path / f"{height}.tif"
+        with rasterio.open(
+            file, "w", driver="GTiff", width=4, height=4, count=1, dtype="float32", crs=CRS,
+            transform=rasterio.Affine(200.0, 0, X0 - 400, 0, -200.0, Y0 + 400),
+        ) as out:  # fmt: skip
+            out.write(np.full((1, 4, 4), height, np.float32))
+        for begun in (height, file):
+            said = surface(project, "--start", begun, "--dry-run")
+            assert said.code == code, said.err
+            if code:
+                assert f"start {begun}: 320 m is above the images, which look down from 300 m (i" in said.err
+            else:
+                side = "70 m above" if height == 170 else "70 m below"
+                assert f"(--start) lies {side} the project's terrain: farther than the reach of 20 m" in said.out
+    assert "cannot be right" not in surface(project, "--start", 110, "--dry-run").out
+    assert "cannot be right" not in surface(project, "--start", 170, "--reach", 80, "--dry-run").out
 
 
 def test_images_without_overlap_are_told(project: Path) -> None:

@@ -216,11 +216,16 @@ def test_the_median_of_tiles_is_counted_in_classes() -> None:
     assert median(counted(np.full((2, 2), np.nan))) is None
 
 
+def planned(base: int = 0, search: object = None, name: str = "surface", apart_text: str = "") -> Any:
+    """Of a plan what its findings look at."""
+    scheme = SimpleNamespace(base=base, search=search, reach=10.0)
+    return SimpleNamespace(scheme=scheme, settings=SimpleNamespace(name=name), height_error=0.1, apart_text=apart_text)
+
+
 def test_pixels_of_reduced_images_are_those_that_count() -> None:
     told = []
     for base in (0, 3):
-        scheme = SimpleNamespace(base=base, search=None)
-        plan: Any = SimpleNamespace(scheme=scheme, settings=SimpleNamespace(name="surface"))
+        plan = planned(base)
         told.append(findings(plan, {"a": 5.0}, 8.0, 2.0, 0.0, 0.5, 0.0))
     assert (
         len(told[0]) == 3 and "not settled; a coarser `resolution`" in told[0][1] and "hardly any texture" in told[0][2]
@@ -232,19 +237,26 @@ def test_pixels_of_reduced_images_are_those_that_count() -> None:
 
 
 def test_that_there_is_no_height_is_told() -> None:
-    plan: Any = SimpleNamespace(scheme=SimpleNamespace(base=0))
-    told = findings(plan, {"a": None, "b": None}, 0.0, None, 0.0, 0.0, 0.0)
+    told = findings(planned(), {"a": None, "b": None}, 0.0, None, 0.0, 0.0, 0.0)
     assert len(told) == 1 and told[0].startswith("there is no height: within `reach`")
 
 
 def test_heights_that_fit_badly_are_told_with_what_helps() -> None:
     told = []
     for search in (None, object()):
-        scheme = SimpleNamespace(base=0, search=search)
-        plan: Any = SimpleNamespace(scheme=scheme, settings=SimpleNamespace(name="s"))
-        told += findings(plan, {"a": 1.0}, 80.0, 0.1, 0.03, 0.01, 0.0)
+        told += findings(planned(search=search, name="s"), {"a": 1.0}, 80.0, 0.1, 0.03, 0.01, 0.0)
     assert all("3.0% of the heights fit badly: see s_fit.tif" in line and "s_sigma.tif" in line for line in told)
     assert len(told) == 2 and "`search`" in told[0] and "`search`" not in told[1] and "`target`" in told[1]
+
+
+def test_heights_that_know_hardly_more_than_the_reach_are_told() -> None:
+    """Standard deviations of 20 px where the reach is 100 px, or of 5 px; where few heights fit badly it is texture."""
+    told = [
+        "".join(findings(planned(), {"a": 1.0}, 80.0, s, m, 0.01, 0.0)) for s, m in ((20, 0.3), (5, 0.3), (20, 0.1))
+    ]
+    assert ["20% of the reach" in lines for lines in told] == [True, False, False]
+    assert ["hardly any texture" in lines for lines in told] == [False, False, True]
+    assert findings(planned(apart_text="it lies apart"), {"a": 1.0}, 80.0, 0.1, 0.0, 0.01, 0.0) == ("it lies apart",)
 
 
 def test_labels_of_a_report_keep_apart(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -255,3 +267,22 @@ def test_labels_of_a_report_keep_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     axes = drawn[0].axes[1]
     assert axes.get_xticks().tolist() == [0]
     assert {f"{tick:.0e}"[0] for tick in axes.get_yticks(minor=True)} == {"2", "5"}
+
+
+def test_a_report_draws_the_residuals_of_images_that_fit_worst(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Of fourteen images one sees nothing, and the one that fits best is not drawn, which is told."""
+    bands = np.ones((14, 4, 5), np.float32)
+    bands[3] = np.nan
+    path = tmp_path / "residuals.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=5, height=4, count=14, dtype="float32",
+        transform=rasterio.Affine(1, 0, 0, 0, -1, 4),
+    ) as file:  # fmt: skip
+        file.write(bands)
+    drawn: list[str] = []
+    monkeypatch.setattr(report, "_draw_residuals", lambda pictures, shape: drawn.extend(pictures) or b"")
+    names = tuple("abcdefghijklmn")
+    plan: Any = SimpleNamespace(images=names)
+    result: Any = SimpleNamespace(sigma0={**dict.fromkeys(names, 2.0), "d": 90.0, "k": 1.0})
+    (picture,) = report._residuals(plan, result, path)
+    assert drawn == [*"abcefghijlmn"] and "Those of 1 more images" in picture

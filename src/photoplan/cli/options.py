@@ -219,7 +219,7 @@ executing = several(
     executor_option,
     memory_option,
     overwrite_option,
-    click.option("--no-quicklook", is_flag=True, help="Do not write overview.png."),
+    click.option("--no-quicklook", is_flag=True, help="No picture of the product."),
     json_option,
     quiet_option,
 )

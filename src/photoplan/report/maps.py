@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.io.naming import write_atomically
 from photoplan.io.quicklook import read_reduced
+from photoplan.products.surface.job import MISFIT
 from photoplan.report.drawing import (
     BLUE,
     GREEN,
@@ -33,8 +34,8 @@ from photoplan.report.drawing import (
 
 #: Longest side of what is drawn, pixels; ellipses along it; length of the largest of them, part of their distance.
 _SIDE, _ELLIPSES, _LARGEST = 900, 16, 0.8
-#: Longest side where three pictures stand beside each other, pixels.
-_SIDE_OF_THREE = 700
+#: Longest side where four pictures stand together, pixels.
+_SIDE_OF_FOUR = 800
 #: Images of smaller regions get no name in the picture, part of the whole.
 _NAMED = 0.005
 
@@ -138,12 +139,12 @@ def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:
 
 
 def draw_surface(heights: Path, picture: Path, coordinates: tuple[str, str] = ("X", "Y")) -> Path:
-    """Draw the files of a surface as one PNG; replaces an older one.
+    """Draw heights, grey values, standard deviations and residuals of a surface as one PNG; replaces an older one.
 
     Parameters
     ----------
     heights : Path
-        NAME.tif; NAME_sigma.tif and NAME_grey.tif stand beside it.
+        NAME.tif; NAME_sigma.tif, NAME_grey.tif and NAME_fit.tif stand beside it.
     coordinates : tuple of str
         Names of what is along the axes.
 
@@ -155,30 +156,51 @@ def draw_surface(heights: Path, picture: Path, coordinates: tuple[str, str] = ("
         A raster cannot be read.
     """
     load_matplotlib("a picture of the surface", "say `no_quicklook`")
-    (z,), (left, bottom, right, top) = read_reduced(heights, max_side=_SIDE_OF_THREE)
-    (sigma,), _ = read_reduced(heights.with_name(f"{heights.stem}_sigma.tif"), max_side=_SIDE_OF_THREE)
-    (grey,), _ = read_reduced(heights.with_name(f"{heights.stem}_grey.tif"), max_side=_SIDE_OF_THREE)
+    (z,), (left, bottom, right, top) = read_reduced(heights, max_side=_SIDE_OF_FOUR)
+    grey, sigma, fit = (
+        read_reduced(heights.with_name(f"{heights.stem}_{kind}.tif"), max_side=_SIDE_OF_FOUR)[0][0]
+        for kind in ("grey", "sigma", "fit")
+    )
     extent = left, right, bottom, top
     with mpl.rc_context(STYLE):
-        fig = figure_of(13.0, float(np.clip(4.0 * (top - bottom) / (right - left) + 1.0, 2.8, 9.0)))
-        axes = fig.subplots(1, 3, sharex=True, sharey=True)
-        shown = axes[0].imshow(z, cmap="terrain", extent=extent, interpolation="nearest")
-        fig.colorbar(shown, ax=axes[0], shrink=0.8, label="m")
+        fig = figure_of(12.0, float(np.clip(8.6 * (top - bottom) / (right - left) + 1.5, 5.0, 18.0)))
+        axes = fig.subplots(2, 2, sharex=True, sharey=True).ravel()
+        # A few heights that went wrong would take all colours from the rest.
+        low, high = _most(z, 0.5)
+        z_shown = axes[0].imshow(z, cmap="terrain", vmin=low, vmax=high, extent=extent, interpolation="nearest")
         step = (right - left) / z.shape[1]
         dy, dx = np.gradient(z, step) if min(z.shape) > 1 else (np.zeros_like(z), np.zeros_like(z))
         light = (dx - dy) / np.sqrt(2 * (1 + dx**2 + dy**2))
         scale = max(float(np.nanpercentile(np.abs(light), 95)) if np.isfinite(light).any() else 1.0, 1e-6)
         axes[0].imshow(light, cmap="gray", extent=extent, alpha=0.35, vmin=-scale, vmax=scale, interpolation="nearest")
-        low, high = np.nanpercentile(grey, (1, 99)) if np.isfinite(grey).any() else (0.0, 1.0)
+        low, high = _most(grey, 1.0)
         axes[1].imshow(grey, cmap="gray", extent=extent, vmin=low, vmax=high, interpolation="nearest")
-        low, high = np.nanpercentile(sigma, (1, 99)) if np.isfinite(sigma).any() else (0.0, 1.0)
-        shown = axes[2].imshow(
-            sigma, cmap="cividis", extent=extent, vmin=low, vmax=max(high, low + 1e-9), interpolation="nearest"
+        # Standard deviations where texture or fit fail are a hundred times those of the rest.
+        low, high = _most(np.where(sigma > 0, sigma, np.nan), 1.0)
+        spread = mpl.colors.LogNorm(low, max(high, 1.01 * low))
+        sigma_shown = axes[2].imshow(sigma, cmap="cividis", norm=spread, extent=extent, interpolation="nearest")
+        fit_shown = axes[3].imshow(
+            fit, cmap="viridis", vmin=0.5, vmax=MISFIT + 0.5, extent=extent, interpolation="nearest"
         )
-        fig.colorbar(shown, ax=axes[2], shrink=0.8, extend="both", label="m")
-        for ax, title in zip(axes, ("heights", "grey values", "standard deviation of the heights")):
+        for ax, shown in zip(axes, (z_shown, None, sigma_shown, fit_shown)):
+            if shown is not None:
+                bar = fig.colorbar(shown, ax=ax, shrink=0.8, extend="both", label="" if ax is axes[3] else "m")
+                if ax is axes[2]:
+                    bar.ax.yaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1, 2, 5)))
+                    bar.ax.yaxis.set_major_formatter("{x:g}")
+                    bar.ax.yaxis.set_minor_locator(mpl.ticker.NullLocator())
+        titles = "heights", "grey values", "standard deviation of the heights", "residuals around them, 1 is expected"
+        for ax, title in zip(axes, titles):
             ax.grid(visible=False)
-            _on_map(ax, title, f"{coordinates[0]} [m]", ylabel=None)
-        axes[0].set_ylabel(f"{coordinates[1]} [m]")
+            _on_map(ax, title, f"{coordinates[0]} [m]" if ax in axes[2:] else "", ylabel=None)
+        for ax in axes[::2]:
+            ax.set_ylabel(f"{coordinates[1]} [m]")
         write_atomically(picture, png(fig))
     return picture
+
+
+def _most(values: NDArray[np.float64], percent: float) -> tuple[float, float]:
+    """Between what values lie but so many percent on either side; 1 and 2 where there are none."""
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, (percent, 100 - percent)) if known.size else (1.0, 2.0)
+    return float(low), float(max(high, low + 1e-9))

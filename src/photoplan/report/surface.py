@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from photoplan.products.surface.job import MISFIT
 from photoplan.products.surface.plan import SurfacePlan
 from photoplan.products.surface.run import SurfaceResult, outputs
 from photoplan.report.drawing import BLUE, INK, ORANGE, SOFT, figure_of, mpl, png, styled
-from photoplan.report.page import cells, figure, headline, number, page, section, table
+from photoplan.report.page import cells, figure, headline, number, page, section, table, text
 
 _Doubles = NDArray[np.float64]
 
@@ -36,6 +38,7 @@ def surface_page(plan: SurfacePlan, result: SurfaceResult) -> str:
             else ("–", "standard deviation", ""),
             (f"{len(plan.images)}", "images", f"{result.redundancy:.3g} observations beyond those that are needed"),
         ]),
+        *(f"<p><b>Mind:</b> {text(note)}.</p>" for note in result.notes),
         section("Standard deviations by class", [
             figure(_draw_classes(sigma, count, texture), "Standard deviations of the heights",
                    "Left by the number of images, right by texture: quarters of the ground by the spread of its grey "
@@ -47,9 +50,7 @@ def surface_page(plan: SurfacePlan, result: SurfaceResult) -> str:
                    "Root mean square of the standardised residuals around each height; 1 is expected. Where it is over "
                    f"{MISFIT:g}, the height may be wrong: an edge that is rounded, something that moved, or a region "
                    "that went wrong."),
-            *([figure(_draw_residuals(plan, paths["residuals"]), "Residuals of the images",
-                      "The surface's grey value less the image's, in standard deviations.")]
-              if "residuals" in paths else []),
+            *(_residuals(plan, result, paths["residuals"]) if "residuals" in paths else []),
         ]),
         section("Images and levels", [
             figure(_draw_adjustment(result), "Noise of the images, and how the heights settled",
@@ -121,22 +122,34 @@ def _draw_fit(fit: _Doubles, extent: tuple[float, float, float, float], coordina
     return png(fig)
 
 
-@styled
-def _draw_residuals(plan: SurfacePlan, path: Any) -> bytes:
+def _residuals(plan: SurfacePlan, result: SurfaceResult, path: Path) -> list[str]:
+    """The pictures of residuals, if there are any: of images that see something, of many those of largest sigma0."""
     bands, (left, bottom, right, top) = read_reduced(path, max_side=_SIDE // 3)
-    shown = min(len(bands), _PICTURES)
-    columns = min(3, shown)
-    rows = -(-shown // columns)
-    tall = float(np.clip(8.4 / columns * (top - bottom) / (right - left), 1.2, 5.0))
+    seen = {name: band for name, band in zip(plan.images, bands) if np.isfinite(band).any()}
+    worst = sorted(seen, key=lambda name: -(result.sigma0[name] or 0.0))[:_PICTURES]
+    drawn = {name: band for name, band in seen.items() if name in worst}
+    more = len(seen) - len(drawn)
+    rest = f" Those of {more} more images, of smaller sigma0, are in the file." if more else ""
+    caption = "The surface's grey value less the image's, in standard deviations." + rest
+    shape = (top - bottom) / (right - left)
+    return [figure(_draw_residuals(drawn, shape), "Residuals of the images", caption)] if drawn else []
+
+
+@styled
+def _draw_residuals(drawn: Mapping[str, _Doubles], shape: float) -> bytes:
+    """Residuals by image; `shape` is their height through their width."""
+    columns = min(3, len(drawn))
+    rows = -(-len(drawn) // columns)
+    tall = float(np.clip(8.4 / columns * shape, 1.2, 5.0))
     fig = figure_of(9.0, rows * (tall + 0.3))
     axes = fig.subplots(rows, columns, squeeze=False).reshape(-1)
-    for ax, band, name in zip(axes, bands, plan.images):
+    for ax, (name, band) in zip(axes, drawn.items()):
         picture = ax.imshow(band, cmap="RdBu_r", vmin=-3, vmax=3, interpolation="nearest")
         ax.set_title(name if len(name) < 28 else "…" + name[-26:], fontsize=8)
     for ax in axes:
         ax.grid(visible=False)
         ax.set(xticks=[], yticks=[])
-    for ax in axes[shown:]:
+    for ax in axes[len(drawn) :]:
         ax.set_visible(False)
     fig.colorbar(picture, ax=list(axes), shrink=0.7, extend="both", label="standard deviations")
     return png(fig)

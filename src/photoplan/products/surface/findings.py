@@ -12,6 +12,8 @@ from photoplan.products.surface.plan import SurfacePlan
 _ALONE, _NOISY, _MISFITS, _MOVING, _VAGUE, _ASTRAY = 1.6, 0.35, 0.02, 0.2, 1.0, 0.001
 #: Where this part of the heights fits badly, the median standard deviation tells that, and nothing of texture.
 _MOST_MISFIT = 0.25
+#: Unless it is this part of the reach and more: then nothing was found there.
+_LOST = 0.1
 #: Standard deviations by which noise alone may still move heights in the last iteration.
 _NOISE_MOVES = 1.0
 
@@ -38,7 +40,7 @@ def findings(
         Of the heights: see `SurfaceResult`; the last correction of the finest level; the part of the posts that has
         none since it went too far from the start.
     """
-    lines = []
+    lines = [plan.apart_text] if plan.apart_text else []
     known = {name: value for name, value in sigma0.items() if value is not None}
     others = {
         name: float(np.median([v for other, v in known.items() if other != name])) for name in known if len(known) > 2
@@ -87,10 +89,18 @@ def findings(
             else "finer `resolution` helps, as relief is finer than"
         )
         lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; a {helps} them")
-    if sigma_px is not None and sigma_px > _VAGUE * pixel and misfit_share < _MOST_MISFIT:
+    vague = sigma_px is not None and sigma_px > _VAGUE * pixel
+    part = 0.0 if sigma_px is None else sigma_px * plan.height_error / plan.scheme.reach
+    if vague and misfit_share < _MOST_MISFIT:
         lines.append(
             f"the median standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "
             "images do not determine follows its surroundings; mask it by the standard deviations, or choose a coarser "
             "`resolution`"
+        )
+    elif vague and part > _LOST:
+        lines.append(
+            f"the median standard deviation is {sigma_px:.2g} px of parallax, {part:.0%} of the reach, and many "
+            "heights fit badly: images agree on no height there. The start is farther away (`start`, `reach`), or "
+            "orientations are wrong (`photoplan tie`, `photoplan adjust`)"
         )
     return tuple(lines)

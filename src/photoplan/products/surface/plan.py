@@ -21,6 +21,7 @@ from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.matching.facets.search import Planes, Search
 from photoplan.plain import pick
 from photoplan.products.orthophoto.look import extent_text
+from photoplan.products.surface.begin import start_apart
 from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start, number
 from photoplan.products.surface.target import SeenTarget, frame_of, over_frame, over_map
 from photoplan.project.scenes import ScenesAddress
@@ -71,6 +72,8 @@ class SurfacePlan:
     """Median ground sampling distance of the images, metres."""
     height_error: float
     """What one pixel of parallax between the outermost images is in height, metres."""
+    apart: float
+    """By how much a start that is not the project's terrain lies above that (below: negative), metres; 0: they meet."""
     key: str
     """Hash of all that decides the product."""
 
@@ -101,8 +104,20 @@ class SurfacePlan:
             f"{self.height_error:.3g} m of height",
             f"  {s.coarsest + 1} level{'s' * (s.coarsest > 0)}, the coarsest with heights of "
             f"{g.resolution * 2**s.coarsest:g} m; start: {self.settings.start}{self._searched}",
+            *([f"  {self.apart_text}"] if self.apart_text else []),
             *([] if self.frame is None else [f"  target {self.settings.target}{far}: u, v, h instead of X, Y, Z"]),
         ])  # fmt: skip
+
+    @property
+    def apart_text(self) -> str:
+        """What there is to say of a start that lies farther from the project's terrain than its reach; else empty."""
+        if abs(self.apart) <= self.scheme.reach:
+            return ""
+        side = "above" if self.apart > 0 else "below"
+        return (
+            f"the start (`start`) lies {abs(self.apart):.4g} m {side} the project's terrain: farther than the reach of "
+            f"{self.scheme.reach:.3g} m (`reach`), so one of them cannot be right"
+        )
 
     @property
     def _searched(self) -> str:
@@ -192,6 +207,7 @@ def plan_surface(
             f"{flying:.3g} m"
         )
     reach = settings.reach or _WRONG * flying or _SOME * height_error
+    apart = 0.0 if frame is not None else start_apart(settings.start, grid.bounds, project.crs, looked)
     if frame is not None:
         reach = _inside(frame, float(settings.start), reach, settings.reach)
     coarsest = _coarsest(reach, looked, height_error, base)
@@ -214,6 +230,7 @@ def plan_surface(
         scheme=scheme,
         gsd=gsd,
         height_error=height_error,
+        apart=apart,
         key=_key(project, used, settings, scheme=scheme, grid=grid, frame=frame),
     )
 
