@@ -44,8 +44,8 @@ def test_the_source_s_strip_is_its_own_inverse(tmp_path: Path) -> None:
         told = ", ".join(f"{nearest[pace > least].max():.1e} px at {least:g}" for least in (1.0, 0.5, 0.1))
         print(f"\n{height:g} m: worst {told} of the pace or more; {nearest.max():.1e} px where the view stands still")
         print("points seen once, twice, …:", seen[1:])
-        # Coordinates in the axes of the earth are rounded to 1e-9 m, which is 3e-9 px.
-        assert nearest[pace > 0.5].max() < 2e-8 and nearest[pace > 0.1].max() < 1e-6
+        # Northings are rounded to 5e-10 m, which is 1.3e-9 px; where the view is slow, a row's rounding is columns.
+        assert nearest[pace > 0.5].max() < 1e-8 and nearest[pace > 0.1].max() < 1e-6
         assert seen[2::2].sum() <= 3 and seen[3::2].sum() > 100 and seen[1] > 200
         once = (count == 1) & (pace > 0.1)
         assert np.abs(project(camera, ground[once]) - xy[once]).max() < 1e-6

@@ -17,6 +17,8 @@ _Floats = NDArray[np.float64]
 _EARTH, _ELSEWHERE, _PART = (-500.0, 9_000.0), (-10_000.0, 25_000.0), 0.1
 #: Half the distance over which the change of a ray on the map is taken, metres.
 _REACH = 50.0
+#: Heights are met when they were missed by less than this before the last step, metres.
+_CLOSE = 1e-7
 
 
 def heights_of(ground: BodyGround) -> tuple[float, float]:
@@ -49,7 +51,8 @@ def meet(ground: BodyGround, S: _Floats, d: _Floats, heights: _Floats) -> tuple[
             point = ground.to_map(S + r[:, None] * d)
             miss = point[:, 2] - heights
             r = r - miss / cos
-            if not (np.abs(miss) > 1e-9).any():
+            # The step that was taken gains three digits and more.
+            if not (np.abs(miss) > _CLOSE).any():
                 break
         at = S + r[:, None] * d
         point = ground.to_map(at)

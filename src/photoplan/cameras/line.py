@@ -16,6 +16,7 @@ from photoplan.cameras.line_track import LineTrack
 from photoplan.cameras.line_tremor import LineTremor, Moments, smoothed
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.body import BodyGround
+from photoplan.geometry.near import NearGround, near_ground
 
 _Floats = NDArray[np.float64]
 #: Rows beyond either end of the image that still have positions: a part of its height, and lines.
@@ -63,9 +64,15 @@ class LineCamera:
         return smoothed(self)
 
     @cached_property
+    def near(self) -> NearGround:
+        """The ground that it sees."""
+        _, S, d, r = self._spread
+        return near_ground(self.ground, self.ground.to_map(S + r[:, None] * d)[:, :2])
+
+    @cached_property
     def sight(self) -> LineSight:
-        """What it sees in the axes of the body."""
-        return LineSight(self.track, self.look)
+        """What it sees in the axes of the body, from the origin of `near`."""
+        return LineSight(self.track, self.look, self.near.origin)
 
     def moments(self, XYZ: ArrayLike) -> Moments:
         """All moments at which ground points (n, 3) are seen: where turbulence is strong, more than one.
@@ -74,7 +81,7 @@ class LineCamera:
         row: what turns back within a row does not count there. Moments outside the image and at lines without
         orientation are not among them.
         """
-        P = self.ground(np.asarray(XYZ, float).reshape(-1, 3))
+        P = self.near(np.asarray(XYZ, float).reshape(-1, 3))
         if self.breaks is None:
             xy = self.seen_from(P)
             point = np.flatnonzero(np.isfinite(xy[:, 0]))
@@ -92,11 +99,11 @@ class LineCamera:
         Across it is parallel; where a line looks further ahead than to the sides, w is 1.
         """
         XYZ = np.asarray(XYZ, float)
-        P = self.ground(XYZ).reshape(-1, 3)
+        P = self.near(XYZ.reshape(-1, 3))
         xy = self.seen_from(P)
         out = np.full((len(P), 3), np.nan)
         seen = np.flatnonzero(np.isfinite(xy[:, 0]))
-        S, R = self.track(xy[seen, 1])
+        S, R = self.track(xy[seen, 1], self.near.origin)
         w = np.einsum("ni,ni->n", R[:, :, 2], P[seen] - S) if self.look.is_wide else np.ones(len(seen))
         out[seen] = np.column_stack([xy[seen] * w[:, None], w])
         return out.reshape(XYZ.shape)
@@ -105,10 +112,10 @@ class LineCamera:
         """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN where there is no position."""
         XYZ = np.asarray(XYZ, float)
         flat = XYZ.reshape(-1, 3)
-        P = self.ground(flat)
+        P = self.near(flat)
         x, y = self.seen_from(P).T
         with np.errstate(all="ignore"):
-            S, R = self.track(y)
+            S, R = self.track(y, self.near.origin)
             d = np.einsum("nij,ni->nj", R, P - S)
             tangents = d[:, :2] / d[:, 2:]
             by_ground = (R[:, :, :2] - R[:, :, 2:] * tangents[:, None, :]) / d[:, 2, None, None]
@@ -136,14 +143,20 @@ class LineCamera:
             raise UsageError("rays of a line camera begin at no common point; give a height")
         xy = np.asarray(xy, float)
         flat = xy.reshape(-1, 2)
-        S, d = self.body_rays(flat)
-        point, tangent = meet(self.ground, S, d, np.broadcast_to(np.asarray(height, float), xy.shape[:-1]).ravel())
+        S, d = self._known_rays(self.sight, flat)
+        heights = np.broadcast_to(np.asarray(height, float), xy.shape[:-1]).ravel()
+        point, tangent = meet(self.ground, S + self.near.origin, d, heights)
+        point = self.near.sharpened(point, S, d)
         return point.reshape(*xy.shape[:-1], 3), tangent.reshape(*xy.shape[:-1], 3)
 
     def body_rays(self, xy: _Floats) -> tuple[_Floats, _Floats]:
         """Projection centres and unit directions of image points (n, 2) in the axes of the body, each (n, 3)."""
+        return self._known_rays(LineSight(self.track, self.look), xy)
+
+    def _known_rays(self, sight: LineSight, xy: _Floats) -> tuple[_Floats, _Floats]:
+        """Rays of what it sees, NaN at rows whose orientation is not known."""
         unknown = ~np.isfinite(xy).all(axis=1) | self.unoriented(xy[:, 1])
-        S, d = self.sight.rays(np.nan_to_num(xy))
+        S, d = sight.rays(np.nan_to_num(xy))
         S[unknown], d[unknown] = np.nan, np.nan
         return S, d
 
@@ -162,7 +175,7 @@ class LineCamera:
         return np.asarray(inside & ~self.track.is_oriented(y))
 
     def seen_from(self, P: _Floats, close: float = FOUND) -> _Floats:
-        """Positions (n, 2) of points (n, 3) in the axes of the body; on smooth flights to `close` lines."""
+        """Positions (n, 2) of points (n, 3) from the origin of `near`; on smooth flights to `close` lines."""
         room = self._room
         tremor = self.breaks
         if tremor is None:
@@ -188,6 +201,15 @@ class LineCamera:
     @cached_property
     def _linear(self) -> tuple[_Floats, float, _Floats]:
         """Rows as a linear function of the place, over the points of rays down to the ground and a tenth above it."""
+        y, S, d, r = self._spread
+        places = np.concatenate([S + part * r[:, None] * d for part in (0.9, 1.0)]) - self.near.origin
+        origin, scale = places.mean(axis=0), float(np.ptp(places, axis=0).max())
+        A = np.column_stack([np.ones(len(places)), (places - origin) / scale])
+        return origin, scale, np.linalg.lstsq(A, np.tile(y, 2), rcond=1e-9)[0]
+
+    @cached_property
+    def _spread(self) -> tuple[_Floats, _Floats, _Floats, _Floats]:
+        """Rows (n,) spread over the image, with their rays in the axes of the body and the way (n,) to the ground."""
         first, last = self.track.oriented
         rows, columns = np.linspace(first, last, 9), np.linspace(0, self.size[0] - 1, 5)
         xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -196,7 +218,4 @@ class LineCamera:
         good = np.isfinite(r)
         if not good.any():
             raise InputError("the camera does not look at the body; are positions and attitudes in the same axes?")
-        places = np.concatenate([S[good] + part * r[good, None] * d[good] for part in (0.9, 1.0)])
-        origin, scale = places.mean(axis=0), float(np.ptp(places, axis=0).max())
-        A = np.column_stack([np.ones(len(places)), (places - origin) / scale])
-        return origin, scale, np.linalg.lstsq(A, np.tile(xy[good, 1], 2), rcond=1e-9)[0]
+        return xy[good, 1], S[good], d[good], r[good]

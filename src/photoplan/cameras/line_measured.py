@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.line import LineCamera
 from photoplan.cameras.line_chips import ChippedLine
+from photoplan.cameras.line_sight import LineSight
 
 _Floats = NDArray[np.float64]
 
@@ -44,14 +45,15 @@ def measured(camera: LineCamera | ChippedLine, steady: LineCamera | ChippedLine,
 
 
 def _of_line(camera: LineCamera, steady: LineCamera, XYZ: _Floats, xy: _Floats) -> LineMiss:
-    P, (x, y) = camera.ground(XYZ), xy.T
-    S, R = camera.track(y)
+    P, (x, y) = camera.near(XYZ), xy.T
+    S, R = camera.track(y, camera.near.origin)
     with np.errstate(all="ignore"):
         d = np.einsum("nij,ni->nj", R, P - S)
         d[~(d[:, 2] > 0) | camera.unoriented(y)] = np.nan
         tangents = d[:, :2] / d[:, 2:]
         by_place = (R[:, :, :2] - R[:, :, 2:] * tangents[:, None, :]) / d[:, 2, None, None]
-        later, earlier = steady.sight.tangents(P, y + 0.5), steady.sight.tangents(P, y - 0.5)
+        calm = LineSight(steady.track, steady.look, camera.near.origin)
+        later, earlier = calm.tangents(P, y + 0.5), calm.tangents(P, y - 0.5)
         J = np.stack([camera.look.slope(x), earlier - later], axis=-1)
         good = np.asarray(np.isfinite(J).all(axis=(1, 2)))
         A = np.linalg.solve(

@@ -26,16 +26,18 @@ class LineSight:
 
     track: LineTrack
     look: LineLook
+    origin: _Floats | float = 0.0
+    """Place in the axes of the body, (3,), from which all places are counted here."""
 
     def rays(self, xy: _Floats) -> tuple[_Floats, _Floats]:
         """Projection centres and unit directions of image points (n, 2), each (n, 3)."""
-        S, R = self.track(xy[:, 1])
+        S, R = self.track(xy[:, 1], self.origin)
         d = np.concatenate([self.look.tangents(xy[:, 0]), np.ones((len(xy), 1))], axis=1)
         return S, np.einsum("nij,nj->ni", R, d / np.linalg.norm(d, axis=1, keepdims=True))
 
     def tangents(self, P: _Floats, y: _Floats) -> _Floats:
         """Tangents (n, 2) of points, from where the camera was at rows (n,); NaN behind it."""
-        S, R = self.track(y)
+        S, R = self.track(y, self.origin)
         d = np.einsum("nij,ni->nj", R, P - S)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.where(d[:, 2:] > 0, d[:, :2] / d[:, 2:], np.nan))

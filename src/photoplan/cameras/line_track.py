@@ -93,12 +93,17 @@ class LineTrack:
             inside &= (t <= begin + slack) | (t >= end - slack)
         return np.asarray(inside)
 
-    def __call__(self, line: _Floats) -> tuple[_Floats, _Floats]:
+    def __call__(self, line: _Floats, origin: _Floats | float = 0.0) -> tuple[_Floats, _Floats]:
         """Positions (n, 3) and rotations (n, 3, 3) of rows (n,), whole numbers at the middle of a line's exposure.
 
-        Beyond what is known the camera flies on as it flew at the end: what lies just outside the image has positions.
+        Positions are counted from `origin`, (3,). Beyond what is known the camera flies on as it flew at the end: what
+        lies just outside the image has positions.
         """
-        S, q = self._between(line) if self.per_line else self._flown(line)
+        if self.per_line:
+            S, q = self._between(line, origin)
+        else:
+            S, q = self._flown(line)
+            S = S - origin
         return S, rotations(q)
 
     @cached_property
@@ -125,15 +130,16 @@ class LineTrack:
             raise InputError("positions and attitudes are known at fewer than two lines of the image")
         return int(first), int(last)
 
-    def _between(self, line: _Floats) -> tuple[_Floats, _Floats]:
-        """Positions (n, 3) and quaternions (n, 4) between the lines."""
+    def _between(self, line: _Floats, origin: _Floats | float) -> tuple[_Floats, _Floats]:
+        """Positions (n, 3) from an origin, and quaternions (n, 4), between the lines."""
         first, poses = self.poses
         at = np.clip(np.asarray(line, float) - first, 1.0, len(poses) - 2.0)
         row = np.minimum(np.floor(at), len(poses) - 3.0)
         weights = cubic_convolution(at - row)
         row = np.nan_to_num(row, nan=1.0).astype(np.int64)
         values = poses[row]
-        # Against the row itself: positions are large, and sums of them are rounded.
+        # Against the row itself, and that from the origin: positions are large, and sums of them are rounded.
+        values[:, :3] -= origin
         for k in (-1, 1, 2):
             values = values + weights[:, k + 1, None] * (poses[row + k] - poses[row])
         return values[:, :3], values[:, 3:]

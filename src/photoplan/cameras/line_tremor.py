@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from photoplan.cameras.line_sight import LineSight, to_sphere
 from photoplan.cameras.line_straight import StraightFlight
 from photoplan.cameras.line_track import LineTrack
-from photoplan.geometry.body import BodyGround
 from photoplan.geometry.motion import Course, rotations
 
 if TYPE_CHECKING:
@@ -64,7 +63,7 @@ class LineTremor:
 
     def part(self, XYZ: _Floats) -> StraightPart | None:
         """See `Tremor`."""
-        seen = self.smooth.seen_from(self.smooth.ground(XYZ).reshape(-1, 3), _ROUGHLY)[:, 1]
+        seen = self.smooth.seen_from(self.smooth.near(XYZ.reshape(-1, 3)), _ROUGHLY)[:, 1]
         seen = seen[np.isfinite(seen)]
         if not len(seen):
             return None
@@ -88,11 +87,11 @@ class LineTremor:
         return int(np.floor(first)), int(np.ceil(np.minimum(begin + _BLOCK, high + far)[some].max()))
 
     def passages(self, P: _Floats) -> tuple[_Rows, _Floats, NDArray[np.bool_]]:
-        """Where points (n, 3), in the axes of the body, pass through the line; see `LineSight.crossings`.
+        """Where points (n, 3), from the origin of `rough.near`, pass through the line; see `LineSight.crossings`.
 
         From the first point to the last, and of each from the first row to the last.
         """
-        near = self.smooth.seen_from(P)[:, 1]
+        near = self.smooth.seen_from(P + (self.rough.near.origin - self.smooth.near.origin))[:, 1]
         block = np.clip(np.nan_to_num(near) // _BLOCK + 1, 0, len(self.largest) - 1).astype(np.int64)
         reach = np.where(np.isfinite(near), self._local[block], -1)
         parts = [(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, bool))]
@@ -207,7 +206,7 @@ def smoothed(camera: LineCamera) -> LineTremor | None:
     knots = _KNOTS
     while True:
         smooth = replace(camera, track=_smooth_track(camera.track, knots))
-        largest, even = _largest(camera.sight, smooth.sight, camera.ground)
+        largest, even = _largest(camera, smooth)
         if even or knots >= 2 * camera.track.lines:
             break
         knots *= 2
@@ -265,16 +264,17 @@ def _by_rows(track: LineTrack, positions: Course, attitudes: Course) -> LineTrac
     )
 
 
-def _largest(rough: LineSight, smooth: LineSight, ground: BodyGround) -> tuple[_Floats, bool]:
+def _largest(camera: LineCamera, calm: LineCamera) -> tuple[_Floats, bool]:
     """Largest shifts of blocks of lines, (k, 2), and whether the smooth part flies evenly.
 
     The first block lies before the image, the last behind it.
     """
+    rough, smooth = (LineSight(each.track, each.look) for each in (camera, calm))
     lines, columns = rough.track.lines, np.array([0.0, (rough.look.columns - 1) / 2, rough.look.columns - 1.0])
     rows = np.arange(-_BLOCK, (-(-lines // _BLOCK) + 1) * _BLOCK, dtype=float)
     y, x = np.repeat(rows, 3), np.tile(columns, len(rows))
     S, d = rough.rays(np.column_stack([x, y]))
-    P = S + to_sphere(S, d, np.linalg.norm(S, axis=1) - ground.height(S) + _LOWEST)[:, None] * d
+    P = S + to_sphere(S, d, np.linalg.norm(S, axis=1) - camera.ground.height(S) + _LOWEST)[:, None] * d
     miss, column = smooth.across(P, y)
     slope = smooth.across(P, y + 1.0)[0] - miss
     usual = np.median(slope)

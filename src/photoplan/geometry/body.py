@@ -58,6 +58,11 @@ class BodyGround:
         object.__setattr__(self, "_wgs84", Ellipsoid.of_radii(*EARTH_RADII))
 
     @property
+    def bare(self) -> BodyGround:
+        """The same with heights above the ellipsoid."""
+        return BodyGround(self.crs, "ellipsoidal", self.radii)
+
+    @property
     def on_earth(self) -> bool:
         """Whether the body is the earth."""
         return self._geodetic is not None
@@ -68,6 +73,10 @@ class BodyGround:
             return self._own.geocentric(np.asarray(XYZ, float))[0]
         at = self._geodetic(XYZ)
         return self._wgs84.geocentric(np.radians(at[..., 0]), np.radians(at[..., 1]), at[..., 2])[0]
+
+    def ellipsoidal(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Height above the body's ellipsoid (...) of map points with height (..., 3), metres."""
+        return np.asarray(XYZ, float)[..., 2] if self._geodetic is None else self._geodetic.ellipsoidal(XYZ)
 
     def to_map(self, xyz: ArrayLike) -> NDArray[np.float64]:
         """The inverse of a call."""

@@ -64,6 +64,10 @@ class GeodeticGround:
         out[..., 2] = self._to_ellipsoid(XYZ)
         return out
 
+    def ellipsoidal(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Ellipsoidal height (...) of map X, Y and height (..., 3); raises as a call does."""
+        return self._to_ellipsoid(np.asarray(XYZ, float))
+
     def to_map(self, geodetic: ArrayLike) -> NDArray[np.float64]:
         """The inverse of a call, to 1e-8 m; NaN where the CRS has no place."""
         geodetic = np.asarray(geodetic, float)
