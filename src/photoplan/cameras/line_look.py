@@ -10,6 +10,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from photoplan.cameras.line_bend import LineBend
 from photoplan.errors import InputError
 
 _Floats = NDArray[np.float64]
@@ -42,17 +43,25 @@ class LineLook:
     """Shape (degree + 1, 2); over the columns of `span` as −1 to 1."""
     part: tuple[int, int] | None = None
     """First and end column of those that are its own, of a line of several chips; None: all."""
+    bend: LineBend | None = None
+    """What comes on top of the polynomials."""
 
     @classmethod
-    def of(cls, tangents: Callable[[_Floats], _Floats], columns: int, part: tuple[int, int] | None = None) -> LineLook:
-        """The curve of a function from columns (n,) to tangents (n, 2)."""
+    def of(
+        cls,
+        tangents: Callable[[_Floats], _Floats],
+        columns: int,
+        part: tuple[int, int] | None = None,
+        bend: LineBend | None = None,
+    ) -> LineLook:
+        """The curve of a function from columns (n,) to tangents (n, 2), with a bend on top of it."""
         low, high = _span(part or (0, columns))
         nodes = chebyshev.chebpts1(4 * _DEGREE)
         values = tangents((low + high) / 2 + (high - low) / 2 * nodes)
         if not np.isfinite(values).all():
             raise InputError("detectors of the line have no direction; are the numbers of its lens right?")
         coefficients = chebyshev.chebfit(nodes, values, _DEGREE)
-        look = cls(columns, np.asarray(coefficients, float), part)
+        look = cls(columns, np.asarray(coefficients, float), part, bend)
         if not look.pitch > _FINEST:
             raise InputError(
                 f"the line's detectors are {look.pitch:.3g} rad apart, which no telescope tells; is its focal length "
@@ -60,7 +69,7 @@ class LineLook:
             )
         # Most lenses are of low degree; what is next to nothing is not computed a million times.
         tiny = np.abs(coefficients).max(axis=1) < _NOTHING * look.pitch
-        look = cls(columns, look.coefficients[: max(2, len(tiny) - int(np.argmin(tiny[::-1])))], part)
+        look = cls(columns, look.coefficients[: max(2, len(tiny) - int(np.argmin(tiny[::-1])))], part, bend)
         miss = float(np.abs(chebyshev.chebval(nodes, look.coefficients).T - values).max())
         if miss > _TOLERANCE * look.pitch:
             raise InputError(f"the line's lens is not smooth: polynomials miss it by {miss / look.pitch:.2g} columns")
@@ -72,12 +81,15 @@ class LineLook:
         """Tangents (n, 2) of columns (n,); straight on where the line has ended."""
         inside = np.clip(column, *self.span)
         values, away = chebyshev.chebval(self._unit(inside), self.coefficients).T, column - inside
+        if self.bend is not None:
+            values = values + self.bend(inside)
         return np.asarray(values + self.slope(inside) * away[:, None] if np.any(away) else values)
 
     def slope(self, column: _Floats) -> _Floats:
         """Change of the tangents (n, 2) from column to column."""
-        unit = self._unit(np.clip(column, *self.span))
-        return np.asarray(chebyshev.chebval(unit, self._slopes).T)
+        inside = np.clip(column, *self.span)
+        change = chebyshev.chebval(self._unit(inside), self._slopes).T
+        return np.asarray(change if self.bend is None else change + self.bend.slope(inside))
 
     @property
     def span(self) -> tuple[float, float]:
@@ -98,8 +110,8 @@ class LineLook:
     @cached_property
     def axes(self) -> _Floats:
         """Unit vectors along the line, from the first to the last column, and across it, (2, 2)."""
-        chord = chebyshev.chebval(self._unit(self._outer), self.coefficients)
-        e = (chord[:, 1] - chord[:, 0]) / np.linalg.norm(chord[:, 1] - chord[:, 0])
+        first, last = self.tangents(self._outer)
+        e = (last - first) / np.linalg.norm(last - first)
         return np.array([e, [-e[1], e[0]]])
 
     @cached_property
@@ -123,11 +135,14 @@ class LineLook:
         first, last = self._along_ends
         at = self.ends[0] + (along - first) * (self.ends[1] - self.ends[0]) / (last - first)
         values, slopes = self._chord
+        e = self.axes[0]
         for _ in range(12):
             inside = np.clip(at, *self.span)
             unit = self._unit(inside)
-            slope = chebyshev.chebval(unit, slopes)
-            step = (chebyshev.chebval(unit, values) + slope * (at - inside) - along) / slope
+            value, slope = chebyshev.chebval(unit, values), chebyshev.chebval(unit, slopes)
+            if self.bend is not None:
+                value, slope = value + self.bend(inside) @ e, slope + self.bend.slope(inside) @ e
+            step = (value + slope * (at - inside) - along) / slope
             at = at - step
             if not (np.abs(step) > 1e-11 * self.columns).any():
                 break
@@ -135,7 +150,7 @@ class LineLook:
 
     @cached_property
     def _chord(self) -> tuple[_Floats, _Floats]:
-        """Polynomials of the tangents along the chord, and of their change from column to column."""
+        """Polynomials of the tangents along the chord, and of their change from column to column; without the bend."""
         return self.coefficients @ self.axes[0], self._slopes @ self.axes[0]
 
     @cached_property

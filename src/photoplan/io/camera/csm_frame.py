@@ -2,18 +2,11 @@
 
 The camera looks along z; x and y of its focal plane, millimetres, lead to lines and samples of the detector from the
 outer corner of its first pixel, so that the middle of that pixel is at 0.5. Line and sample of the image are those of
-the detector less the first that was read, over how many were summed. With u without and d with distortion, both in
-millimetres, r² = x² + y² (USGS, usgscsm, `Distortion.cpp`, public domain; names are its own):
-
-    radial      u = d (1 − k0 − k1 r² − k2 r⁴), r of d
-    transverse  dx, dy = cubic polynomials of u with ten coefficients each, in the order of `Cubic`
-    dawnfc      d = u (1 + k r²), r of u
-    radtan      d / f = OpenCV's lens of u / f: k1, k2, p1, p2, k3
+the detector less the first that was read, over how many were summed. Distortions are those of `isd_lens`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +17,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.body_frame import BodyFrameCamera
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.cubic import Cubic
 from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.opencv import OpenCV
-from photoplan.cameras.lenses.reversed import Reversed
 from photoplan.cameras.line_sight import to_sphere
 from photoplan.cameras.plane import Affine2D
 from photoplan.errors import InputError
@@ -37,6 +25,7 @@ from photoplan.geometry.body import BodyGround
 from photoplan.geometry.motion import conjugate, cubic, rotations, times
 from photoplan.geometry.pose import Pose
 from photoplan.io.camera.isd import FORM, FRAME_MODEL, Isd
+from photoplan.io.camera.isd_lens import LENSES, lens_of, not_known
 from photoplan.io.plain_files import read_json
 
 _Floats = NDArray[np.float64]
@@ -120,11 +109,14 @@ def read(isd: Any, path: Path) -> StatedFrame:
     try:
         if source.has("jitter"):
             raise InputError("its lines were exposed one after the other (jitter); such cameras are not known")
-        c, lens = _lens(source)
+        kind = source.distortion
+        if kind is not None and kind not in LENSES:
+            raise not_known(kind, list(LENSES))
+        c, lens = lens_of(source, kind)
         focal = source.focal_plane().focal
         frame = FrameCamera(_interior(source, c), lens, _pose(source))
         _refuse_away(frame, max(source.radii))
-        return StatedFrame(path, frame, source.radii, focal, source.distortion if lens != NoLens() else None)
+        return StatedFrame(path, frame, source.radii, focal, kind if lens != NoLens() else None)
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
@@ -166,57 +158,3 @@ def _refuse_away(frame: FrameCamera, radius: float) -> None:
             "the camera looks away from its body: positions and pointing are not in the same axes, or the focal plane "
             "is meant to lie behind the lens, which is not known here"
         )
-
-
-def _lens(isd: Isd) -> tuple[float, Lens]:
-    """The camera constant, millimetres, and the lens by its tangents."""
-    f, kind = isd.focal_plane().focal, isd.distortion
-    if kind is None:
-        return f, NoLens()
-    if kind not in _LENSES:
-        raise InputError(
-            f"the distortion {kind!r} is not known; {', '.join(_LENSES)} are. Where all its coefficients are 0, or are "
-            "not needed, take optical_distortion out of the file"
-        )
-    return _LENSES[kind](isd, f)
-
-
-def _radial(isd: Isd, f: float) -> tuple[float, Lens]:
-    k0, k1, k2 = _coefficients(isd, "radial.coefficients", 3)
-    if not k0 < 1.0:
-        raise InputError(f"radial distortion with a constant part of {k0:g}")
-    # The constant part changes the scale of the image, and nothing else.
-    c = f / (1.0 - k0)
-    lens = Brown.from_image_units(c, k=(-k1 / (1.0 - k0), -k2 / (1.0 - k0)))
-    return c, Reversed(lens) if k1 or k2 else NoLens()
-
-
-def _transverse(isd: Isd, f: float) -> tuple[float, Lens]:
-    x, y = (tuple(_coefficients(isd, f"transverse.{axis}", 10)) for axis in "xy")
-    return f, Cubic.from_y_down(f, x, y)
-
-
-def _dawn(isd: Isd, f: float) -> tuple[float, Lens]:
-    return f, Brown.from_image_units(f, k=tuple(_coefficients(isd, "dawnfc.coefficients", 1)))
-
-
-def _radtan(isd: Isd, f: float) -> tuple[float, Lens]:
-    k1, k2, p1, p2, k3 = _coefficients(isd, "radtan.coefficients", 5)
-    return f, OpenCV(k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
-
-
-#: Camera constant and lens of every distortion that is known.
-_LENSES: dict[str, Callable[[Isd, float], tuple[float, Lens]]] = {
-    "radial": _radial,
-    "transverse": _transverse,
-    "dawnfc": _dawn,
-    "radtan": _radtan,
-}
-
-
-def _coefficients(isd: Isd, name: str, count: int) -> list[float]:
-    """So many coefficients of a distortion; more or fewer have no certain meaning."""
-    found: _Floats = isd.numbers(f"optical_distortion.{name}", (-1,))
-    if len(found) != count:
-        raise InputError(f"optical_distortion.{name} has {len(found)} numbers, not {count}: which they are is not said")
-    return [float(v) for v in found]

@@ -86,6 +86,15 @@ class Isd:
             return None
         return str(next(iter(kinds), "")) if isinstance(kinds, dict) else ""
 
+    def coefficients(self, name: str, count: int) -> list[float]:
+        """So many coefficients of the optical distortion; more or fewer have no certain meaning."""
+        found = self.numbers(f"optical_distortion.{name}", (-1,))
+        if len(found) != count:
+            raise InputError(
+                f"optical_distortion.{name} has {len(found)} numbers, not {count}: which they are is not said"
+            )
+        return [float(v) for v in found]
+
     def focal_plane(self) -> FocalPlane:
         """The focal plane."""
         rows = [self.numbers(f"focal2pixel_{name}", (3,)) for name in ("lines", "samples")]

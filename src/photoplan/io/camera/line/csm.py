@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.line_look import LineLook
 from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
 from photoplan.geometry.motion import (
@@ -26,6 +25,7 @@ from photoplan.geometry.motion import (
     times,
 )
 from photoplan.io.camera.isd import FORM, FRAME_MODEL, Isd
+from photoplan.io.camera.line.csm_lens import look
 from photoplan.io.camera.line.model import StatedLine
 
 _Floats = NDArray[np.float64]
@@ -50,7 +50,7 @@ def read(isd: Any, path: Path) -> StatedLine:
         )
     source = Isd(isd, path)
     try:
-        return StatedLine(path, FORM, _track(source), _look(source), source.radii)
+        return StatedLine(path, FORM, _track(source), look(source), source.radii)
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
@@ -94,30 +94,3 @@ def _clock(isd: Isd) -> tuple[_Floats, _Floats, _Floats]:
         raise InputError("line_scan_rate is empty")
     line, began, lasts = rates.T
     return line - 0.5, began + 0.5 * lasts, lasts
-
-
-def _look(isd: Isd) -> LineLook:
-    """Directions of the detectors: places in the focal plane (mm) without distortion, over the focal length."""
-    plane = isd.focal_plane()
-    summing = isd.summing("sample")
-
-    def tangents(column: _Floats) -> _Floats:
-        detector = np.stack([np.full_like(column, plane.first[0]), (column + 0.5) * summing + plane.first[1]], axis=-1)
-        return _undistorted((detector - plane.axis) @ np.linalg.inv(plane.to_detector).T, isd) / plane.focal
-
-    return LineLook.of(tangents, isd.samples)
-
-
-def _undistorted(xy: _Floats, isd: Isd) -> _Floats:
-    """Focal plane coordinates (n, 2), mm, as they would be without distortion."""
-    kind = isd.distortion
-    if kind is None:
-        return xy
-    if kind == "radial":
-        k = isd.numbers("optical_distortion.radial.coefficients", (3,))
-        rr = (xy**2).sum(axis=-1, keepdims=True)
-        return np.asarray(xy * (1.0 - (k[0] + rr * (k[1] + rr * k[2]))))
-    if kind == "lrolrocnac":
-        k = isd.numbers("optical_distortion.lrolrocnac.coefficients", (1,))
-        return np.asarray(np.stack([xy[:, 0], xy[:, 1] / (1.0 + k[0] * xy[:, 1] ** 2)], axis=-1))
-    raise InputError(f"the distortion {kind!r} is not known; radial and lrolrocnac are")
