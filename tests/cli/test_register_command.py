@@ -73,7 +73,12 @@ def test_images_without_a_map_are_compared_pixel_by_pixel(photoplan: Here, tmp_p
     assert said.code == 0 and "9 × 7 patches of 21 px" in said.out and not (tmp_path / "v.gpkg").exists()
     said = photoplan(*words, "--model", "shift")
     assert said.code == 0, said.err
-    assert "dx -0.30" in said.out and "100.00%" in said.out and not (tmp_path / "v.png").exists()
+    assert (
+        "few patches" not in said.err
+        and "dx -0.30" in said.out
+        and "100.00%" in said.out
+        and not (tmp_path / "v.png").exists()
+    )
     assert photoplan(*words).code == 2  # exists
     one = (tmp_path / "v.csv").read_bytes()
     assert photoplan(*words, "--overwrite", "--workers", 2).code == 0
@@ -103,6 +108,21 @@ def test_what_makes_no_sense_is_refused(
     said = photoplan("register", first, second, *output, *words)
     assert said.code == code and message in said.err, said.err
     assert {p.name for p in tmp_path.iterdir() if not p.name.startswith(".")} == {"a.tif", "b.tif"}
+
+
+def test_that_few_patches_were_found_is_told(photoplan: Here, tmp_path: Path) -> None:
+    """Of nine columns of patches two show the same, the others something else."""
+    shown = {"a": 0.0, "b": 0.0, "c": 900.0}
+    first, second, other = (write(tmp_path / f"{name}.tif", at=(at, 0.0)) for name, at in shown.items())
+    with rasterio.open(second, "r+") as file, rasterio.open(other) as beside:
+        pixels = beside.read()
+        pixels[..., :50] = file.read()[..., :50]
+        file.write(pixels)
+    words = ("register", first, second, "-o", tmp_path / "v.gpkg", "--no-picture")
+    said = photoplan(*words)
+    assert said.code == 0 and "few patches were found" in said.err and "give a larger --search (3 px now)" in said.err
+    told = json.loads((tmp_path / "v.run.json").read_text())["product"]["notes"]
+    assert len(told) == 1 and "most are unlike" in told[0]
 
 
 def test_maps_that_do_not_meet_are_refused(photoplan: Here, tmp_path: Path) -> None:

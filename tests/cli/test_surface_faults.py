@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable
@@ -121,6 +122,14 @@ def test_a_start_above_the_images_is_refused_and_one_far_from_the_terrain_told(p
 def test_images_without_overlap_are_told(project: Path) -> None:
     said = surface(project, "--bounds", X0 + 4000, Y0, X0 + 4010, Y0 + 10)
     assert said.code == 3 and "no two images see anything there; together they see" in said.err
+
+
+def test_bounds_that_reach_far_beyond_the_images_are_told(project: Path) -> None:
+    """Three images see a square of some 80 m; nothing is said of bounds inside."""
+    far = X0 - 500, Y0 - 500, X0 + 500, Y0 + 500
+    said = surface(project, "--bounds", *far, "--dry-run")
+    assert said.code == 0 and re.search(r"two images see 0\.[67]\d% of these bounds at most", said.out), said.out
+    assert "of these bounds" not in surface(project, "--dry-run").out
 
 
 def test_fault_02_undeclared_height_systems(project: Path) -> None:

@@ -175,6 +175,8 @@ def test_targets_that_are_none(scene: Scene) -> None:
         (["--target", ON_WALL], 2, "it has no end; give --bounds"),
         (["--target", ON_WALL, *around(0, 0)], 3, "no two images see"),
         (["--target", "wall:0,0,0,0,-90", *around(-X, -Y)], 3, "all images stand behind the target"),
+        (["--target", f"vault:{X0},{Y0},{GROUND},0,3", *around(0, 0)], 2, "reach 4 m: its heights go to 2.7 m"),
+        (["--target", f"vault:{X0},{Y0},{GROUND},0,30", *around(0, 0)], 3, "a vault is seen from inside its radius"),
         (["--target", "image:none"], 3, "image 'none' is not in the project"),
         (["--target", "wall:1e300,2,3,4", *around(0, 0)], 2, "lies on no map"),
         (["--target", f"wall:{Y0},{X0},140,4", *around(0, 0)], 2, "X and Y in the right order"),

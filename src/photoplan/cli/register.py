@@ -17,9 +17,11 @@ if TYPE_CHECKING:
 @click.argument("first", type=PATH)
 @click.argument("second", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, metavar="GPKG", help="Vectors; NAME.csv beside it.")
-@click.option("--radius", type=int, default=10, show_default=True, help="Of a round patch, pixels.")
+@click.option("--radius", type=int, default=10, show_default=True, help="Of a round patch, pixels, 4 to 50.")
 @click.option("--spacing", type=int, metavar="PX", help="Distance of the patches [they touch].")
-@click.option("--search", type=float, default=3.0, show_default=True, help="Largest displacement in x and y, pixels.")
+@click.option(
+    "--search", type=float, default=3.0, show_default=True, help="Largest displacement in x and y, pixels, up to 30."
+)
 @click.option("--correlation", type=float, default=0.7, show_default=True, help="Least correlation of a patch.")
 @click.option("--sigma", type=float, default=0.2, show_default=True, help="Largest standard deviation, pixels.")
 @click.option("--model", default="affine", show_default=True, metavar="KIND", help="none, shift or affine.")
@@ -47,7 +49,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
             report = register(request, events)
         picture = None if drawing is None else drawing.write(draw_vectors(report))
     if not quiet:
-        for note in report.pair.notes:
+        for note in report.notes:
             say(note)
     if as_json:
         show_json(report, picture=picture)

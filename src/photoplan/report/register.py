@@ -73,13 +73,14 @@ def _components(fig: Any, axes: list[Any], report: RegisterReport, extent: Any) 
     assert found is not None
     field = np.where((found.state == FOUND)[:, None], found.moved, np.nan).reshape(*report.shape, 2)
     middle = np.nanmedian(field, axis=(0, 1))
-    scale = max(float(np.nanpercentile(np.abs(field - middle), 98)), 1e-4)
+    scale = max(float(np.nanpercentile(np.abs(field - middle), 98)), 1e-3)
     half, (first, last) = report.step / 2, found.at[[0, -1]].astype(float)
     edges = first[0] - half, last[0] + half, last[1] + half, first[1] - half
     for k, (ax, name) in enumerate(zip(axes, ("dx", "dy"))):
         limits = {"vmin": middle[k] - scale, "vmax": middle[k] + scale}
         shown = ax.imshow(field[..., k], cmap="RdBu_r", extent=edges, interpolation="nearest", **limits)
-        fig.colorbar(shown, ax=ax, shrink=0.85, extend="both", label="px")
+        bar = fig.colorbar(shown, ax=ax, shrink=0.85, extend="both", label="px")
+        bar.formatter.set_useOffset(False)
         ax.set(xlim=extent[:2], ylim=extent[2:], facecolor="#d9dfe3")
         ax.set_title(f"{name}: median {middle[k]:+.3f} px")
         ax.grid(visible=False)

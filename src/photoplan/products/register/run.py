@@ -22,13 +22,24 @@ from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import recording, run_key, settings_of
 from photoplan.io.tables import write_table
-from photoplan.matching.register import FOUND, STATES, PatchDisplacements, PatchSettings, contradicting, match_grid
+from photoplan.matching.register import (
+    FOUND,
+    MISSING,
+    STATES,
+    TEXTURELESS,
+    PatchDisplacements,
+    PatchSettings,
+    contradicting,
+    match_grid,
+)
 from photoplan.plain import pick
 from photoplan.products.register.figures import MODELS, RegisterFigures, SmoothModel, figures_of, fit_smooth
 from photoplan.products.register.pair import Pair, open_pair
 
 #: Patches of a tile along each side, and of all at most.
 _TILE, _MOST = 24, 2_000_000
+#: Part of the patches with texture below which those that were found are few.
+_FEW = 0.25
 _COLUMNS = ("x", "y", "dx", "dy", "sigma_x", "sigma_y", "covariance", "correlation", "state")
 
 
@@ -111,12 +122,19 @@ class RegisterReport:
     figures: RegisterFigures | None
     model: SmoothModel | None
     found: PatchDisplacements | None
+    advice: str = ""
+    """What helps, if few patches were found."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What there is to say of the images, and of what was found."""
+        return (*self.pair.notes, *([self.advice] if self.advice else []))
 
     def json_fields(self) -> dict[str, Any]:
         """Figures, without the vectors."""
         images = [str(path) for path in self.pair.paths]
         own = pick(self, "output", "table", "figures", "model", grid="shape", spacing_px="step")
-        return {**own, "images": images, "pixel": self.pair.pixel, "notes": list(self.pair.notes)}
+        return {**own, "images": images, "pixel": self.pair.pixel, "notes": list(self.notes)}
 
 
 def register(request: RegisterRequest, events: Events = SILENT) -> RegisterReport:
@@ -171,6 +189,7 @@ def register(request: RegisterRequest, events: Events = SILENT) -> RegisterRepor
             figures=figures,
             model=model,
             found=found,
+            advice=_few(found, request),
         )
         record([request.output, request.table], report)
         when_named(log.remove)
@@ -241,14 +260,32 @@ def _nothing(found: PatchDisplacements, request: RegisterRequest) -> str:
     """Why there is no vector."""
     counts = np.bincount(found.state, minlength=len(STATES))
     listed = ", ".join(f"{count} {name}" for name, count in zip(STATES, counts.tolist()) if count)
-    worst = STATES[int(counts.argmax())]
-    advice = {
+    return f"no patch of {request.first} was found in {request.second}: {listed}; {_advice(counts, request)}"
+
+
+def _few(found: PatchDisplacements, request: RegisterRequest) -> str:
+    """What helps if of the patches with pixels and texture few were found; empty if there were more."""
+    counts = np.bincount(found.state, minlength=len(STATES))
+    counts[[MISSING, TEXTURELESS]] = 0
+    if counts[FOUND] >= _FEW * counts.sum():
+        return ""
+    counts[FOUND] = 0
+    return f"few patches were found, and these may be chance; most are {_worst(counts)}: {_advice(counts, request)}"
+
+
+def _worst(counts: NDArray[np.int64]) -> str:
+    return STATES[int(counts.argmax())]
+
+
+def _advice(counts: NDArray[np.int64], request: RegisterRequest) -> str:
+    """What helps against what befell most patches."""
+    return {
         "missing": "the images have hardly a valid pixel in common; look at their nodata",
         "textureless": f"give a larger `radius` or `sigma`; they are {request.radius} and {request.sigma:g} px",
         "unlike": f"give a larger `search` ({request.search:g} px now) or a smaller `correlation`",
         "uncertain": "give a larger `radius` or `sigma`",
-    }
-    return f"no patch of {request.first} was found in {request.second}: {listed}; {advice.get(worst, '')}"
+        "apart": "neighbours contradict each other, as where a pattern repeats; give a larger `radius`",
+    }.get(_worst(counts), "")
 
 
 def _write(request: RegisterRequest, pair: Pair, found: PatchDisplacements) -> None:

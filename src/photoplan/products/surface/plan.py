@@ -46,6 +46,8 @@ _SOME = 32.0
 _SHARED = 0.2
 #: B : H of images that see the ground from the same direction.
 _PARALLEL = 1e-4
+#: Part of stated bounds that two images see, below which it is told: there are no heights elsewhere.
+_MOSTLY = 0.5
 #: Levels at most.
 _LEVELS = 8
 #: Pixels of parallax of the reach from which on heights are searched; those for which the coarsest level of a search
@@ -74,6 +76,8 @@ class SurfacePlan:
     """What one pixel of parallax between the outermost images is in height, metres."""
     apart: float
     """By how much a start that is not the project's terrain lies above that (below: negative), metres; 0: they meet."""
+    seen_share: float
+    """Part of the bounds that lies inside those of what two images see, 0 to 1."""
     key: str
     """Hash of all that decides the product."""
 
@@ -96,14 +100,15 @@ class SurfacePlan:
     def __str__(self) -> str:
         g, s = self.grid, self.scheme
         reduced = f", images reduced by {2**s.base}" if s.base else ""
+        pixels = f"{s.ratio**2} pixel{'s' * (s.ratio > 1)} of each image per height"
         far = f" at {self.frame.distance:.4g} m" if isinstance(self.frame, ImageFrame) else ""
         return "\n".join([
             f"surface of {len(self.images)} images: {g.width} × {g.height} heights of {g.resolution:g} m, grey values "
             f"of {g.resolution / s.ratio:.3g} m",
-            f"  GSD {self.gsd:.3g} m, {s.ratio**2} pixels of each image per height{reduced}; one pixel of parallax is "
-            f"{self.height_error:.3g} m of height",
+            f"  GSD {self.gsd:.3g} m, {pixels}{reduced}; one pixel of parallax is {self.height_error:.3g} m of height",
             f"  {s.coarsest + 1} level{'s' * (s.coarsest > 0)}, the coarsest with heights of "
             f"{g.resolution * 2**s.coarsest:g} m; start: {self.settings.start}{self._searched}",
+            *([f"  two images see {self.seen_share:.2%} of these bounds at most"] if self.seen_share < _MOSTLY else []),
             *([f"  {self.apart_text}"] if self.apart_text else []),
             *([] if self.frame is None else [f"  target {self.settings.target}{far}: u, v, h instead of X, Y, Z"]),
         ])  # fmt: skip
@@ -132,7 +137,16 @@ class SurfacePlan:
     def json_fields(self) -> dict[str, object]:
         """What a dry run tells."""
         return {
-            **pick(self, "images", "blind", "gsd", "key", height_of_a_pixel="height_error"),
+            **pick(
+                self,
+                "images",
+                "blind",
+                "gsd",
+                "key",
+                "seen_share",
+                height_of_a_pixel="height_error",
+                start_apart_m="apart",
+            ),
             **pick(self.grid, "bounds", "resolution", "width", "height"),
             "target": self.settings.target,
             "frame": self.frame,
@@ -188,7 +202,7 @@ def plan_surface(
         settings = replace(settings, bounds=bounds, start="0" if settings.start == "terrain" else settings.start)
         looked, blind = over_frame(project, names, frame, bounds, float(settings.start), events)
     check_bands(project, settings.bands, [one.name for one in looked])
-    bounds = _bounds(settings, looked, blind)
+    bounds, seen_share = _bounds(settings, looked, blind)
     gsd = float(np.median([one.gsd for one in looked]))
     if settings.resolution < _FINEST * gsd * 0.999:
         raise UsageError(
@@ -231,6 +245,7 @@ def plan_surface(
         gsd=gsd,
         height_error=height_error,
         apart=apart,
+        seen_share=seen_share,
         key=_key(project, used, settings, scheme=scheme, grid=grid, frame=frame),
     )
 
@@ -250,12 +265,13 @@ def _inside(frame: Frame, start: float, reach: float, stated: float | None) -> f
     low, high = frame.heights
     most = min(start - low, high - start)
     if most <= 0 or (reach > most and stated is not None):
-        raise UsageError(f"start {start:g} m and reach {reach:g} m: its heights go from {low:.3g} to {high:.3g} m")
+        ends = [f"{word} {end:.3g} m" for word, end in (("from", low), ("to", high)) if math.isfinite(end)]
+        raise UsageError(f"start {start:g} m and reach {reach:g} m: its heights go {' '.join(ends)}")
     return min(reach, most)
 
 
-def _bounds(settings: SurfaceSettings, looked: Sequence[SeenTarget], blind: Sequence[str]) -> Bounds:
-    """The bounds that were chosen, or around all that two images see by their footprints."""
+def _bounds(settings: SurfaceSettings, looked: Sequence[SeenTarget], blind: Sequence[str]) -> tuple[Bounds, float]:
+    """The bounds that were chosen, or around all that two images see by their footprints; the part of them they see."""
     seen = [one.bounds for one in looked]
     common = []
     for a, b in combinations(seen, 2):
@@ -271,13 +287,14 @@ def _bounds(settings: SurfaceSettings, looked: Sequence[SeenTarget], blind: Sequ
     around = np.array(common)
     (xmin, ymin), (xmax, ymax) = around[:, :2].min(axis=0).tolist(), around[:, 2:].max(axis=0).tolist()
     if settings.bounds is None:
-        return (xmin, ymin, xmax, ymax)
+        return (xmin, ymin, xmax, ymax), 1.0
     b = settings.bounds
     MapGrid.covering(b, settings.resolution, "")
     if not (b[0] < xmax and xmin < b[2] and b[1] < ymax and ymin < b[3]):
         together = extent_text((xmin, ymin, xmax, ymax))
         raise GeometryError(f"bounds {extent_text(b)}: no two images see anything there; together they see {together}")
-    return b
+    common_area = (min(b[2], xmax) - max(b[0], xmin)) * (min(b[3], ymax) - max(b[1], ymin))
+    return b, common_area / ((b[2] - b[0]) * (b[3] - b[1]))
 
 
 def _heights_of_a_pixel(looked: Sequence[SeenTarget], gsd: float) -> tuple[float, float]:

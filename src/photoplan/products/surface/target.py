@@ -115,9 +115,13 @@ def over_frame(
         areas = np.abs(np.linalg.det(camera.derivatives(uvh[inside])[..., :2]))
         seen[name] = SeenTarget(name, camera, (*low, *high), (height, height), float(np.mean(areas**-0.5)))
     if behind == len(names):
+        helps = "the azimuth of a wall is that of its outward normal, towards them"
+        if isinstance(frame, CylinderFrame):
+            helps = "a vault is seen from inside its radius, a column from outside"
+        elif isinstance(frame, ImageFrame):
+            helps = "they stand nearer to what is seen than its distance"
         raise GeometryError(
-            f"all images stand behind the target at the height {height:g}: the azimuth of a wall is that of its "
-            "outward normal, towards them\n  " + "\n  ".join(blind[:12])
+            f"all images stand behind the target at the height {height:g}: {helps}\n  " + "\n  ".join(blind[:12])
         )
     return [seen[name] for name in names if name in seen], blind
 
