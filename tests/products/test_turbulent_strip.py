@@ -11,6 +11,7 @@ import pytest
 import rasterio
 from scipy import ndimage
 from tools.command import inside
+from tools.line_strip import pattern
 from tools.shaken_strip import ShakenStrip, Vienna
 
 
@@ -56,6 +57,36 @@ def test_check_and_the_record_tell_how_turbulent_a_flight_is(tmp_path: Path) -> 
     assert record["images"][0]["tremor"] in words
     with rasterio.open(product) as file:
         assert (file.read(1)[file.read_masks(1) > 0] == 99).all() and (file.read_masks(1) > 0).mean() > 0.5
+
+
+def test_the_direct_method_puts_the_pixels_of_a_strip_where_they_come_down(tmp_path: Path) -> None:
+    """Each pixel of the product is the mean of those of the image, whose places come from other means."""
+    strip = ShakenStrip(columns=120, lines=160, vibration=(3.0, 0.4, 0.5), events=(20.0, 5.0, 5.0), event_lines=20.0)
+    strip.strip_file(tmp_path)
+    XY = strip.seen(300.0)
+    grey = pattern(XY).astype(np.float32)
+    with rasterio.open(
+        tmp_path / "a.tif", "w", driver="GTiff", width=120, height=160, count=1, dtype="float32"
+    ) as file:
+        file.write(grey, 1)
+    path = tmp_path / "project.toml"
+    terrain = '[terrain]\nheight = 300.0\nheight_system = "ellipsoidal"\n'
+    image = '[[images]]\nname = "a"\nfile = "a.tif"\nline = "strip.toml"\ndetectors = "nadir"\n'
+    path.write_text(f'format = 1\ncrs = "{strip.crs}"\n{terrain}{image}')
+    said = inside("ortho", path, "--resolution", 1.0, "--method", "direct", "--no-quicklook")
+    assert said.code == 0, said.err
+    with rasterio.open(said.out.split()[0]) as product:
+        values, valid, T = product.read(1), product.read_masks(1) > 0, product.transform
+    at = np.stack([(XY[..., 1] - T.f) / T.e, (XY[..., 0] - T.c) / T.a])
+    row, column = np.floor(at).astype(int)
+    count, sums, edge = (np.zeros(values.shape) for _ in range(3))
+    np.add.at(count, (row, column), 1)
+    np.add.at(sums, (row, column), grey.astype(float))
+    # Places within 0.1 mm of the border of a pixel may come down in the one beside it.
+    np.add.at(edge, (row, column), np.abs(at - np.round(at)).min(axis=0) < 1e-4)
+    sure = ~ndimage.binary_dilation(edge > 0, np.ones((3, 3)))
+    assert (valid == (count > 0))[sure].all() and sure.mean() > 0.9 and (valid & sure).sum() > 1000
+    assert np.abs(values - sums / np.maximum(count, 1))[valid & sure].max() < 1e-4
 
 
 @pytest.mark.slow
