@@ -18,6 +18,7 @@ class BodyAxes:
 
     radii: tuple[float, float]
     on_earth = False
+    reach = 100.0
 
     def __call__(self, xyz: ArrayLike) -> NDArray[np.float64]:
         return np.asarray(xyz, float)

@@ -15,8 +15,6 @@ from photoplan.geometry.body import BodyGround
 _Floats = NDArray[np.float64]
 #: Heights of any ground, metres: of the earth, and of other bodies, where they are at most this part of the radius.
 _EARTH, _ELSEWHERE, _PART = (-500.0, 9_000.0), (-10_000.0, 25_000.0), 0.1
-#: Half the distance over which the change of a ray on the map is taken, metres.
-_REACH = 50.0
 #: Heights are met when they were missed by less than this before the last step, metres.
 _CLOSE = 1e-7
 
@@ -59,7 +57,8 @@ def meet(ground: BodyGround, S: _Floats, d: _Floats, heights: _Floats) -> tuple[
         # Places far away from the body are rounded.
         point[~((np.abs(point[:, 2] - heights) < 1e-6 + 1e-14 * r) & (r > 0))] = np.nan
         point[:, 2] = np.where(np.isnan(point[:, 0]), np.nan, heights)
-        tangent = ground.to_map(at + _REACH * d) - ground.to_map(at - _REACH * d)
+        half = ground.reach / 2 * d
+        tangent = ground.to_map(at + half) - ground.to_map(at - half)
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     return point, tangent
 

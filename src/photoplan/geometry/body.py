@@ -14,8 +14,8 @@ from photoplan.geometry.local import Ellipsoid, ProjectedCrs, projected_crs
 
 #: Semi-axes of WGS 84, metres.
 EARTH_RADII = (6_378_137.0, 6_356_752.314245179)
-#: Half the distance over which derivatives are taken, metres.
-_REACH = 100.0
+#: Half the distance over which derivatives are taken, metres, and of small bodies as a part of their radius.
+_REACH, _PART = 100.0, 2e-5
 #: Radii of what a file and a CRS call the same body agree to this part.
 _SAME = 0.01
 
@@ -91,9 +91,14 @@ class BodyGround:
         ellipsoid = self._own.ellipsoid if self._geodetic is None else self._wgs84
         return ellipsoid.geodetic(np.asarray(xyz, float))[2]
 
+    @property
+    def reach(self) -> float:
+        """Half the distance over which the map hardly bends, metres: for derivatives."""
+        return min(_REACH, _PART * self.radii[0])
+
     def jacobian(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """∂(x, y, z) / ∂(X, Y, height), shape (..., 3, 3)."""
         XYZ = np.asarray(XYZ, float)
-        steps = _REACH * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, 0, 1.0], [0, 0, -1.0]])
+        steps = self.reach * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, 0, 1.0], [0, 0, -1.0]])
         around = self(XYZ[..., None, :] + steps)
-        return np.asarray(np.moveaxis(around[..., ::2, :] - around[..., 1::2, :], -2, -1) / (2 * _REACH))
+        return np.asarray(np.moveaxis(around[..., ::2, :] - around[..., 1::2, :], -2, -1) / (2 * self.reach))

@@ -50,8 +50,8 @@ def parse_crs(text: str, where: str = "CRS") -> CRS:
 
 #: A map's metre on the ground: units are converted, projections stretch.
 _SCALES = 0.1, 10.0
-#: Radii of bodies that ellipsoids describe, from asteroids to Jupiter, metres.
-_RADII = 1e5, 1e8
+#: Radii of bodies that ellipsoids describe, from Phobos to Jupiter, metres; those of planets in kilometres are not.
+_RADII = 1e4, 1e8
 
 
 def _unusable(crs: CRS) -> str:
