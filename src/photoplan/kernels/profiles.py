@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.normals import _hit_normal
-from photoplan.kernels.pyramid import Pyramid, leave
+from photoplan.kernels.pyramid import Pyramid
 from photoplan.kernels.raycast import (
     ASK,
     MISS,
     OVER,
     SURFACE,
     Faces,
-    _cell,
+    _block,
     _span,
     _through_mesh,
 )
@@ -110,21 +110,14 @@ def follow_columns(
         local[2], local[5], local[6] = line[2] - frame[4], line[5], line[6]
         u, end, level = ray[7], ray[9], last
         while rows[i] >= fan[4]:
-            col = _cell(local[0] + u * local[3], local[3], posts.shape[1] - 1)
-            row = _cell(local[1] + u * local[4], local[4], posts.shape[0] - 1)
-            bx, by = col >> level, row >> level
-            out = min(leave(bx, level, local[0], local[3]), leave(by, level, local[1], local[4]))
-            if not out > u:
-                # Beyond the outer edge, by rounding.
-                out = end
+            mesh, block, out = _block(posts, levels, level, local, u, end)
             stop = min(out, end)
-            block = levels[level, 0] + by * levels[level, 2] + bx
             t, result = stop, MISS
             if low[block] <= high[block] and _span(local, u, stop)[0] <= high[block]:
                 if level > 0:
                     level -= 1
                     continue
-                t, _, result = _through_mesh(posts, faces, (col, row), local, (u, stop), OVER)
+                t, _, result = _through_mesh(posts, faces, mesh, local, (u, stop), OVER)
             if result == MISS:
                 u, level = out, min(level + 1, last)
                 if out >= end:

@@ -234,6 +234,21 @@ def _through_mesh(
 
 
 @inner
+def _block(
+    posts: NDArray[np.float32], levels: NDArray[np.int64], level: int, ray: NDArray[np.float64], u: float, end: float
+) -> tuple[tuple[Any, Any], Any, float]:
+    """The mesh, column and row, in which a ray is at u; the block of a level around it; where the ray leaves that."""
+    col = _cell(ray[0] + u * ray[3], ray[3], posts.shape[1] - 1)
+    row = _cell(ray[1] + u * ray[4], ray[4], posts.shape[0] - 1)
+    bx, by = col >> level, row >> level
+    out = min(leave(bx, level, ray[0], ray[3]), leave(by, level, ray[1], ray[4]))
+    if not out > u:
+        # Beyond the outer edge, by rounding.
+        out = end
+    return (col, row), levels[level, 0] + by * levels[level, 2] + bx, out
+
+
+@inner
 def _follow(
     posts: NDArray[np.float32], pyramid: Pyramid, faces: Faces, ray: NDArray[np.float64], state: int
 ) -> tuple[float, Any, Any]:
@@ -247,16 +262,9 @@ def _follow(
     last = levels.shape[0] - 1
     level = last
     while True:
-        col = _cell(ray[0] + u * ray[3], ray[3], posts.shape[1] - 1)
-        row = _cell(ray[1] + u * ray[4], ray[4], posts.shape[0] - 1)
-        bx, by = col >> level, row >> level
-        out = min(leave(bx, level, ray[0], ray[3]), leave(by, level, ray[1], ray[4]))
-        if not out > u:
-            # Beyond the outer edge, by rounding.
-            out = end
+        mesh, block, out = _block(posts, levels, level, ray, u, end)
         stop = min(out, end)
         lowest, highest = _span(ray, u, stop)
-        block = levels[level, 0] + by * levels[level, 2] + bx
         if not low[block] <= high[block]:
             state = NONE
         elif lowest > high[block]:
@@ -267,7 +275,7 @@ def _follow(
             level -= 1
             continue
         else:
-            t, state, result = _through_mesh(posts, faces, (col, row), ray, (u, stop), state)
+            t, state, result = _through_mesh(posts, faces, mesh, ray, (u, stop), state)
             if result != MISS:
                 return t, state, result
         if out >= end:
