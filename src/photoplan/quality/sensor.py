@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
+from photoplan.quality.apertures import pupil_transfer
 
 Array = NDArray[np.float64]
 
@@ -103,9 +104,7 @@ def diffraction_cutoff(f_number: float, wavelength_nm: float) -> float:
 
 
 def diffraction_mtf(frequency: ArrayLike, cutoff: float) -> Array:
-    """MTF of a perfect lens with a circular stop in incoherent light: 2/π (arccos v − v √(1 − v²)), v = f / cutoff.
-
-    The autocorrelation of a disc, Goodman, Introduction to Fourier Optics, chapter 6.
+    """MTF of a perfect lens with a circular stop in incoherent light, see `pupil_transfer`.
 
     Raises
     ------
@@ -114,8 +113,7 @@ def diffraction_mtf(frequency: ArrayLike, cutoff: float) -> Array:
     """
     if not cutoff > 0.0:
         raise InputError(f"a diffraction limit of {cutoff:g} LP/mm; it is positive")
-    v = np.clip(np.abs(np.asarray(frequency, float)) / cutoff, 0.0, 1.0)
-    return np.asarray(2.0 / pi * (np.arccos(v) - v * np.sqrt(1.0 - v * v)))
+    return pupil_transfer(np.abs(np.asarray(frequency, float)) / cutoff)
 
 
 #: By how many kelvin the dark current doubles (Behr 1989, §3.6.4).

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal, special
+from scipy import signal
 
 from photoplan.errors import InputError
+from photoplan.quality.apertures import disc_transfer, pupil_transfer
 from photoplan.quality.formation.parts import Aperture, Spread
 from photoplan.quality.formation.shapes import disc_share
 
@@ -34,31 +35,18 @@ def _sinc(x: _Array) -> _Array:
     return np.asarray(np.sinc(x))
 
 
-def _disc_transfer(radius: float, f: _Array) -> _Array:
-    """Transfer function of an even disc: 2 J1(2π r f) / (2π r f)."""
-    z = 2.0 * pi * radius * f
-    small = z < 1e-6
-    return np.where(small, 1.0, 2.0 * special.j1(z) / np.where(small, 1.0, z))
-
-
-def _airy_transfer(cutoff_length: float, f: _Array) -> _Array:
-    """Transfer function of a circular pupil without aberrations; zero from 1 / (λ N)."""
-    nu = np.minimum(f * cutoff_length, 1.0)
-    return np.asarray(2.0 / pi * (np.arccos(nu) - nu * np.sqrt(1.0 - nu**2)))
-
-
 def _smooth_transfer(spread: Spread, fx: _Array, fy: _Array, scale: float) -> _Array:
     """Transfer function of the parts that are functions of continuous place, without the tail; cycles per pixel."""
     sx, sy = (sigma * scale for sigma in spread.gaussian)
     result = np.exp(-2.0 * pi**2 * ((sx * fx) ** 2 + (sy * fy) ** 2))
     f = np.hypot(fx, fy)
     if spread.defocus:
-        result = result * _disc_transfer(spread.defocus * scale / 2.0, f)
+        result = result * disc_transfer(spread.defocus * scale / 2.0, f)
     if spread.motion:
         along = radians(spread.motion_deg)
         result = result * _sinc(spread.motion * scale * (cos(along) * fx + sin(along) * fy))
     if spread.diffraction:
-        result = result * _airy_transfer(spread.diffraction * scale, f)
+        result = result * pupil_transfer(spread.diffraction * scale * f)
     return np.asarray(result)
 
 
@@ -101,7 +89,7 @@ def aperture_transfer(aperture: Aperture, fx: _Array, fy: _Array) -> _Array:
     if aperture.shape == "square":
         return _sinc(fx * wx) * _sinc(fy * wy)
     if aperture.shape == "round":
-        return _disc_transfer(0.5, np.hypot(fx * wx, fy * wy))
+        return disc_transfer(0.5, np.hypot(fx * wx, fy * wy))
     return np.ones(np.broadcast_shapes(np.shape(fx), np.shape(fy)))
 
 

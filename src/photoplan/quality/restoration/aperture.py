@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import j1
 
 from photoplan.errors import InputError
+from photoplan.quality.apertures import disc_transfer
 
 #: Frequencies per axis over which the series of the inverse is summed.
 _GRID = 256
@@ -32,9 +32,7 @@ def aperture_transfer(
     """
     if shape == "square":
         return np.asarray(np.sinc(ratio * u) * np.sinc(ratio * v))
-    argument = pi * ratio * np.hypot(u, v)
-    safe = np.where(argument > 1e-9, argument, 1.0)
-    return np.asarray(np.where(argument > 1e-9, 2.0 * j1(safe) / safe, 1.0))
+    return disc_transfer(ratio / 2.0, np.hypot(u, v))
 
 
 def aperture_filter(shape: Literal["square", "round"], ratio: float = 1.0, half: int = 4) -> NDArray[np.float64]:

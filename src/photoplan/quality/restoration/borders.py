@@ -15,6 +15,7 @@ from photoplan.geometry.grid import Window
 from photoplan.kernels.convolve import CHUNK, EVEN_TAPS, GENERAL_TAPS, convolve_even, convolve_general
 from photoplan.kernels.extend import extend_oddly
 from photoplan.kernels.jit import is_ready
+from photoplan.kernels.shift_bands import limits_of
 from photoplan.quality.restoration.filters import FilterKernel
 
 #: Columns of zeros that a source has before and behind its pixels, for vectors and unrolled loops.
@@ -100,14 +101,6 @@ class Convolution:
 
     def _code(self) -> Any:
         return convolve_even if self.even else convolve_general
-
-
-def limits_of(dtype: np.dtype[Any]) -> tuple[float, float]:
-    """Least and largest whole number of a type; low > high: it is floating point."""
-    if dtype.kind == "f":
-        return 1.0, 0.0
-    limits = np.iinfo(dtype)
-    return float(limits.min), float(limits.max)
 
 
 #: Values that are kept for the next tile; larger arrays are made and given back (64 MiB).

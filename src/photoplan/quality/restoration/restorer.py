@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.convolve import round_clipped
+from photoplan.kernels.shift_bands import limits_of
 from photoplan.quality.linearise import Linearisation
-from photoplan.quality.restoration.borders import Convolution, Margin, Scratch, limits_of
+from photoplan.quality.restoration.borders import Convolution, Margin, Scratch
 from photoplan.quality.restoration.filters import RestorationFilter
 
 _SCRATCH = Scratch()
