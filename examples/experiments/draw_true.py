@@ -20,7 +20,7 @@ from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.faces import Faces
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.objects import ObjectSurface
-from photoplan.surfaces.polygon_faces import triangles_of
+from photoplan.surfaces.polygon_faces import filled
 from photoplan.targets.map import MapTarget
 
 #: Middle, length, width, eaves and ridge of houses, metres.
@@ -83,7 +83,7 @@ def photo(camera: FrameCamera, scene: ObjectSurface, polygon: NDArray[np.int64])
 
 def draw_true(resolution: float = 0.25) -> Figure:
     """Ordinary and true orthophoto side by side, outlines of roofs and deck in red."""
-    corners, polygon = triangles_of(polygons(), [str(k) for k in range(len(polygons()))], "scene")
+    corners, polygon, _ = filled(polygons(), [str(k) for k in range(len(polygons()))])
     faces = Faces(corners, np.ones(len(corners), bool), polygon.astype(np.int32), ("",) * len(polygons()))
     scene = ObjectSurface(LevelSurface(0.0), faces)
     middle = Affine2D(1.0, 0.0, (SIZE[0] - 1) / 2, 0.0, -1.0, (SIZE[1] - 1) / 2)

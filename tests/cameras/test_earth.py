@@ -15,7 +15,7 @@ from photoplan.cameras.curved import curved_camera
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.refraction import Refraction, refractivity
+from photoplan.cameras.refraction import Refraction, _profile
 from photoplan.cameras.warped import WarpedCamera
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.local import LocalFrame, earth_radius
@@ -224,7 +224,8 @@ def traced(H: float, h: float, alpha: float) -> tuple[float, float]:
     """Horizontal distance at which a ray that arrives at H under `alpha` left h, by Snell through 20 000 layers."""
     z = np.linspace(h, H, 20_001)
     z = (z[1:] + z[:-1]) / 2
-    sine = np.sin(alpha) * (1 + refractivity(H)) / (1 + refractivity(z))
+    at_H, at_z = _profile(np.array(H))[0], _profile(z)[0]
+    sine = np.sin(alpha) * (1 + at_H) / (1 + at_z)
     return float((sine / np.sqrt(1 - sine**2)).mean() * (H - h)), H - h
 
 

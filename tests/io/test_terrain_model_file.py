@@ -181,7 +181,7 @@ def test_many_threads_and_a_pickled_copy(model: ModelReader) -> None:
     """With a cache that holds two units, so that every thread reads again and again."""
     small = ModelReader(model.path, cache_bytes=20_000)
     copy = pickle.loads(pickle.dumps(small))
-    assert copy.header == small.header and copy.cached_bytes == 0
+    assert copy.header == small.header and copy._cache.bytes == 0
 
     def look(number: int) -> bool:
         column, row = PLACES[number * 7 % len(PLACES)]
@@ -190,7 +190,7 @@ def test_many_threads_and_a_pickled_copy(model: ModelReader) -> None:
 
     with ThreadPoolExecutor(8) as pool:
         assert all(pool.map(look, range(200)))
-    assert 0 < small.cached_bytes <= 20_000
+    assert 0 < small._cache.bytes <= 20_000
 
 
 def test_a_model_that_was_replaced_is_noticed(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import count, product
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,29 @@ from photoplan.errors import PhotoplanError
 from photoplan.io.result_log import ResultLog
 from photoplan.radiometry import seams
 from photoplan.radiometry.seams import SeamParts, _Level
-from photoplan.radiometry.shown import ArrayMemory, Shown, layers_of
+from photoplan.radiometry.shown import SeamLayer, Shown, features_of
+
+
+class ArrayMemory:
+    """A store that ends with the process."""
+
+    def __init__(self) -> None:
+        self._kept: dict[int, NDArray[np.float32]] = {}
+        self._numbers = count()
+
+    def keep(self, values: NDArray[np.float32], /) -> int:
+        """Keep an array; its number."""
+        number = next(self._numbers)
+        self._kept[number] = values
+        return number
+
+    def rows(self, at: int, shape: tuple[int, int, int], first: int, last: int, /) -> NDArray[np.float32]:
+        """Some of its rows."""
+        return self._kept[at][first:last]
+
+
+def layers_of(image: Shown, store: ArrayMemory) -> tuple[SeamLayer, ...]:
+    return tuple(each.kept(store) for each in features_of(image))
 
 
 def find_seams(

@@ -8,9 +8,9 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.thinned import examples
+from tools.town import triangles_of
 
 from photoplan.errors import InputError, UsageError
-from photoplan.surfaces.polygon_faces import distance_weighted, triangles_of
 from photoplan.surfaces.quadtree import decompose
 
 
@@ -106,17 +106,6 @@ def test_fault_19_polygons_that_cross_themselves_or_have_no_height_are_named() -
     square = np.array([(0.0, 0, 1), (4, 0, 1), (4, 4, 1), (0, 4, 1)])
     with pytest.raises(InputError, match=r"(?s)test: 1 polygon cannot.*'leaky' crosses itself"):
         triangles_of([[square, hole]], ["leaky"], "test")
-
-
-def test_weighted_by_distance_a_vertex_keeps_its_height_and_an_edge_does_not() -> None:
-    ring = np.array([(0.0, 0, 10), (100, 0, 10), (100, 10, 16), (0, 10, 16)])
-    np.testing.assert_allclose(distance_weighted(ring, ring[:, :2]), ring[:, 2], atol=1e-6)
-    # By hand: 50 m to two vertices of 10, the root of 2600 m to two of 16.
-    near, far = 1 / 50, 1 / np.sqrt(2600)
-    assert distance_weighted(ring, [50, 0]) == pytest.approx((10 * near + 16 * far) / (near + far))
-    assert distance_weighted(ring, [[50.0, 5], [50, 0]]).shape == (2,)
-    inside = distance_weighted(ring, np.random.default_rng(0).uniform(0, 10, (50, 2)))
-    assert (inside > 10).all() and (inside < 16).all()
 
 
 @settings(max_examples=examples(12, 30), deadline=None)

@@ -10,7 +10,7 @@ import shapely
 
 from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.surfaces.faces import Faces
-from photoplan.surfaces.polygon_faces import triangles_of
+from photoplan.surfaces.polygon_faces import cannot_be_used, filled
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,14 @@ def houses(count: int, seed: int, side: float = 140.0, ground=None) -> list[Hous
         ridge = eaves + rng.choice([0.0, 4.0])
         found.append(House(x, y, rng.uniform(0, np.pi), *rng.uniform(5, 25, 2), foot, eaves, ridge))
     return found
+
+
+def triangles_of(polygons, names, where: str):
+    """Corners of triangles and their polygons, all of which can be used."""
+    corners, polygon, faults = filled(polygons, names)
+    if faults:
+        raise cannot_be_used(where, faults)
+    return corners, polygon
 
 
 def faces_of(polygons, paints=True, names=None) -> Faces:

@@ -23,11 +23,6 @@ _TOP = _SEA_LEVEL * (1.0 - _LAPSE * _TROPOPAUSE) ** _POWER
 _NEAR = 2.0
 
 
-def refractivity(z: ArrayLike) -> NDArray[np.float64]:
-    """n − 1 of the standard atmosphere for visible light at height z above sea level, metres."""
-    return _profile(np.asarray(z, float))[0]
-
-
 def _profile(z: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """n − 1 at height z, and its integral from sea level to z."""
     u = 1.0 - _LAPSE * np.minimum(z, _TROPOPAUSE)

@@ -83,7 +83,7 @@ def find_seams(
     Parameters
     ----------
     images : sequence
-        For each its layers, see `layers_of`, none if it shows nothing; `store` holds them.
+        For each its layers, see `features_of`, none if it shows nothing; `store` holds them.
     weight : ndarray of float32, shape (height, width)
         What a seam costs at a place beside others; 1 usually, more where none should run.
     fixed : ndarray of uint16, shape (height, width), optional

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import count
 from typing import Protocol
 
 import numpy as np
@@ -28,24 +27,6 @@ class ArrayStore(Protocol):
     def rows(self, at: int, shape: tuple[int, int, int], first: int, last: int, /) -> _Floats:
         """Rows from `first` to before `last` of an array of a shape."""
         ...
-
-
-class ArrayMemory:
-    """A store that ends with the process."""
-
-    def __init__(self) -> None:
-        self._kept: dict[int, _Floats] = {}
-        self._numbers = count()
-
-    def keep(self, values: _Floats, /) -> int:
-        """Keep an array; its number."""
-        number = next(self._numbers)
-        self._kept[number] = values
-        return number
-
-    def rows(self, at: int, shape: tuple[int, int, int], first: int, last: int, /) -> _Floats:
-        """Some of its rows."""
-        return self._kept[at][first:last]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +89,8 @@ class SeamFeatures:
         return SeamLayer(store.keep(self.values), (self.row, self.col, height, width), depth)
 
 
-def layers_of(image: Shown, store: ArrayStore) -> tuple[SeamLayer, ...]:
-    """An image on its own pixels, on those twice as large and so on till it has one."""
-    return tuple(each.kept(store) for each in features_of(image))
-
-
 def features_of(image: Shown) -> tuple[SeamFeatures, ...]:
-    """The same before it is kept."""
+    """An image on its own pixels, on those twice as large and so on till it has one."""
     found = []
     while True:
         height, width = image.valid.shape

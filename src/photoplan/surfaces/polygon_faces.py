@@ -1,4 +1,4 @@
-"""Polygons in space as triangles, and heights inside polygons (Behr 1989, §6.2.2)."""
+"""Polygons in space as triangles (Behr 1989, §6.2.2, has heights of squares instead: design/022)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
@@ -26,40 +26,6 @@ _FARTHEST = 1e9
 _NAMED = 100
 
 
-def triangles_of(
-    polygons: Sequence[Rings], names: Sequence[str], where: str
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Triangles that fill polygons between their vertices, whose heights they have.
-
-    Inside a plane polygon the height is that of the plane; inside another one that of a constrained Delaunay
-    triangulation of its vertices, seen along its mean normal (Newell's), so that upright and overhanging polygons are
-    as good as level ones.
-
-    Parameters
-    ----------
-    polygons : sequence of `Rings`
-    names : sequence of str
-        Of the polygons, for messages.
-    where : str
-        What a message begins with.
-
-    Returns
-    -------
-    corners : ndarray, shape (n, 3, 3)
-    polygon : ndarray, shape (n,)
-        Place of the polygon of each triangle.
-
-    Raises
-    ------
-    InputError
-        Polygons have vertices without a height, or cross themselves; they are named.
-    """
-    corners, polygon, faults = filled(polygons, names)
-    if faults:
-        raise cannot_be_used(where, faults)
-    return corners, polygon
-
-
 def cannot_be_used(where: str, faults: Mapping[str, str]) -> InputError:
     """The error that names polygons one by one, each with what is wrong with it."""
     told = "".join(f"\n  {name!r} {fault}" for name, fault in list(faults.items())[:_NAMED])
@@ -71,7 +37,26 @@ def cannot_be_used(where: str, faults: Mapping[str, str]) -> InputError:
 def filled(
     polygons: Sequence[Rings], names: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], dict[str, str]]:
-    """Triangles as of `triangles_of`, and what is wrong with polygons that have none, by name."""
+    """Triangles that fill polygons between their vertices, whose heights they have.
+
+    Inside a plane polygon the height is that of the plane; inside another one that of a constrained Delaunay
+    triangulation of its vertices, seen along its mean normal (Newell's), so that upright and overhanging polygons are
+    as good as level ones.
+
+    Parameters
+    ----------
+    polygons : sequence of `Rings`
+    names : sequence of str
+        Of the polygons, for what is wrong with them.
+
+    Returns
+    -------
+    corners : ndarray, shape (n, 3, 3)
+    polygon : ndarray, shape (n,)
+        Place of the polygon of each triangle.
+    faults : dict
+        By name, what is wrong with polygons that have no triangles, see `cannot_be_used`.
+    """
     flat: list[Any] = []
     bases: list[_Base | None] = []
     faults: dict[str, str] = {}
@@ -157,24 +142,3 @@ def _axes(x: float, y: float, z: float) -> NDArray[np.float64]:
         length = math.hypot(x, y)
         u = -y / length, x / length, 0.0
     return np.array([u, (y * u[2] - z * u[1], z * u[0] - x * u[2], x * u[1] - y * u[0])])
-
-
-def distance_weighted(vertices: ArrayLike, XY: ArrayLike) -> NDArray[np.float64]:
-    """Heights inside a polygon from those of its vertices, each weighted by one over its distance on the map.
-
-    The way of Behr 1989, §6.2.2 (there without a formula); at a vertex its own height. Between two vertices of an edge
-    all others pull as well, so that neither a plane nor an edge is kept (design/022).
-
-    Parameters
-    ----------
-    vertices : array_like, shape (k, 3)
-    XY : array_like, shape (..., 2)
-
-    Returns
-    -------
-    ndarray, shape (...)
-    """
-    vertices, XY = np.asarray(vertices, float), np.asarray(XY, float)
-    away = np.linalg.norm(XY[..., None, :] - vertices[:, :2], axis=-1)
-    weight = 1.0 / np.maximum(away, 1e-9)
-    return np.asarray((weight * vertices[:, 2]).sum(axis=-1) / weight.sum(axis=-1))

@@ -13,8 +13,6 @@ from photoplan.errors import InputError, UsageError
 from photoplan.kernels import flow as kernels
 
 FlowMethod = Literal["d8", "dinf"]
-DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
-"""Names of the directions 0 to 7."""
 #: Bytes of one cell while it is computed.
 CELL_BYTES = 80
 

@@ -135,11 +135,6 @@ class ModelReader:
         """Where the units lie."""
         return self.header.layout
 
-    @property
-    def cached_bytes(self) -> int:
-        """Bytes of units held now."""
-        return self._cache.bytes
-
     def unit(self, column: int, row: int) -> Unit | None:
         """The unit, or None if it is empty (or not of the layout)."""
         layout = self.layout

@@ -40,7 +40,7 @@ class TerrainReader:
 
     Nodata, alpha, mask and blocks that were never written follow the rule of `photoplan.io.validity`; NaN and values
     of ±1e30 and more are void as well. Other values that are no height on Earth (below -12 000 m or above 9 000 m), and
-    the usual nodata values where none is declared, are refused with their count, or taken as void if `void_outside`.
+    the usual nodata values where none is declared, are refused with their count.
 
     Raises
     ------
@@ -53,8 +53,6 @@ class TerrainReader:
     """The file."""
     cache_bytes: int = 64 << 20
     """Bytes of blocks that are kept."""
-    void_outside: bool = False
-    """Take values that are no height on Earth as void instead of refusing them."""
     limits: RasterLimits = TERRAIN_LIMITS
     """How much the header may promise."""
     allow_remote: bool = False
@@ -93,11 +91,6 @@ class TerrainReader:
     def size(self) -> tuple[int, int]:
         """Columns and rows of the grid."""
         return self.info.size
-
-    @property
-    def cached_bytes(self) -> int:
-        """Bytes of blocks held now."""
-        return self._cache.bytes
 
     def read(self, window: Window) -> NDArray[np.float32]:
         """Heights of a window inside the grid, shape (height, width), in the file's unit; NaN where there is none."""
@@ -149,17 +142,15 @@ class TerrainReader:
     def _check_range(
         self, stored: NDArray[Any], heights: NDArray[np.float64], void: NDArray[np.bool_], window: Window
     ) -> None:
-        """Refuse values that are no heights, or add them to `void`."""
+        """Refuse values that are no heights."""
         metres = self.info.metres_per_unit or 1.0
         wrong = ~void & ((heights * metres < LOWEST) | (heights * metres > HIGHEST))
         if self.info.nodata is None:
             wrong |= ~void & np.isin(stored, USUAL_NODATA)
         if not wrong.any():
             return
-        if not self.void_outside:
-            raise InputError(
-                f"{self.path}: {int(wrong.sum())} values in window col {window.col} row {window.row} {window.width} × "
-                f"{window.height} are no heights (allowed {LOWEST:g} to {HIGHEST:g} m), for one "
-                f"{heights[wrong][0]:g}; declare the nodata value (`gdal_edit -a_nodata {stored[wrong][0]:g}`)"
-            )
-        void |= wrong
+        raise InputError(
+            f"{self.path}: {int(wrong.sum())} values in window col {window.col} row {window.row} {window.width} × "
+            f"{window.height} are no heights (allowed {LOWEST:g} to {HIGHEST:g} m), for one "
+            f"{heights[wrong][0]:g}; declare the nodata value (`gdal_edit -a_nodata {stored[wrong][0]:g}`)"
+        )

@@ -35,7 +35,6 @@ from photoplan.targets.base import Target
 from photoplan.targets.view import ViewTarget
 from photoplan.terrain.shading import RAMPS, Lighting, Ramp, built_in_ramp, shaded
 
-OWN = ("shade", "tint", "slope")
 #: Colours of slopes, at degrees.
 SLOPES = Ramp(
     np.array([0.0, 10, 20, 30, 45]),
@@ -189,7 +188,9 @@ class Resampled:
             owner = best_photos([source.camera for source in self.sources], scene.seen, scene.surface)
             owners = _Given(window, owner)
         tiles = Tiles(window, max(window.width, window.height), np.zeros(1, np.uint32), rows)
-        plan = ProductPlan("view", tuple(map(str, rows)), scene.target, rule, tiles, owners)
+        plan = ProductPlan(
+            name="view", sources=tuple(map(str, rows)), target=scene.target, rule=rule, tiles=tiles, owners=owners
+        )
         painted = render(plan, Tile(0, window, rows), self.sources, scene, scene.kernel)
         if painted.values is None or painted.valid is None:
             return under, np.zeros(under.shape[1:], bool)

@@ -7,7 +7,6 @@ of grey values.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +31,6 @@ class EdgeSettings:
     """Distance in pixels up to which pixels are used (8 standard deviations of wider edges); light that is spread
     farther is estimated. Infinite: the whole region, for evenly lit targets: uneven light across the edge looks like
     stray light."""
-    shading: Literal["none", "along", "plane"] = "along"
-    """Whether both levels may change linearly: not at all, along the edge, or along and across it. Across, a slope can
-    hardly be told from stray light, so that figures become less certain."""
     blocks: int = 20
     """Into how many independent profiles an edge is split at most; a block has two rows at least."""
     confidence: float = 0.95
@@ -59,8 +55,6 @@ class EdgeSettings:
             raise InputError(f"an interval needs 5 blocks of an edge at least; given: {self.blocks}")
         if not self.reach >= 4.0:
             raise InputError(f"the reach of an edge is 4 pixels at least; given: {self.reach}")
-        if self.shading not in ("none", "along", "plane"):
-            raise InputError(f"shading is none, along or plane; given: {self.shading!r}")
         if not 0.5 <= self.confidence < 1.0:
             raise InputError(f"a confidence is 0.5 or more and below 1; given: {self.confidence}")
 

@@ -172,7 +172,7 @@ def measure_edge(
     every = EdgePixels.of(image, mask, line.direction)
     if every.light.size > MANY:
         every = every.where(np.abs(line.distance(every.across, every.along)) <= max(4.0 * chosen.reach, 64.0))
-    line, model, levels = fit_line(every, line, chosen.curve, chosen.shading != "none", _FIRST_STEPS)
+    line, model, levels = fit_line(every, line, chosen.curve, True, _FIRST_STEPS)
     near = np.abs(line.distance(every.across, every.along)) < 2.5 * model.total
     if np.count_nonzero(near) > 40 and determines(every.where(near), line, model, chosen.curve):
         line, model, levels = fit_line(every.where(near), line, chosen.curve, False)
@@ -182,11 +182,11 @@ def measure_edge(
     inside = (distance >= low) & (distance <= high)
     seen, distance = every.where(inside), distance[inside]
     span = _span(seen, distance, model, line, chosen)
-    weight, first_noise = _weights(seen, distance, line, model, chosen)
+    weight, first_noise = _weights(seen, distance, line, model)
     own = grain(seen.light, seen.along, seen.across)
     check_step(float(levels[1]), first_noise, own, chosen)
     try:
-        fit = _fit(seen, (distance, weight), line, (model, low, high), chosen)
+        fit = _fit(seen, distance, weight, line, ProfileBasis.between(model, low, high), chosen)
     except np.linalg.LinAlgError as error:
         raise InputError("the region's pixels do not determine a profile; choose a larger region") from error
     return _measured(
@@ -238,14 +238,14 @@ def _span(
 
 
 def _weights(
-    pixels: EdgePixels, distance: NDArray[np.float64], line: EdgeLine, model: PixelEdge, settings: EdgeSettings
+    pixels: EdgePixels, distance: NDArray[np.float64], line: EdgeLine, model: PixelEdge
 ) -> tuple[NDArray[np.float64], float]:
     """Weights of pixels whose noise differs between dark and bright side, and their mean noise.
 
     The variance of photon noise grows in proportion to the light, so it is interpolated between both sides.
     """
     rise = model.profile(distance)[0]
-    design = np.concatenate([rise[:, None], _levels(pixels, distance, line, rise, settings)], axis=1)
+    design = np.concatenate([rise[:, None], _levels(pixels, distance, line, rise)], axis=1)
     residual = -solve(design, pixels.light).residuals
     dark, bright = residual[distance < -2.0 * model.total], residual[distance > 2.0 * model.total]
     if min(dark.size, bright.size) < 30:
@@ -259,29 +259,24 @@ def _weights(
 
 
 def _levels(
-    pixels: EdgePixels, distance: NDArray[np.float64], line: EdgeLine, rise: NDArray[np.float64], settings: EdgeSettings
+    pixels: EdgePixels, distance: NDArray[np.float64], line: EdgeLine, rise: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Columns of the dark level and of the changes of both levels along, and across, the edge."""
-    columns = [np.ones_like(distance)]
-    if settings.shading != "none":
-        t = (pixels.along - line.middle) / max(float(np.ptp(pixels.along)), 1.0)
-        columns += [t * (1.0 - rise), t * rise]
-    if settings.shading == "plane":
-        columns += [distance * (1.0 - rise) / 10.0, distance * rise / 10.0]
-    return np.stack(columns, axis=1)
+    """Columns of the dark level and of the changes of both levels along the edge: across it, a slope can hardly be told
+    from stray light."""
+    t = (pixels.along - line.middle) / max(float(np.ptp(pixels.along)), 1.0)
+    return np.stack([np.ones_like(distance), t * (1.0 - rise), t * rise], axis=1)
 
 
 def _fit(
     pixels: EdgePixels,
-    observed: tuple[NDArray[np.float64], NDArray[np.float64]],
+    distance: NDArray[np.float64],
+    weight: NDArray[np.float64],
     line: EdgeLine,
-    window: tuple[PixelEdge, float, float],
+    basis: ProfileBasis,
     settings: EdgeSettings,
 ) -> EdgeFit:
-    distance, weight = observed
-    model, low, high = window
-    basis = ProfileBasis.between(model, low, high)
-    extra = _levels(pixels, distance, line, model.profile(distance)[0], settings)
+    model = basis.model
+    extra = _levels(pixels, distance, line, model.profile(distance)[0])
     near = pixels.along[np.abs(distance) <= max(model.total, 0.5)]
     blocks = int(min(settings.blocks, max(5, np.ptp(near) // 2)))
     borders = np.linspace(near.min(), near.max() + 1.0, blocks + 1)[1:-1]
@@ -354,9 +349,16 @@ def _residual_checks(found: _Context, step: float) -> tuple[float, float]:
     rise, spread, _ = fit.basis.model.profile(found.distance)
     table = np.linspace(fit.basis.low, fit.basis.high, 4 * int(fit.basis.high - fit.basis.low) * 8)
     fitted = np.interp(found.distance, table, fit.basis.edge(table) @ fit.shape)
-    fitted += _levels(pixels, found.distance, found.line, rise, settings) @ fit.levels
+    fitted += _levels(pixels, found.distance, found.line, rise) @ fit.levels
     value = (pixels.light - fitted) / step
-    residuals = EdgeResiduals(pixels.across, pixels.along, found.distance, value, spread, fit.basis.model.total)
+    residuals = EdgeResiduals(
+        across=pixels.across,
+        along=pixels.along,
+        distance=found.distance,
+        value=value,
+        spread=spread,
+        width=fit.basis.model.total,
+    )
     structure = check_sides(residuals, settings.most_structure)
     return check_line(residuals, settings.most_bend, settings.curve), structure
 

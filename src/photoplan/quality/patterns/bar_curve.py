@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from math import hypot, pi
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.patterns.bars import BarContrast, fundamental_of_square
-
-Array = NDArray[np.float64]
 
 #: Bars with less bend than this have a flat middle, where their levels are those of wide areas.
 FLAT = 0.02

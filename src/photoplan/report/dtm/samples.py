@@ -96,16 +96,6 @@ class PlottedError:
     """Difference from what its neighbours predict, in standard deviations."""
 
 
-@dataclass(frozen=True)
-class Note:
-    """Something found in the measurements, and what was done about it."""
-
-    kind: str
-    text: str
-    X: float = float("nan")
-    Y: float = float("nan")
-
-
 @dataclass(frozen=True, eq=False)
 class BuildFacts:
     """All that the report shows."""
@@ -140,7 +130,7 @@ class BuildFacts:
     gross: tuple[PlottedError, ...]
     suspects: tuple[PlottedError, ...] = ()
     """Points that are used, but look like parts of gross errors."""
-    notes: tuple[Note, ...] = ()
+    notes: tuple[Finding, ...] = ()
     """What cleaning found."""
     settings: tuple[tuple[str, str], ...] = ()
     inputs: tuple[tuple[str, str], ...] = ()
@@ -187,10 +177,7 @@ def build_facts(
         effects=_effects(built, measured, surface),
         gross=_errors(built, measured, surface, fit.gross, fit.residuals[fit.gross]),
         suspects=_errors(built, measured, surface, fit.suspects[:, 0].astype(np.int64), fit.suspects[:, 2:]),
-        notes=(
-            *(Note("while reading", note) for note in measured.notes),
-            *(Note(f.kind, f.text, f.X, f.Y) for f in findings),
-        ),
+        notes=(*(Finding("while reading", note) for note in measured.notes), *findings),
         settings=_settings(built),
         inputs=tuple((path.name, _size(path)) for path in inputs),
         limit=built.plan.settings.gross,
