@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+
+if TYPE_CHECKING:
+    from photoplan.events import Events
+    from photoplan.products.run import Run
 
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIRECTIONS = ["camera-to-ground", "ground-to-camera"]
@@ -223,3 +228,29 @@ executing = several(
     json_option,
     quiet_option,
 )
+
+
+@dataclass(frozen=True)
+class How:
+    """The options of `executing`, as values."""
+
+    workers: int
+    executor: str
+    memory: int | None
+    overwrite: bool
+    quicklook: bool
+    as_json: bool
+    quiet: bool
+
+    @classmethod
+    def from_options(cls, options: dict[str, Any]) -> How:
+        """Take the options of `executing` out of the options of a verb."""
+        names = ("workers", "executor", "memory", "overwrite", "as_json", "quiet")
+        return cls(quicklook=not options.pop("no_quicklook"), **{name: options.pop(name) for name in names})
+
+    def run(self, events: Events) -> Run:
+        """What is asked of a run, told to `events`."""
+        from photoplan.plain import pick
+        from photoplan.products.run import Run
+
+        return Run(**pick(self, "workers", "executor", "memory", "overwrite", "quicklook"), events=events)

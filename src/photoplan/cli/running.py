@@ -4,44 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
+from photoplan.cli.options import How
 from photoplan.cli.output import can_draw, show_json
 from photoplan.cli.telling import Telling
 from photoplan.errors import TilesFailed
 from photoplan.io.project.model import Project
-from photoplan.plain import pick
 from photoplan.products.orthophoto.execution import ProductResult, execute, seams_path
 from photoplan.products.orthophoto.plan import OrthoPlan
-from photoplan.products.run import Run
-
-
-@dataclass(frozen=True)
-class How:
-    """The options of `executing`, as values."""
-
-    workers: int
-    executor: str
-    memory: int | None
-    overwrite: bool
-    quicklook: bool
-    as_json: bool
-    quiet: bool
-
-    @classmethod
-    def from_options(cls, options: dict[str, Any]) -> How:
-        """Take the options of `executing` out of the options of a verb."""
-        names = ("workers", "executor", "memory", "overwrite", "as_json", "quiet")
-        return cls(quicklook=not options.pop("no_quicklook"), **{name: options.pop(name) for name in names})
-
-    def run(self, events: Telling) -> Run:
-        """What is asked of a run, told to `events`."""
-        return Run(**pick(self, "workers", "executor", "memory", "overwrite", "quicklook"), events=events)
 
 
 def telling(how: How) -> Telling:

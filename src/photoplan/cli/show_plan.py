@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from photoplan.cli.options import How
 from photoplan.cli.output import can_draw, show, show_json
-from photoplan.cli.running import How
 from photoplan.events import Events
 from photoplan.products.orthophoto.plan import OrthoPlan
 from photoplan.products.orthophoto.plan_file import PlanFigures, check_plan_path, compile_figures, write_plan

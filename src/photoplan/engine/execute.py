@@ -128,7 +128,7 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
             again = compile_next(product, tile, cameras, surface, compiled, refused)
             values, valid = execute_tile(again, sources, kernel, (values, valid))
             compiled = _with_others(compiled, again, np.any(list(refused.values()), axis=0))
-        _blend(compiled, sources, kernel, (values, valid))
+        _blend(compiled, sources, kernel, values, valid)
         return _painted(compiled, values, valid)
     side = max(SMALLEST_PART, -(-max(window.width, window.height) // 2))
     cut = [replace(tile, window=part) for part in window.tiles(side)]
@@ -138,10 +138,9 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
 
 
 def _blend(
-    tile: CompiledTile, sources: Sequence[Source], kernel: str, onto: tuple[NDArray[Any], NDArray[np.bool_]]
+    tile: CompiledTile, sources: Sequence[Source], kernel: str, values: NDArray[Any], valid: NDArray[np.bool_]
 ) -> None:
     """Replace what is painted along seams by the weighted mean of the sources that pass into each other there."""
-    values, valid = onto
     if not tile.blends or not len(values):
         return
     # In float64: the least weights are those of sources that stand alone in the end.

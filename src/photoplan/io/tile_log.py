@@ -159,7 +159,9 @@ class TileLog:
                 if isinstance(error, OSError):
                     raise disk_error(self.path, error) from error
                 raise
-            self._places[index] = _Place(self._end + len(head), length, len(text), checksum, notes)
+            self._places[index] = _Place(
+                position=self._end + len(head), length=length, figures=len(text), checksum=checksum, notes=notes
+            )
             self._end += len(head) + length
 
     def read(self, index: int) -> bytes:
@@ -250,5 +252,10 @@ class TileLog:
                 found, left = zlib.crc32(part, found), left - len(part)
             if found != checksum:
                 return
-            yield index, _Place(position + figures, length, figures, checksum, (note0, note1))
+            yield (
+                index,
+                _Place(
+                    position=position + figures, length=length, figures=figures, checksum=checksum, notes=(note0, note1)
+                ),
+            )
             position = end

@@ -61,7 +61,13 @@ class Features:
 
     def where(self, keep: NDArray[Any]) -> Features:
         """The features at `keep` (mask or indices)."""
-        return Features(self.xy[keep], self.scale[keep], self.angle[keep], self.strength[keep], self.descriptors[keep])
+        return Features(
+            xy=self.xy[keep],
+            scale=self.scale[keep],
+            angle=self.angle[keep],
+            strength=self.strength[keep],
+            descriptors=self.descriptors[keep],
+        )
 
 
 def opencv() -> Any:
@@ -124,11 +130,11 @@ def _tile_features(
     p = descriptors[keep] / np.maximum(descriptors[keep].sum(axis=1, keepdims=True), 1e-9)
     k = settings.factor
     return Features(
-        (at[keep] + 0.5) * k - 0.5,
-        scale[keep] * k,
-        np.radians([found[i].angle for i in keep]),
-        np.array([found[i].response for i in keep], float),
-        np.clip(np.rint(np.sqrt(p) * DESCRIPTOR_UNIT), 0, 255).astype(np.uint8),
+        xy=(at[keep] + 0.5) * k - 0.5,
+        scale=scale[keep] * k,
+        angle=np.radians([found[i].angle for i in keep]),
+        strength=np.array([found[i].response for i in keep], float),
+        descriptors=np.clip(np.rint(np.sqrt(p) * DESCRIPTOR_UNIT), 0, 255).astype(np.uint8),
     )
 
 
@@ -149,7 +155,9 @@ def _spread(features: Features, settings: FeatureSettings, size: tuple[int, int]
 
 def _none() -> Features:
     empty = np.empty(0)
-    return Features(np.empty((0, 2)), empty, empty, empty, np.empty((0, 128), np.uint8))
+    return Features(
+        xy=np.empty((0, 2)), scale=empty, angle=empty, strength=empty, descriptors=np.empty((0, 128), np.uint8)
+    )
 
 
 def _joined(parts: list[Features]) -> Features:

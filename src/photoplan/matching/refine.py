@@ -263,12 +263,12 @@ def _accepted(
         variance[reference, k] = total / np.maximum(count, 1)
     keep = sure | (is_reference & (count > 0)[tracks.track])
     sigma = np.sqrt(np.where(keep[:, None], variance, np.nan))
-    refined = Tracks(tracks.track, tracks.image, xy, tracks.scale, tracks.angle, sigma)
+    refined = Tracks(track=tracks.track, image=tracks.image, xy=xy, scale=tracks.scale, angle=tracks.angle, sigma=sigma)
     others = ~is_reference
     return Refined(
-        refined.where(keep),
-        int((others & ~settled).sum()),
-        int((settled & ~alike).sum()),
-        int((alike & ~sure).sum()),
-        float(np.median(correlation[sure])) if sure.any() else float("nan"),
+        tracks=refined.where(keep),
+        unsettled=int((others & ~settled).sum()),
+        unlike=int((settled & ~alike).sum()),
+        uncertain=int((alike & ~sure).sum()),
+        correlation=float(np.median(correlation[sure])) if sure.any() else float("nan"),
     )

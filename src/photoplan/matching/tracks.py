@@ -104,7 +104,14 @@ def build_tracks(features: Sequence[Features], pairs: Sequence[PairMatches], sam
     apart = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1)]) if len(track) else scale
     bad = np.zeros(int(track.max()) + 1 if len(track) else 0, bool)
     bad[track[again & (apart > same)]] = True
-    every = Tracks(track.astype(np.int64), image, xy, scale, angle, np.full((len(track), 2), np.nan))
+    every = Tracks(
+        track=track.astype(np.int64),
+        image=image,
+        xy=xy,
+        scale=scale,
+        angle=angle,
+        sigma=np.full((len(track), 2), np.nan),
+    )
     return TracksFound(every.where(~again & ~bad[track]), int(bad.sum()))
 
 

@@ -9,6 +9,7 @@ __getattr__, __dir__, __all__ = public(
         "orientation.resection.direct": "resect_direct",
         "orientation.resection.model": "MeasuredPoints ResectSettings Resected",
         "orientation.intersection": "intersect",
+        "orientation.marks.alone": "find_mark",
         "orientation.bundle.adjust": "adjust_block",
         "orientation.bundle.block": "AdjustSettings Adjusted Block BlockCamera BlockImage",
         "orientation.start.block": "start_block",

@@ -100,7 +100,9 @@ def fit_skyline(pixels: Callable[[_Floats], _Floats], distance: _Floats, edge: _
     A = by_differences(distances, start, _STEP)
     covariance, correlated = _covariance(A / size[:, None], v / size, weight, where)
     _refuse_undetermined(covariance)
-    return SkylineFit(start, covariance, int(np.count_nonzero(weight)), len(where), correlated)
+    return SkylineFit(
+        step=start, covariance=covariance, used=int(np.count_nonzero(weight)), columns=len(where), correlated=correlated
+    )
 
 
 def _columns(xy: _Floats, edge: _Floats) -> NDArray[np.int64]:

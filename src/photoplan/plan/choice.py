@@ -115,7 +115,7 @@ class BestImage:
             """Penalties (images, height, width) before it is asked what hides the ground from images, and after."""
             for row in rows:
                 if row not in costs:
-                    costs[row], scales[row] = self._penalty(row, cameras[row], (ground, slope), drawn)
+                    costs[row], scales[row] = self._penalty(row, cameras[row], ground, slope, drawn)
                     np.logical_or(inside, np.isfinite(costs[row]), out=inside)
             cost = np.stack([costs[row] for row in rows])
             blind = cost if not self.paints_hidden else cost.copy()
@@ -173,12 +173,12 @@ class BestImage:
         self,
         row: int,
         camera: Projection,
-        sloping: tuple[TileGround, NDArray[np.float32]],
+        ground: TileGround,
+        slope: NDArray[np.float32],
         drawn: NDArray[np.uint16] | None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Penalty of each pixel without what hides it; infinite outside the image, and without a surface. Also its
         coarseness."""
-        ground, slope = sloping
         shape, (width, height) = ground.relief.shape, camera.size
         xy, near, values = np.empty((*shape, 2)), np.empty(shape), np.empty((4, *shape), np.float32)
         nodes, levels, corner = self._nodes(camera, ground)

@@ -152,7 +152,7 @@ def compile_anchors(
         boxes = ground.boxes(*_finer(boxes, keep, split_u, split_v, thin))
     if not done:
         return None
-    return _assemble(image, done, ground.ranges if wanted is None else wanted, residual, (rule.radius, longest))
+    return _assemble(image, done, ground.ranges if wanted is None else wanted, residual, rule.radius, longest)
 
 
 def _tremor(tremor: Tremor, ground: TileGround, image: _Image) -> TremorTable | None:
@@ -218,9 +218,8 @@ def _halved(rects: NDArray[np.int32], in_u: bool, in_v: bool) -> NDArray[np.int3
 
 
 def _assemble(
-    image: _Image, done: list[Piles], ranges: NDArray[np.float64], residual: float, margin: tuple[int, float]
+    image: _Image, done: list[Piles], ranges: NDArray[np.float64], residual: float, radius: int, longest: float
 ) -> Anchors | None:
-    radius, longest = margin
     rects, heights, corners = (np.concatenate(part) for part in zip(*done))
     starts = [0]
     if len(rects) > 1:

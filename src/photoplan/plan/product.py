@@ -143,38 +143,39 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Project
         relief = np.where(product.clip.rows(tile.window) > 0, relief, np.float32(np.nan))
     ground = TileGround.of(product.target, tile.window, relief)
     if product.feather is not None:
-        return _feathered(product, tile, cameras, (ground, tilt), surface)
+        return _feathered(product, tile, cameras, ground, tilt, surface)
     share = Share(None) if product.owners is None else product.owners.share(ground, cameras, surface)
-    return _compiled(product, tile, cameras, (ground, tilt), share)
+    return _compiled(product, tile, cameras, ground, tilt, share)
 
 
 def _feathered(
     product: ProductPlan,
     tile: Tile,
     cameras: Mapping[int, Projection],
-    depth: tuple[TileGround, NDArray[np.float32] | None],
+    ground: TileGround,
+    tilt: NDArray[np.float32] | None,
     surface: Surface,
 ) -> CompiledTile:
     """A tile whose sources pass into each other."""
     assert product.feather is not None and product.owners is not None
     wide = product.feather.around(tile.window)
-    ground = TileGround.of(product.target, wide, surface.relief(product.target, wide))
-    share = product.owners.share(ground, cameras, surface)
+    around = TileGround.of(product.target, wide, surface.relief(product.target, wide))
+    share = product.owners.share(around, cameras, surface)
     assert share.owner is not None
     at = tile.window.slices(wide)
     owner = np.ascontiguousarray(share.owner[at])
     hidden = None if share.hidden is None else np.ascontiguousarray(share.hidden[at])
-    made = _compiled(product, tile, cameras, depth, Share(owner, hidden))
+    made = _compiled(product, tile, cameras, ground, tilt, Share(owner, hidden))
     feather, blends = product.feather, []
     if len(feather.reaches) > 1:
-        tile, depth, at = replace(tile, window=wide), (ground, None), np.s_[:, :]
+        tile, ground, tilt, at = replace(tile, window=wide), around, None, np.s_[:, :]
     for row, (weights, seen) in feather.weights(share, wide, made.window).items():
         wanted = np.zeros(seen.shape, np.bool_)
         wanted[made.window.slices(wide)] = weights[-1] > 0
         if len(feather.reaches) > 1:
             wanted = _spread(wanted, feather.reaches[-2]) & seen
         mine = Share(np.where(wanted[at], np.uint16(row + 1), np.uint16(0)))
-        blends.append(Blend(weights, _compiled(product, tile, cameras, depth, mine)))
+        blends.append(Blend(weights, _compiled(product, tile, cameras, ground, tilt, mine)))
     return replace(made, blends=tuple(blends), reaches=feather.reaches)
 
 
@@ -221,18 +222,18 @@ def compile_next(
                 owner[at] = np.where(np.isin(share.owner[at], rows[alike] + 1), 0, share.owner[at])
             if share.hidden is not None:
                 hidden[at] = share.hidden[at]
-    return _compiled(product, tile, cameras, (ground, first.tilt), Share(owner, hidden))
+    return _compiled(product, tile, cameras, ground, first.tilt, Share(owner, hidden))
 
 
 def _compiled(
     product: ProductPlan,
     tile: Tile,
     cameras: Mapping[int, Projection],
-    depth: tuple[TileGround, NDArray[np.float32] | None],
+    ground: TileGround,
+    tilt: NDArray[np.float32] | None,
     share: Share,
 ) -> CompiledTile:
     """Anchors of those that paint a tile."""
-    ground, tilt = depth
     wanted, parts = ground.ranges[None], np.array([[0, 0, tile.window.width, tile.window.height]])
     if share.owner is not None:
         wanted, parts = ground.owned(share.owner, tile.sources, len(product.sources))
@@ -248,7 +249,7 @@ def _compiled(
                 reduced = anchors.at_level(level, camera.size)
                 found = [Layer(source=source, level=level, anchors=reduced, part=part, owner=share.owner)]
             else:
-                found = _layers_by_level(product.rule, ground, tilt, (source, camera, anchors), share.owner)
+                found = _layers_by_level(product.rule, ground, tilt, source, camera, anchors, share.owner)
             layers += found if columns is None else [replace(each, columns=columns) for each in found]
     return CompiledTile(
         window=tile.window,
@@ -289,11 +290,12 @@ def _layers_by_level(
     rule: AnchorRule,
     ground: TileGround,
     tilt: NDArray[np.float32],
-    source: tuple[int, Projection, Anchors],
+    row: int,
+    camera: Projection,
+    anchors: Anchors,
     owner: NDArray[np.uint16] | None,
 ) -> list[Layer]:
     """What a source gives where neighbouring pixels need it at very different levels: near and far ground of a view."""
-    row, camera, anchors = source
     runs = tile_runs(anchors.rects, np.arange(len(anchors.rects)), (0, 0), ground.relief.shape)
     levels, longest = np.zeros(ground.relief.shape, np.uint8), np.zeros(256)
     footprint_levels(anchors.arrays, runs, (ground.relief, tilt), FINEST, levels, longest)

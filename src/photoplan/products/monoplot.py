@@ -215,7 +215,7 @@ def _read(request: MonoplotRequest) -> _Given:
     if request.points.suffix.lower() in (".csv", ".txt", ".tsv", ".dat"):
         table = read_table(request.points, Columns(roles=ROLES, needed=("x", "y"), row="point"))
         labels = tuple(table.labels("name", "{row}"))
-        return _Given(table.numbers("x", "y"), table.layout.names, table.rows, None, labels)
+        return _Given(xy=table.numbers("x", "y"), header=table.layout.names, rows=table.rows, line=None, names=labels)
     items = read_features(request.points, "Point", "LineString").items
     kinds = {"Line" in item.geometry.geom_type for item in items}
     if len(kinds) > 1:
@@ -226,7 +226,13 @@ def _read(request: MonoplotRequest) -> _Given:
         xy = np.column_stack([xy[:, 0] - 0.5, -xy[:, 1] - 0.5])
     names = [parts[k][0] for k in line]
     rows = [(name, repr(float(x)), repr(float(y))) for name, (x, y) in zip(names, xy)]
-    return _Given(xy, ("name", "x", "y"), rows, line if True in kinds else None, tuple(name for name, _ in parts))
+    return _Given(
+        xy=xy,
+        header=("name", "x", "y"),
+        rows=rows,
+        line=line if True in kinds else None,
+        names=tuple(name for name, _ in parts),
+    )
 
 
 def _write_table(path: Path, given: _Given, found: MonoplotPoints) -> None:

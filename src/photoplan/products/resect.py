@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import CentralCamera
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.errors import GeometryError, PhotoplanError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.edit import ProjectChanges, edit_project
@@ -305,14 +304,14 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
         XYZ = given.XYZ.copy()
         XYZ[:, 2] = frame.inward(XYZ)
         working = replace(given, XYZ=XYZ)
-    found = resected(project, image, working, (interior, lens), settings)
+    found = resected(project, image, working, interior, lens, settings)
     terrain = float(nadir_heights(project, found.pose.center[None, :2], np.nan)[0])
     wrong = impossible(of_resection(working, found, terrain))
     if wrong is not None:
         fits = fitting(
             working,
             interior.size[1],
-            lambda other: resected(project, image, other, (interior, lens), settings),
+            lambda other: resected(project, image, other, interior, lens, settings),
             found.rms,
         )
         raise GeometryError(f"image {image.name!r}: {wrong}; its orientation is not written: {fits}")
@@ -326,15 +325,8 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     of_angles = D @ found.covariance[3:6, 3:6] @ D.T
     T = np.eye(len(found.covariance))
     T[3:6, 3:6] = D * to_unit
-    camera = None
-    entries: dict[str, Any] = {}
-    if found.free:
-        start = block_camera(image.camera, described, interior, dict.fromkeys(found.free))
-        adjusted = AdjustedCamera(
-            image.camera, found.interior.c, found.interior.principal_point, lens, found.free, found.covariance[6:, 6:]
-        )
-        camera = calibrated(described, start, adjusted)
-        entries = {**camera_entries(described, start, adjusted), "sigma": camera.sigmas}
+    camera, entries = (None, {}) if not found.free else _calibration(project, image, found)
+    if camera is not None:
         T[6:, 6:] = camera.of_block
     return ResectedImage(
         image=image,
@@ -352,6 +344,22 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     )
 
 
+def _calibration(project: Project, image: Image, found: Resected) -> tuple[Calibrated, dict[str, Any]]:
+    """What an image says of its camera, and the entries that the description gets."""
+    described = project.cameras[image.camera]
+    start = block_camera(image.camera, described, interior_of(described, image), dict.fromkeys(found.free))
+    adjusted = AdjustedCamera(
+        name=image.camera,
+        c=found.interior.c,
+        principal_point=found.interior.principal_point,
+        lens=lens_of(described),
+        free=found.free,
+        covariance=found.covariance[6:, 6:],
+    )
+    camera = calibrated(described, start, adjusted)
+    return camera, {**camera_entries(described, start, adjusted), "sigma": camera.sigmas}
+
+
 def _notes(of_angles: Array) -> Sequence[str]:
     if np.sqrt(np.diag(of_angles)).max() > 0.5:
         return ["the angles are near a singular position of their order, only their combination is determined"]
@@ -366,32 +374,25 @@ def measured_control(inputs: AdjustInputs, rows: list[tuple[int, int]]) -> Measu
     covariance[:, range(3), range(3)] = ground.sigma[g] ** 2
     if ground.covariance is not None:
         covariance = ground.covariance[g]
-    return MeasuredPoints(tuple(ground.names[i] for i in g), points.xy[k], points.sigma[k], ground.XYZ[g], covariance)
+    names, xy = tuple(ground.names[i] for i in g), points.xy[k]
+    return MeasuredPoints(names=names, xy=xy, sigma=points.sigma[k], XYZ=ground.XYZ[g], covariance=covariance)
 
 
 def resected(
-    project: Project, image: Image, points: MeasuredPoints, camera: tuple[Interior, Lens], settings: ResectSettings
+    project: Project, image: Image, points: MeasuredPoints, interior: Interior, lens: Lens, settings: ResectSettings
 ) -> Resected:
     """Resection with the earth curvature and refraction of the project."""
     orientation = project.orientation
+    curvature, refraction = orientation.earth_curvature, orientation.refraction
+    camera_of = partial(oriented_camera, crs=project.crs, earth_curvature=curvature, refraction=refraction)
     below = float(points.XYZ[:, 2].mean()) if len(points) else 0.0
-
-    def camera_of(interior: Interior, lens: Lens, pose: Pose) -> CentralCamera:
-        return oriented_camera(
-            interior,
-            lens,
-            pose,
-            crs=project.crs,
-            earth_curvature=orientation.earth_curvature,
-            refraction=orientation.refraction,
-            mean_ground=below,
-        )
-
-    plain = orientation.earth_curvature == "none" and not orientation.refraction
+    over = partial(camera_of, mean_ground=below)
+    plain = curvature == "none" and not refraction
     near = None if image.center is None or image.angles is None else stated_pose(project, image)
-    found = resect(points, *camera, settings, camera_of=None if plain else camera_of, near=near, name=image.name)
-    if orientation.earth_curvature == "correction":
+    found = resect(points, interior, lens, settings, camera_of=None if plain else over, near=near, name=image.name)
+    if curvature == "correction":
         # It refers to the ground below the station, which is known only now.
         below = float(nadir_heights(project, found.pose.center[None, :2], below)[0])
-        found = resect(points, *camera, settings, camera_of=camera_of, near=found.pose, name=image.name)
+        over = partial(camera_of, mean_ground=below)
+        found = resect(points, interior, lens, settings, camera_of=over, near=found.pose, name=image.name)
     return found

@@ -107,13 +107,33 @@ def _ground(address: _GroundAddress) -> Ground:
     terrain = address.terrain
     if terrain.height is not None:
         systems = declared_pair(terrain.height_system, address.orientation_system)
-        return _in_system(Ground(LevelSurface(terrain.height), None, None, (), systems, systems[1]), address)
+        return _in_system(
+            Ground(
+                surface=LevelSurface(terrain.height),
+                bounds=None,
+                file=None,
+                operations=(),
+                height_systems=systems,
+                working_system=systems[1],
+            ),
+            address,
+        )
     assert terrain.file is not None
     path = resolve_input(Path(address.folder), terrain.file)
     own = open_terrain(path, terrain.crs, 'as crs = "EPSG:nnnn" in [terrain]')
     systems = declared_pair(terrain.height_system or own.height_system, address.orientation_system)
     placed, steps = own.in_crs(address.crs)
-    return _in_system(Ground(placed.surface, placed.bounds, placed.path, steps, systems, systems[1]), address)
+    return _in_system(
+        Ground(
+            surface=placed.surface,
+            bounds=placed.bounds,
+            file=placed.path,
+            operations=steps,
+            height_systems=systems,
+            working_system=systems[1],
+        ),
+        address,
+    )
 
 
 def _in_system(ground: Ground, address: _GroundAddress) -> Ground:

@@ -201,7 +201,7 @@ def _open(address: SceneAddress) -> Scene:
     ground = ground_of(project)
     reader = _reader(project, image)
     camera = camera_of(project, image, ground, reader.size)
-    return Scene(camera, ground.surface, reader, ground, address)
+    return Scene(camera=camera, surface=ground.surface, reader=reader, ground=ground, address=address)
 
 
 def _reader(project: Project, image: ImageEntry) -> SteppedReader:

@@ -125,7 +125,9 @@ def adjust(band: Band, gauge: Gauge) -> AdjustedBand:
     weights = _weigh(band, state, robust, gauge.fixed is None)
     variance = _without_parts(band, state, weights, solved, N) + _of_prior(solved, prior)
     sigmas = BandState(state.tables, state.trends, np.full(len(state.ground), np.nan)).with_vector(np.sqrt(variance))
-    return AdjustedBand(state, sigmas, weights.sigma, rounds, float((robust < 0.5).mean()))
+    return AdjustedBand(
+        state=state, sigmas=sigmas, sigma=weights.sigma, rounds=rounds, down=float((robust < 0.5).mean())
+    )
 
 
 def _weigh(band: Band, state: BandState, robust: _Floats, own: bool) -> _Weights:
@@ -138,7 +140,7 @@ def _weigh(band: Band, state: BandState, robust: _Floats, own: bool) -> _Weights
     sigma = max(float(np.median(np.abs(size))) / MEDIAN_1D, _FLOOR * float(np.ptp(band.nodes)))
     robust = cauchy(size / sigma, _HALF)
     moved, share = _held(band, state, sigma) if own else np.zeros((2, len(state.ground)))
-    return _Weights(band.weight * robust / sigma**2, share, moved, robust, sigma)
+    return _Weights(of=band.weight * robust / sigma**2, ground=share, moved=moved, robust=robust, sigma=sigma)
 
 
 def _normals(band: Band, state: BandState, weights: _Weights) -> _Normals:

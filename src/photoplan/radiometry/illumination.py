@@ -170,7 +170,7 @@ def estimate(
         count = len(some)
         sigma = np.sqrt((count - 1) / count * ((np.array(some) - np.mean(some, axis=0)) ** 2).sum(axis=0))
         slope, sky, haze, by_height = whole.tolist()
-        bands.append(BandLight(slope, sky, haze, by_height, tuple(sigma.tolist())))
+        bands.append(BandLight(slope=slope, sky=sky, haze=haze, haze_by_height=by_height, sigmas=tuple(sigma.tolist())))
     return LightModel(empty.corrections, cos_z, empty.height, tuple(bands))
 
 

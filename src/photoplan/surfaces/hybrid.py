@@ -283,7 +283,13 @@ class HybridParts:
         if unit is None:
             return None
         faces = NO_FACES if unit.faces is None else (*_plain(unit.faces, "heights", unit.datum), _frame(unit))
-        return TerrainPart((unit.left, unit.top), (unit.width, unit.width), unit.heights, unit.datum, faces)
+        return TerrainPart(
+            corner=(unit.left, unit.top),
+            mesh=(unit.width, unit.width),
+            posts=unit.heights,
+            datum=unit.datum,
+            faces=faces,
+        )
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Heights at points of the model's CRS."""

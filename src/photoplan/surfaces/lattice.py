@@ -37,7 +37,9 @@ class Lattice:
         Their number is odd: the middle one has the centre of the pixel.
         """
         times = max(1, math.ceil(parts)) | 1
-        finer = MapTarget(MapGrid(grid.left, grid.top, grid.resolution / times, 1, 1, grid.crs))
+        finer = MapTarget(
+            MapGrid(left=grid.left, top=grid.top, resolution=grid.resolution / times, width=1, height=1, crs=grid.crs)
+        )
         return cls(np.full(2, (times - 1) / 2), times * np.eye(2), lambda window: surface.relief(finer, window))
 
     @property

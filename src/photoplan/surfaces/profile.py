@@ -226,11 +226,11 @@ def _between_breaks(
     from_start = np.cumsum(lengths) - lengths
     distance = np.maximum.accumulate(from_start[number] + t * lengths[number])
     XY = pieces.a[number] + t[:, None] * (pieces.b - pieces.a)[number]
-    keep = _distinct(distance, Z, step == 0)
+    keep = _distinct(Z, step == 0)
     return distance[keep], XY[keep, 0], XY[keep, 1], Z[keep]
 
 
-def _distinct(distance: NDArray[np.float64], Z: NDArray[np.float64], first: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _distinct(Z: NDArray[np.float64], first: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Points that are needed: one where two pieces meet at one height, none inside gaps."""
     lost = np.isnan(Z)
     keep = np.ones(len(Z), bool)

@@ -189,7 +189,7 @@ def follow(parts: TerrainParts, paths: ArrayLike, bend: float = 0.0, cache: Cach
         box = begin_lines(at, piece, bend, parts.inside, frame, away, hits.result, states, lines, rays, spans)
         if box[0] <= box[2]:
             which = np.flatnonzero(spans[:, 1] >= 0)
-            over_parts(parts, box, which, _Rays(parts, lines, rays, states, hits), cache)
+            over_parts(parts, box, which, _Rays(parts=parts, lines=lines, rays=rays, states=states, hits=hits), cache)
         end_lines(at, piece, bend, away, rays, spans, hits.result, states, hits.XYZ, hits.along, hits.normal)
     hits.below[:] = (hits.result == MISS) & (states == BELOW)
     hits.owner[hits.result != MISS] = 0

@@ -144,7 +144,7 @@ class SeenSurface:
         with np.errstate(invalid="ignore", divide="ignore"):
             uvh[..., 2] = away / fan.level[0] / fan.level[1][:, None]
         left, ground = owner == LEFT, owner == 0
-        seen = Seen(XYZ, uvh, normal, towards, owner, (owner < 0) & ~fan.up[:, None])
+        seen = Seen(XYZ=XYZ, uvh=uvh, normal=normal, towards=towards, owner=owner, lost=(owner < 0) & ~fan.up[:, None])
         if np.isfinite(self.farthest):
             gone = np.zeros(owner.shape, bool)
             gone[ground] = target.distance(uvh[ground]) > self.farthest

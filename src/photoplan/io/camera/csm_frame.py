@@ -116,7 +116,8 @@ def read(isd: Any, path: Path) -> StatedFrame:
         focal = source.focal_plane().focal
         frame = FrameCamera(_interior(source, c), lens, _pose(source))
         _refuse_away(frame, max(source.radii))
-        return StatedFrame(path, frame, source.radii, focal, kind if lens != NoLens() else None)
+        distortion = kind if lens != NoLens() else None
+        return StatedFrame(file=path, frame=frame, radii=source.radii, focal=focal, distortion=distortion)
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None

@@ -133,7 +133,7 @@ def parse_block(
         lines = [lines[at] for at in keep]
     records = np.array(keep, np.int64) + first
     block = _fast(layout, lines, records, decimal_comma)
-    return block if block is not None else _slow(path, layout, (lines, records), look_up, decimal_comma)
+    return block if block is not None else _slow(path, layout, lines, records, look_up, decimal_comma)
 
 
 def _fast(layout: TableLayout, lines: list[str], records: NDArray[np.int64], decimal_comma: bool) -> PointBlock | None:
@@ -186,10 +186,9 @@ def _fast(layout: TableLayout, lines: list[str], records: NDArray[np.int64], dec
 
 
 def _slow(
-    path: Path, layout: TableLayout, block: tuple[list[str], NDArray[np.int64]], look_up: LookUp, decimal_comma: bool
+    path: Path, layout: TableLayout, lines: list[str], records: NDArray[np.int64], look_up: LookUp, decimal_comma: bool
 ) -> PointBlock:
     """The same line by line: it names the line and the column that cannot be read."""
-    lines, records = block
     rows: dict[str, list[Any]] = {role: [] for role in layout.roles}
     for record, text in zip(records.tolist(), lines):
         where = f"{path}:{record}"

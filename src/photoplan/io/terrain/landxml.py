@@ -169,7 +169,8 @@ class _Reader:
             self.notes.append(
                 f"{self.path.name}: {surface.name}: a retaining wall is {largest:.2f} m wide; taken as upright"
             )
-        surface.lines.append(MeasuredLine(self._name(element, surface), "breakline", xyz, other, None, _code(element)))
+        name, code = self._name(element, surface), _code(element)
+        surface.lines.append(MeasuredLine(name=name, kind="breakline", xyz=xyz, right=other, sigma=None, code=code))
 
     def vertex(self, element: Element, surface: _LandXmlSurface) -> None:
         where = f"{self.path}: {surface.name}: point {element.get('id')!r} of the triangulation"
@@ -302,7 +303,8 @@ class _Reader:
             count += len(xyz)
             if cls.kind != "ignore":
                 kind: Any = cls.kind if cls.kind == "spot" else "mass"
-                groups.append(PointGroup(f"{self.path.name} {code}".strip(), kind, xyz, records, cls.sigma))
+                name = f"{self.path.name} {code}".strip()
+                groups.append(PointGroup(name=name, kind=kind, xyz=xyz, records=records, sigma=cls.sigma))
         return groups
 
 

@@ -103,7 +103,7 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
         active = next_active
     weighted = _weighted(loop, solution, active, settings)
     check_rank(model, weighted.solution.state, weighted.solution.reduced)
-    return replace(result_of(block, selection, weighted, active, loop.count), other_control=alternative)
+    return replace(result_of(selection, weighted, active, loop.count), other_control=alternative)
 
 
 def _weighted(loop: Loop, solution: Solution, active: Active, settings: AdjustSettings) -> Weighted:

@@ -112,11 +112,19 @@ def _of_errors(block: Block, base: Adjusted, result: Adjusted) -> tuple[Cause, .
             "look at the lens, the film and how points were measured; with many more points in each image the "
             "adjustment regards it"
         )
-        found.append(Cause(name, likeness.by_likeness, 0.0, remedy, "deviance"))
+        found.append(Cause(name=name, explains=likeness.by_likeness, change=0.0, remedy=remedy, measure="deviance"))
     if likeness.worse:
         groups = ", ".join(f"{name} ({times:.1f} times)" for name, times in likeness.worse)
         name = f"errors that are larger than stated: {groups}"
-        found.append(Cause(name, likeness.by_accuracy, 0.0, "state their accuracy as it is", "deviance"))
+        found.append(
+            Cause(
+                name=name,
+                explains=likeness.by_accuracy,
+                change=0.0,
+                remedy="state their accuracy as it is",
+                measure="deviance",
+            )
+        )
     return tuple(sorted(found, key=lambda cause: -cause.explains))
 
 

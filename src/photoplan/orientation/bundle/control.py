@@ -112,7 +112,9 @@ def misclosures(model: Model, state: State, weight: _Floats, loose: float) -> Mi
     lost = np.flatnonzero(~known.ravel())
     Q[lost] = Q[:, lost] = 0.0
     Q[lost, lost] = 1.0
-    return Misclosures(names, known, np.where(known, moved - model.block.ground.XYZ[names], 0.0), Q, defect)
+    return Misclosures(
+        points=names, known=known, w=np.where(known, moved - model.block.ground.XYZ[names], 0.0), Q=Q, defect=defect
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,4 +101,6 @@ def _of_camera(name: str, image: NDArray[np.int64], xy: _Floats, v: _Floats) -> 
     effect = 1.0 + 2.0 * float((rho[:last] * weights[:last]).sum()) / len(image)
     if effect < _LEAST:
         return None
-    return Correlation(name, effect, float(edges[last]), edges[1:], np.where(enough, rho, np.nan))
+    return Correlation(
+        group=name, effect=effect, reach=float(edges[last]), distance=edges[1:], rho=np.where(enough, rho, np.nan)
+    )

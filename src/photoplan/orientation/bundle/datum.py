@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
@@ -19,7 +21,16 @@ _WHOLE = 0.95
 _MANY = 600
 
 
-def by_prior(model: Model, state: State, rows: Rows, points: tuple[_Floats, sparse.csr_matrix]) -> tuple[str, ...]:
+class OfPoints(NamedTuple):
+    """What takes steps of the other unknowns to those of the points."""
+
+    V_inverse: _Floats
+    """Inverse normal matrices of the points, (m, 3, 3)."""
+    N_pg: sparse.csr_matrix
+    """Their normal matrix with the other unknowns, (3m, n)."""
+
+
+def by_prior(model: Model, state: State, rows: Rows, points: OfPoints) -> tuple[str, ...]:
     """Motions of the block of which only what corrections are known to beforehand says anything.
 
     Parameters
@@ -28,8 +39,7 @@ def by_prior(model: Model, state: State, rows: Rows, points: tuple[_Floats, spar
     state : State
     rows : Rows
         Equations at `state`.
-    points : tuple
-        Inverse normal matrices of the points (m, 3, 3), and their normal matrix with the other unknowns (3m, n).
+    points : OfPoints
     """
     count = model.columns.count
     if not model.sets or not 0 < count <= _MANY:
@@ -45,7 +55,7 @@ def by_prior(model: Model, state: State, rows: Rows, points: tuple[_Floats, spar
     return motions_of_points(state, points, vectors[:, values > _PRIOR] * scale[:, None])
 
 
-def motions_of_points(state: State, points: tuple[_Floats, sparse.csr_matrix], directions: _Floats) -> tuple[str, ...]:
+def motions_of_points(state: State, points: OfPoints, directions: _Floats) -> tuple[str, ...]:
     """Motions of all points as one (shifts, turns, scale) that lie in directions (n, q) of the other unknowns."""
     V_inverse, N_pg = points
     if not directions.shape[1] or len(V_inverse) < 3:

@@ -110,7 +110,9 @@ class BlockFrame:
             covariance = J @ ground.covariance @ np.swapaxes(J, -1, -2)
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
         covariance[~known.all(axis=1)] = np.nan
-        return GroundPoints(ground.names, XYZ, np.where(known, sigma, np.nan), ground.check, covariance)
+        return GroundPoints(
+            names=ground.names, XYZ=XYZ, sigma=np.where(known, sigma, np.nan), check=ground.check, covariance=covariance
+        )
 
     def positions(self, positions: ObservedPositions) -> ObservedPositions:
         """Observed positions in the block's system; covariances between coordinates are left out."""
@@ -118,7 +120,13 @@ class BlockFrame:
             return positions
         J = self.jacobian(positions.XYZ)
         sigma = np.sqrt((J**2 @ positions.sigma[..., None] ** 2)[..., 0])
-        return ObservedPositions(positions.images, self.points(positions.XYZ), sigma, positions.strip, positions.time)
+        return ObservedPositions(
+            images=positions.images,
+            XYZ=self.points(positions.XYZ),
+            sigma=sigma,
+            strip=positions.strip,
+            time=positions.time,
+        )
 
     def attitudes(self, attitudes: ObservedAttitudes, centers: _Floats) -> ObservedAttitudes:
         """Observed attitudes in the block's system; `centers` (n, 3) are the stations in the map."""

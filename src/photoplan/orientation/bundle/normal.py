@@ -17,7 +17,7 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, spl
 from photoplan.errors import GeometryError
 from photoplan.kernels.quadratic_forms import SparseRows, gathered, point_variances, row_variances
 from photoplan.kernels.selected_inverse import SelectedInverse, aligned, fill_pattern, selected_inverse
-from photoplan.orientation.bundle.datum import motions_of_points
+from photoplan.orientation.bundle.datum import OfPoints, motions_of_points
 from photoplan.orientation.bundle.model import Model
 from photoplan.orientation.bundle.rows import Rows
 from photoplan.orientation.bundle.unknowns import IMAGES, State
@@ -49,9 +49,9 @@ class Reduced:
     """(points, 3)."""
 
     @property
-    def of_points(self) -> tuple[_Floats, sparse.csr_matrix]:
+    def of_points(self) -> OfPoints:
         """What takes steps of the other unknowns to those of the points."""
-        return self.V_inverse, self.N_pg
+        return OfPoints(self.V_inverse, self.N_pg)
 
     def solved(self, model: Model, state: State) -> tuple[_Floats, _Floats]:
         """As `solve`; what is not determined is named."""
@@ -150,7 +150,7 @@ class Inverse:
         L = factor.L.tocsc()
         values = aligned(pointer, rows, L.indptr.astype(np.int64), L.indices.astype(np.int64), L.data)
         diagonal, lower = selected_inverse(pointer, rows, values, factor.U.diagonal())
-        self._Q = SelectedInverse(pointer, rows, diagonal, lower, order)
+        self._Q = SelectedInverse(pointer=pointer, rows=rows, diagonal=diagonal, lower=lower, order=order)
         self._reduced = reduced
 
     def block(self, columns: NDArray[np.int64]) -> _Floats:

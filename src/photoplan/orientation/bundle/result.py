@@ -18,7 +18,6 @@ from photoplan.orientation.bundle.block import (
     AdjustedCamera,
     AdjustedCorrections,
     AdjustedStrip,
-    Block,
     Correlation,
     Group,
 )
@@ -176,7 +175,7 @@ class Weighted:
     correlations: tuple[Correlation, ...]
 
 
-def result_of(block: Block, selection: Selection, weighted: Weighted, active: Active, iterations: int) -> Adjusted:
+def result_of(selection: Selection, weighted: Weighted, active: Active, iterations: int) -> Adjusted:
     """The result as users see it."""
     solution = weighted.solution
     model, state = solution.model, solution.state
@@ -332,7 +331,11 @@ def _corrections(solution: Solution, variance: float) -> tuple[AdjustedCorrectio
         values = solution.state.corrections(each.key)
         covariance = _covariances(solution, each.key, variance)
         joint = _joint(solution, each, variance) if each.owner == "knot" else {}
-        found.append(AdjustedCorrections(each.key, values, covariance, known.reshape(values.shape), joint))
+        found.append(
+            AdjustedCorrections(
+                key=each.key, values=values, covariance=covariance, known=known.reshape(values.shape), joint=joint
+            )
+        )
     return tuple(found)
 
 
@@ -362,7 +365,7 @@ def _strips(solution: Solution, variance: float) -> tuple[AdjustedStrip, ...]:
     sigma = np.full((len(model.strip_names), 6), np.nan)
     sigma[:, : covariances.shape[1]] = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)) if len(covariances) else 0.0
     return tuple(
-        AdjustedStrip(name, row[:3], row[3:], float(epoch), s)
+        AdjustedStrip(name=name, shift=row[:3], rate=row[3:], epoch=float(epoch), sigma=s)
         for name, row, epoch, s in zip(model.strip_names, solution.state.drift, model.epochs, sigma)
     )
 
@@ -389,5 +392,5 @@ def _groups(solution: Solution, factors: _Floats) -> tuple[Group, ...]:
             rms = float(np.sqrt((raw[mine] ** 2).mean()))
             r = float(solution.redundancies[: len(of)][mine].sum())
             factor = float(factors[k]) if r > ENOUGH else float("nan")
-            groups.append(Group(name, int(mine.sum()), r, rms, unit, factor))
+            groups.append(Group(name=name, count=int(mine.sum()), redundancy=r, rms=rms, unit=unit, factor=factor))
     return tuple(groups)

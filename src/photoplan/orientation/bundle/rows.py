@@ -117,7 +117,7 @@ def _residuals(model: Model, state: State, rays: _Rays, seen: list[_Seen]) -> Re
         observed = block.attitudes.R_ground_camera[model.attitude_row]
         turned = np.swapaxes(observed, 1, 2) @ state.images.rotations[model.attitude] @ state.boresight
         attitude = rotation_vector(turned)
-    return Residuals(image, ground, position, attitude, _known(model, state))
+    return Residuals(image=image, ground=ground, position=position, attitude=attitude, prior=_known(model, state))
 
 
 def linearise(model: Model, state: State, weight: _Floats) -> tuple[Rows, Residuals]:
@@ -125,7 +125,7 @@ def linearise(model: Model, state: State, weight: _Floats) -> tuple[Rows, Residu
     rays, seen = _project(model.posed, state, derivatives=True), _seen(model, state)
     found = _residuals(model, state, rays, seen)
     entries = _Entries(model.columns)
-    on_points = _image_rows(model, state, (rays, seen), entries)
+    on_points = _image_rows(model, state, rays, seen, entries)
     _direct_rows(model, state, found, entries)
     for at, (key, parameter, _, sigma) in enumerate(model.known, model.parts.known.start):
         entries.put(np.array([[at]]), key, np.zeros(1, np.int64), np.array([[[1.0 / sigma]]]), parameter)
@@ -169,15 +169,15 @@ class _Entries:
         self.parts.append((values.ravel(), row.ravel(), column.ravel()))
 
 
-def _image_rows(model: Model, state: State, made: tuple[_Rays, list[_Seen]], entries: _Entries) -> _Floats:
+def _image_rows(model: Model, state: State, rays: _Rays, seen: list[_Seen], entries: _Entries) -> _Floats:
     """Rows of image points: entries of orientations and cameras; returned: the coefficients of the points, (2k, 3)."""
     every = np.arange(2 * len(model.image)).reshape(-1, 2)
-    by_X = _posed_rows(model.posed, state, made[0], entries, every[model.framed])
+    by_X = _posed_rows(model.posed, state, rays, entries, every[model.framed])
     if not model.projections:
         return by_X.reshape(-1, 3)
     out = np.zeros((len(model.image), 2, 3))
     out[model.framed] = by_X
-    for each in made[1]:
+    for each in seen:
         white = 1.0 / model.sigma[each.mine][:, :, None]
         geometry, there = each.projection.geometry, (each.camera, each.XYZ, model.xy[each.mine])
         out[each.mine] = geometry.by_ground(*there) @ each.by_block * white
@@ -211,7 +211,16 @@ def _seen(model: Model, state: State) -> list[_Seen]:
         geometry = projection.geometry
         camera = geometry.camera({key: state.corrections(key) for key in keys})
         XYZ, by_block = _on_map(model, state.XYZ[model.point[mine]])
-        out.append(_Seen(projection, mine, camera, XYZ, by_block, geometry.seen(camera, XYZ, model.xy[mine])))
+        out.append(
+            _Seen(
+                projection=projection,
+                mine=mine,
+                camera=camera,
+                XYZ=XYZ,
+                by_block=by_block,
+                xy=geometry.seen(camera, XYZ, model.xy[mine]),
+            )
+        )
     return out
 
 
@@ -311,7 +320,7 @@ def _project(model: Model, state: State, derivatives: bool) -> _Rays:
     outer = np.empty((len(t), 2, 2))
     outer[:, 0, 0], outer[:, 0, 1] = b[:, 0] + b[:, 2] * y, b[:, 1] + b[:, 2] * x
     outer[:, 1, 0], outer[:, 1, 1] = b[:, 4] + b[:, 6] * y, b[:, 5] + b[:, 6] * x
-    return _Rays(p, t, real, inner, outer, px)
+    return _Rays(p=p, t=t, real=real, inner=inner, outer=outer, px=px)
 
 
 def _by_parameters(camera: CameraState, rays: _Rays, mine: _Index) -> _Floats:

@@ -107,31 +107,9 @@ def start_points(block: Block, selection: Selection, wait: bool = False) -> tupl
     about right, they would fly off and take the adjustment with them.
     """
     seen = block.observations
-    chosen = [block.images[k] for k in selection.images if k < len(block.images)]
-    projections = [block.projections[k - len(block.images)] for k in selection.images if k >= len(block.images)]
-    image_index = {n: k for k, n in enumerate([*(b.name for b in chosen), *(p.name for p in projections)])}
     point_index = {n: k for k, n in enumerate(selection.points)}
-    image = np.array([image_index.get(n, -1) for n in seen.images], np.int64)[seen.image[selection.measured]]
     point = np.array([point_index.get(n, -1) for n in seen.points], np.int64)[seen.point[selection.measured]]
-    directions, centers = np.empty((len(image), 3)), np.empty((len(image), 3))
-    sigma = np.empty(len(image))
-    order = np.argsort(image, kind="stable")
-    ends = np.searchsorted(image[order], np.arange(len(image_index) + 1))
-    for k, b in enumerate(chosen):
-        mine = order[ends[k] : ends[k + 1]]
-        camera = block.cameras[b.camera]
-        plane = b.plane_to_pixel.inverse(seen.xy[selection.measured][mine])
-        t = camera.lens.undistort((plane - camera.principal_point) / camera.c)
-        d = np.column_stack([t, -np.ones(len(t))]) @ b.pose.R_ground_camera.T
-        directions[mine] = d / np.linalg.norm(d, axis=1, keepdims=True)
-        pixel = np.sqrt(abs(np.linalg.det(b.plane_to_pixel.derivative(np.array(camera.principal_point)))))
-        sigma[mine] = seen.sigma[selection.measured][mine].mean(axis=1) / (camera.c * pixel)
-        centers[mine] = b.pose.center
-    for k, p in enumerate(projections, len(chosen)):
-        mine = order[ends[k] : ends[k + 1]]
-        centers[mine], directions[mine] = p.sight(seen.xy[selection.measured][mine])
-        # An angle that is as large as the point's size seen from there.
-        sigma[mine] = seen.sigma[selection.measured][mine].mean(axis=1) * p.metres / p.away
+    image, centers, directions, sigma = _rays(block, selection)
     XYZ, angle = intersect(centers, directions, point, len(point_index))
     count = np.maximum(np.bincount(point, minlength=len(point_index)), 1)
     usual = np.bincount(point, sigma, len(point_index)) / count
@@ -143,8 +121,8 @@ def start_points(block: Block, selection: Selection, wait: bool = False) -> tupl
     determined = np.isfinite(XYZ).all(axis=1) & (angle > np.maximum(least, 1e-7)) & ~turned
     if wait:
         wide = determined & (angle > _NARROW)
-        kept = np.bincount(image[wide[point]], minlength=len(image_index))
-        if (kept >= np.minimum(_ENOUGH, np.bincount(image, minlength=len(image_index)))).all():
+        kept = np.bincount(image[wide[point]], minlength=len(selection.images))
+        if (kept >= np.minimum(_ENOUGH, np.bincount(image, minlength=len(selection.images)))).all():
             determined = wide
     control = [
         (point_index[name], block.ground.XYZ[k])
@@ -167,6 +145,36 @@ def start_points(block: Block, selection: Selection, wait: bool = False) -> tupl
             XYZ[point_index[name]] = start
             determined[point_index[name]] = True
     return XYZ, frozenset(selection.points[k] for k in np.flatnonzero(~determined))
+
+
+def _rays(block: Block, selection: Selection) -> tuple[_Index, _Floats, _Floats, _Floats]:
+    """Of all measurements that were selected: number of the image, origin and direction (k, 3) of its ray, and the
+    standard deviation of that, radians."""
+    seen = block.observations
+    chosen = [block.images[k] for k in selection.images if k < len(block.images)]
+    projections = [block.projections[k - len(block.images)] for k in selection.images if k >= len(block.images)]
+    numbers = {n: k for k, n in enumerate([*(b.name for b in chosen), *(p.name for p in projections)])}
+    image = np.array([numbers.get(n, -1) for n in seen.images], np.int64)[seen.image[selection.measured]]
+    xy, spread = seen.xy[selection.measured], seen.sigma[selection.measured].mean(axis=1)
+    directions, centers = np.empty((len(image), 3)), np.empty((len(image), 3))
+    sigma = np.empty(len(image))
+    order = np.argsort(image, kind="stable")
+    ends = np.searchsorted(image[order], np.arange(len(numbers) + 1))
+    for k, b in enumerate(chosen):
+        mine = order[ends[k] : ends[k + 1]]
+        camera = block.cameras[b.camera]
+        t = camera.lens.undistort((b.plane_to_pixel.inverse(xy[mine]) - camera.principal_point) / camera.c)
+        d = np.column_stack([t, -np.ones(len(t))]) @ b.pose.R_ground_camera.T
+        directions[mine] = d / np.linalg.norm(d, axis=1, keepdims=True)
+        pixel = np.sqrt(abs(np.linalg.det(b.plane_to_pixel.derivative(np.array(camera.principal_point)))))
+        sigma[mine] = spread[mine] / (camera.c * pixel)
+        centers[mine] = b.pose.center
+    for k, p in enumerate(projections, len(chosen)):
+        mine = order[ends[k] : ends[k + 1]]
+        centers[mine], directions[mine] = p.sight(xy[mine])
+        # An angle that is as large as the point's size seen from there.
+        sigma[mine] = spread[mine] * p.metres / p.away
+    return image, centers, directions, sigma
 
 
 def _on_ray(center: _Floats, direction: _Floats, given: _Floats) -> _Floats:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,10 +115,10 @@ def find_mark(
     matrix = np.array(mm_to_pixel, np.float64)
     turned = [_turn(angle) @ matrix for angle in rotations]
     tries = [_coarse(grey, render(pattern, each, negative=negative, blur_px=blur_px)) for each in turned]
-    top = max((t[2] for t in tries if math.isfinite(t[2])), default=math.nan)
+    top = max((t.correlation for t in tries if math.isfinite(t.correlation)), default=math.nan)
     if math.isnan(top):
         return _nothing("too little of the mark lies in the window")
-    likely = [(turn, t) for turn, t in zip(turned, tries, strict=True) if t[2] > top - _BLUNT]
+    likely = [(turn, t) for turn, t in zip(turned, tries, strict=True) if t.correlation > top - _BLUNT]
     found = [_by_edges(grey, pattern, turn, t, negative, blur_px) for turn, t in likely]
     _, at, edges, turn = max(found, key=_merit)
     if edges is not None:
@@ -125,7 +126,7 @@ def find_mark(
         turn, at = edges.scale * _turn(math.degrees(edges.rotation)) @ turn, (edges.x, edges.y)
     part, origin = _around(grey, render(pattern, turn, blur_px=0.0), at, _AROUND)
     fine = locate_mark(part, pattern, turn, negative=negative, blur_px=blur_px)
-    second = max(t[3] / t[2] for _, t in likely if t[2] == top)
+    second = max(t.second / t.correlation for _, t in likely if t.correlation == top)
     place = (fine.x + origin[0], fine.y + origin[1])
     judged = _judged(pattern, fine, place, edges, second, least_correlation)
     if isinstance(pattern, MarkExample) and judged.accepted:
@@ -149,7 +150,7 @@ def _by_edges(
     grey: NDArray[np.float32],
     pattern: MarkPattern | MarkExample,
     matrix: NDArray[np.float64],
-    coarse: tuple[float, float, float, float, int],
+    coarse: _Place,
     negative: bool,
     blur_px: float,
 ) -> _Found:
@@ -240,18 +241,28 @@ def _turn(degrees: float) -> NDArray[np.float64]:
     return np.array([[c, s], [-s, c]])
 
 
-def _coarse(grey: NDArray[np.float32], template: Template) -> tuple[float, float, float, float, int]:
+class _Place(NamedTuple):
     """Place, its correlation, that of the best other place, and the factor of the pixels used; NaN: none."""
+
+    x: float
+    y: float
+    correlation: float
+    second: float
+    factor: int
+
+
+def _coarse(grey: NDArray[np.float32], template: Template) -> _Place:
+    """Where a template suits best, with coarse pixels."""
     factor = max(1, round(min(template.values.shape) / _COARSE))
     small, at = _shrunk_template(template, factor)
     image = _shrunk(grey, factor)
     rows, columns = small.values.shape
     padded = np.pad(image, ((rows // 2, rows // 2), (columns // 2, columns // 2)), constant_values=np.nan)
     if padded.shape[0] < rows or padded.shape[1] < columns:
-        return math.nan, math.nan, math.nan, math.nan, factor
+        return _Place(math.nan, math.nan, math.nan, math.nan, factor=factor)
     surface, _ = correlation_surface(padded, small, _SHARE)
     if not np.isfinite(surface).any():
-        return math.nan, math.nan, math.nan, math.nan, factor
+        return _Place(math.nan, math.nan, math.nan, math.nan, factor=factor)
     row, column = np.unravel_index(int(np.nanargmax(surface)), surface.shape)
     i, j = np.indices(surface.shape)
     far = np.maximum(np.abs(i - row) / rows, np.abs(j - column) / columns) > 0.25
@@ -260,7 +271,7 @@ def _coarse(grey: NDArray[np.float32], template: Template) -> tuple[float, float
     half = (factor - 1) / 2
     x = (column - columns // 2 + at[0]) * factor + half
     y = (row - rows // 2 + at[1]) * factor + half
-    return x, y, float(surface[row, column]), second, factor
+    return _Place(x=x, y=y, correlation=float(surface[row, column]), second=second, factor=factor)
 
 
 def _shrunk(grey: NDArray[np.float32], factor: int) -> NDArray[np.float32]:

@@ -107,7 +107,7 @@ def _find(scan: Scan, layout: MarkLayout, known: FiducialSearch, wide: bool = Tr
     turns = tuple(t for t in TURNS if known.rotation in (None, t.rotation) and known.mirrored in (None, t.mirrored))
     placements, notes = _search(scan, layout, known, turns, wide)
     if not placements:
-        raise MarksNotFound(_nothing(layout, scan, known), _expected(layout, scan, known))
+        raise MarksNotFound(_nothing(layout, scan), _expected(layout, scan, known))
     ties = _ties(placements)
     chosen = _usual(ties, known)
     measured = measure_marks(scan, layout, chosen, known.least_correlation)
@@ -118,7 +118,7 @@ def _find(scan: Scan, layout: MarkLayout, known: FiducialSearch, wide: bool = Tr
         raise MarksNotFound(_too_few(layout, measured, better), _sought(measured))
     measured, dropped = _without_false(layout, measured, chosen.turn)
     turn, fit, names, said = _decide(layout, measured, ties, chosen, known)
-    return _result(layout, measured, (turn, fit, names), (*notes, *said, *dropped))
+    return _result(layout, measured, turn, fit, names, (*notes, *said, *dropped))
 
 
 def _search(
@@ -230,8 +230,8 @@ def _without_false(layout: MarkLayout, measured: Measured, turn: ScanTurn) -> tu
     notes: list[str] = []
     names = list(measured.found)
     while len(names) >= 5:
-        everything = _sigma0(layout, measured, names, turn)
-        left = [_sigma0(layout, measured, [n for n in names if n != name], turn) for name in names]
+        everything = _sigma0(layout, measured, names)
+        left = [_sigma0(layout, measured, [n for n in names if n != name]) for name in names]
         k = int(np.argmin(left))
         pixel_mm = 1 / measured.px_per_mm
         if everything * pixel_mm < 0.02 or left[k] > everything / 4:
@@ -247,16 +247,20 @@ def _without_false(layout: MarkLayout, measured: Measured, turn: ScanTurn) -> tu
     return replace(measured, found=kept, missed=missed), notes
 
 
-def _sigma0(layout: MarkLayout, measured: Measured, names: Sequence[str], turn: ScanTurn) -> float:
+def _sigma0(layout: MarkLayout, measured: Measured, names: Sequence[str]) -> float:
     P = layout.mm[[layout.names.index(n) for n in names]]
     p = np.array([(measured.found[n].x, measured.found[n].y) for n in names])
     return solve(np.column_stack([P, np.ones(len(P))]), p).sigma0
 
 
 def _result(
-    layout: MarkLayout, measured: Measured, decided: tuple[ScanTurn, FiducialFit, dict[str, str]], notes: Sequence[str]
+    layout: MarkLayout,
+    measured: Measured,
+    turn: ScanTurn,
+    fit: FiducialFit,
+    names: dict[str, str],
+    notes: Sequence[str],
 ) -> FiducialResult:
-    turn, fit, names = decided
     marks = {names[old]: _located(names[old], at) for old, at in measured.found.items()}
     to_mm = np.linalg.inv(fit.transformation.derivative(np.zeros(2)))
     residuals = fit.residuals @ to_mm.T * 1000.0
@@ -315,7 +319,7 @@ def _located(name: str, at: Location) -> LocatedMark:
     )
 
 
-def _nothing(layout: MarkLayout, scan: Scan, known: FiducialSearch) -> str:
+def _nothing(layout: MarkLayout, scan: Scan) -> str:
     width, height = scan.size
     return (
         f"none of the {len(layout.names)} fiducial marks found in the scan of {width} × {height} px; not found: "

@@ -93,7 +93,7 @@ class Location:
     correlation: float
     """Highest correlation coefficient (Behr 1989, eq. 4.1), at a whole pixel."""
     method: str
-    """`matching` (least squares), `paraboloid`, `edges` (by `mark_measure`), or `pixel` where the maximum lies at
+    """`matching` (least squares), `paraboloid`, `edges` (by `marks.measure`), or `pixel` where the maximum lies at
     the border of the search."""
     peak: Peak | None
     """Top of the paraboloid (Behr 1989, eq. 4.4), in the window's pixels."""

@@ -158,7 +158,7 @@ def _spelled(direction: Array, singular: float, unknowns: ResectionUnknowns) -> 
     names = [*UNKNOWNS, *unknowns.free]
     # One percent of the natural size of what changes most.
     step = direction * (0.01 / direction[parts[0]])
-    said = [_change(names[k], float(step[k] * unknowns.units[k]), k, len(unknowns.free)) for k in parts]
+    said = [_change(names[k], float(step[k] * unknowns.units[k]), k) for k in parts]
     moved = float(np.linalg.norm(step)) * singular * unknowns.sigma
     together = f"{' and '.join(names[k] for k in parts)}" + (" apart" if len(parts) > 1 else "")
     way = "hold a parameter fixed or " if unknowns.free else ""
@@ -168,7 +168,7 @@ def _spelled(direction: Array, singular: float, unknowns: ResectionUnknowns) -> 
     )
 
 
-def _change(name: str, value: float, k: int, free: int) -> str:
+def _change(name: str, value: float, k: int) -> str:
     if k < 3:
         return f"{name} {value:+.4g} m"
     if k < 6:

@@ -34,7 +34,13 @@ def _correctable(project: Project, image: LineImage, ground: Ground, size: tuple
     start = LineCorrection.none()
     if image.correction is not None and project.resolve(image.correction).exists():
         start = read_line_correction(project.resolve(image.correction))
-    return CorrectableLine(plain, image.mount or image.line, image.line, _priors(project.adjustment.strips), start)
+    return CorrectableLine(
+        plain=plain,
+        mount=image.mount or image.line,
+        flight=image.line,
+        priors=_priors(project.adjustment.strips),
+        start=start,
+    )
 
 
 def _priors(stated: StripAdjustment) -> TrackPriors:
@@ -72,7 +78,14 @@ def _found(image: CorrectableLine, sets: Mapping[str, AdjustedCorrections]) -> F
         sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
         over_time = correction.spline.times, correction.spline.coefficients
     text = line_correction_text(correction, covariance, sigma, _pose_errors(image, correction, sets))
-    return FoundCorrection({}, parameters, text, over_time, image.plain.track.time, _angles(image, correction))
+    return FoundCorrection(
+        entries={},
+        parameters=parameters,
+        file=text,
+        over_time=over_time,
+        seconds=image.plain.track.time,
+        angles=_angles(image, correction),
+    )
 
 
 def _pose_errors(
@@ -112,4 +125,4 @@ def _output(name: str) -> str:
     return f"{Path(name).stem}.correction.toml"
 
 
-LINES = Geometry("lines", lambda image: image.away, _correctable, _found, _output)
+LINES = Geometry(group="lines", away=lambda image: image.away, correctable=_correctable, found=_found, output=_output)

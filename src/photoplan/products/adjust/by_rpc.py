@@ -24,7 +24,9 @@ def _correctable(project: Project, image: RpcImage, ground: Ground, size: tuple[
     camera = rpc_camera(project, image, ground, size)
     stated = project.adjustment.rpc
     plain = replace(camera, correction=None)
-    return CorrectableRpc(plain, image.name, stated.correction, stated.sigma, camera.correction)
+    return CorrectableRpc(
+        plain=plain, name=image.name, form=stated.correction, sigma=stated.sigma, start=camera.correction
+    )
 
 
 def _found(image: CorrectableRpc, sets: Mapping[str, AdjustedCorrections]) -> FoundCorrection:

@@ -130,10 +130,10 @@ def _hint(result: MapResult) -> str:
     if len(rows[image.name]) < 4:
         return "are X and Y, the direction of y in the images, units and height systems as they are stated?"
     given, described = measured_control(inputs, rows[image.name]), inputs.project.cameras[image.camera]
-    camera = interior_of(described, image), lens_of(described)
+    interior, lens = interior_of(described, image), lens_of(described)
     return fitting(
         given,
-        camera[0].size[1],
-        lambda other: resected(inputs.project, image, other, camera, ResectSettings()),
+        interior.size[1],
+        lambda other: resected(inputs.project, image, other, interior, lens, ResectSettings()),
         math.nan,
     )

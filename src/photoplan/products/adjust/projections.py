@@ -68,7 +68,14 @@ def place_of(project: Project, image: ImageEntry) -> _Floats:
 def _ground(project: Project) -> Ground:
     """Whatever cameras are made over: the height system of control."""
     system = orientation_system(project)
-    return Ground(LevelSurface(0.0), None, None, (), (system, system), system)
+    return Ground(
+        surface=LevelSurface(0.0),
+        bounds=None,
+        file=None,
+        operations=(),
+        height_systems=(system, system),
+        working_system=system,
+    )
 
 
 def _projection(project: Project, image: ImageEntry, frame: BlockFrame, level: float | None) -> BlockProjection:
@@ -93,7 +100,7 @@ def _projection(project: Project, image: ImageEntry, frame: BlockFrame, level: f
         return foot - away * directions, directions
 
     metres = float(1.0 / np.sqrt(abs(np.linalg.det(J[:, :2]))))
-    return BlockProjection(image.name, kind.group, geometry, sight, metres, away)
+    return BlockProjection(name=image.name, group=kind.group, geometry=geometry, sight=sight, metres=metres, away=away)
 
 
 def _level(project: Project, camera: Camera) -> float:

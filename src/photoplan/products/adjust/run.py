@@ -231,14 +231,14 @@ def _check_outputs(request: AdjustRequest, project: Project) -> None:
     if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
         raise UsageError(f"{request.folder}: cannot be made, as {there} cannot be written into; give another `output`")
     # What an earlier run has written of corrections is written again.
-    written = [request.folder.resolve() / n for i in project.images if (n := _correction_file(project, i)) is not None]
+    written = [request.folder.resolve() / n for i in project.images if (n := _correction_file(i)) is not None]
     inputs = [file for file in input_files(project) if file.resolve() not in written]
     _refuse_inputs(request, [request.project, *inputs])
     for file in written:
         check_output(file, inputs, overwrite=request.overwrite)
 
 
-def _correction_file(project: Project, image: ImageEntry) -> str | None:
+def _correction_file(image: ImageEntry) -> str | None:
     return None if isinstance(image, Image) else geometry_of(image).output(image.name)
 
 

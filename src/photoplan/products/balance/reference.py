@@ -41,7 +41,13 @@ class Reference:
     def pixels(self, grid: MapGrid, window: Window) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
         """What it holds for a window of the map, (bands, height, width), and where; None: nothing."""
         rule = AnchorRule.of(_KERNEL, _TOLERANCE)
-        plan = ProductPlan("reference", ("reference",), MapTarget(grid), rule, Tiles.every(grid.window, 512))
+        plan = ProductPlan(
+            name="reference",
+            sources=("reference",),
+            target=MapTarget(grid),
+            rule=rule,
+            tiles=Tiles.every(grid.window, 512),
+        )
         made = render(plan, Tile(0, window), (_source(self),), LevelSurface(0.0), _KERNEL)
         if made.values is None or made.valid is None:
             return None

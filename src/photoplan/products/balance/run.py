@@ -160,7 +160,7 @@ def _made(request: BalanceRequest, found: Survey, fixed: str | None, notes: list
         raise GeometryError(f"{reference.path}: shows nothing of the ground that the images show")
     made, pairs = _adjusted(request, cells, found, fixed, events, notes)
     files = tuple(request.folder / f"{safe_stem(found.names[k])}.toml" for k in made.images.tolist())
-    return BalanceReport(found, tuple(notes), cells, made, pairs, files)
+    return BalanceReport(survey=found, notes=tuple(notes), cells=cells, balanced=made, pairs=pairs, files=files)
 
 
 def _keep(request: BalanceRequest, project: Project, report: BalanceReport, times: dict[str, Any]) -> None:

@@ -51,7 +51,7 @@ def _plane(data: SeriesData, plane: Plane) -> Findings:
     for setting, kinds, share in ((dark, ("hot",), 0.0), (flat, ("hot", "dark"), _FLAT_SHARE)):
         if setting is not None:
             key = of.under(setting.label).named("defect elements")
-            outcomes.append(tried(key, _setting, data, setting, plane, (kinds, share)))
+            outcomes.append(tried(key, _setting, data, setting, plane, kinds, share))
     refused = {}
     if flat is None:
         refused[of.named("dark pixels")] = "no flat frames, two or more at a setting, that are not saturated"
@@ -80,8 +80,8 @@ def _flat(data: SeriesData, plane: Plane) -> Setting | None:
     return min(middle, key=lambda each: (-len(each[0].frames), each[1]), default=(None, 0.0))[0]
 
 
-def _setting(data: SeriesData, setting: Setting, plane: Plane, how: tuple[tuple[Kind, ...], float]) -> Findings:
-    (kinds, share), of = how, Subject(plane.name, setting.label)
+def _setting(data: SeriesData, setting: Setting, plane: Plane, kinds: tuple[Kind, ...], share: float) -> Findings:
+    of = Subject(plane.name, setting.label)
     stack = data.stacks(setting)[plane.name]
     level, mean = stack.level, stack.only_counted(stack.mean)
     pixels = find_defects(mean, level.temporal_variance, level.frames, kinds, share, data.step, level.is_cut_off)

@@ -30,14 +30,14 @@ def analyse(data: SeriesData) -> Findings:
     if data.series.reduced_of("flat"):
         bright = [reduced_level(data, point) for point in data.series.reduced_of("flat")]
         dark = sorted(data.series.reduced_of("dark"), key=lambda point: point.exposure_ms or 0.0)
-        levels = [reduced_level(data, point) for point in dark], [p.exposure_ms or 0.0 for p in dark]
-        return tried("gain", _plane, "", bright, levels, data)
+        levels, exposures = [reduced_level(data, point) for point in dark], [p.exposure_ms or 0.0 for p in dark]
+        return tried("gain", _plane, "", bright, levels, exposures, data)
     return joined([_of_frames(data, plane, data.settings("flat", least=2)) for plane in data.planes])
 
 
 def _of_frames(data: SeriesData, plane: Plane, flats: tuple[Setting, ...]) -> Findings:
     bright, dark = [data.levels(setting)[plane.name] for setting in flats], dark_levels(data, plane, flats[0])
-    return tried(Subject(plane.name).named("gain"), _plane, plane.name, bright, dark, data)
+    return tried(Subject(plane.name).named("gain"), _plane, plane.name, bright, *dark, data)
 
 
 def reduced_level(data: SeriesData, point: ReducedPoint) -> Level:
@@ -57,8 +57,8 @@ def reduced_level(data: SeriesData, point: ReducedPoint) -> Level:
     )
 
 
-def _plane(name: str, bright: list[Level], dark: tuple[list[Level], list[float]], data: SeriesData) -> Findings:
-    f, of = photon_transfer(bright, *dark, data.stated_black, data.step), Subject(name)
+def _plane(name: str, bright: list[Level], dark: list[Level], exposures: list[float], data: SeriesData) -> Findings:
+    f, of = photon_transfer(bright, dark, exposures, data.stated_black, data.step), Subject(name)
     refused = {}
     if f.read_noise_refused:
         refused[of.named("read noise")] = f.read_noise_refused

@@ -99,7 +99,7 @@ def choose_patches(
     step = max(float(np.median([np.sqrt(area.area) for area, _ in areas])) / grid, resolution)
     union = shapely.unary_union([area for area, _ in areas])
     settings = (resolution, radius, cells, search)
-    return settings, _in_squares(ortho, union, scenes[0].ground, (step, resolution, radius, factor))
+    return settings, _in_squares(ortho, union, scenes[0].ground, step, resolution, radius, factor)
 
 
 def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
@@ -122,9 +122,8 @@ def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
 
 
 def _in_squares(
-    ortho: Ortho, union: shapely.Geometry, ground: Ground, sizes: tuple[float, float, int, int]
+    ortho: Ortho, union: shapely.Geometry, ground: Ground, step: float, resolution: float, radius: int, factor: int
 ) -> list[OrthoPatch]:
-    step, resolution, radius, factor = sizes
     xmin, ymin, xmax, ymax = union.bounds
     margin = (radius + 1) * resolution
     found = []

@@ -143,18 +143,7 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
             images = list(run(work, range(len(names))))
         ground, points = _tables(patches, covariances, images)
         if not len(points):
-            found = sum(i.matched for i in images)
-            advice = "give a larger `search`, another `correlation`, or an orthophoto of a similar date"
-            if not found:
-                reasons = sum((Counter(i.reasons) for i in images), Counter[str]())
-                listed = (
-                    ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "none is in an image"
-                )
-                raise GeometryError(f"no patch of the orthophoto was found in an image: {listed}; {advice}")
-            raise GeometryError(
-                f"{found} of {sum(i.tried for i in images)} patches were found, but they do not agree on an "
-                f"orientation of any image; {advice}"
-            )
+            raise GeometryError(_nothing(images))
         write_ground_points(output, ground)
         write_image_points(image_output, points)
         _enter(request.project, output, image_output)
@@ -170,6 +159,18 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
         )
         record([output, image_output, request.project], report)
     return report
+
+
+def _nothing(images: Sequence[ImageControl]) -> str:
+    """Why no point came out."""
+    found = sum(i.matched for i in images)
+    advice = "give a larger `search`, another `correlation`, or an orthophoto of a similar date"
+    if not found:
+        reasons = sum((Counter(i.reasons) for i in images), Counter[str]())
+        listed = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "none is in an image"
+        return f"no patch of the orthophoto was found in an image: {listed}; {advice}"
+    tried = sum(i.tried for i in images)
+    return f"{found} of {tried} patches were found, but they do not agree on an orientation of any image; {advice}"
 
 
 def _medians(values: NDArray[np.float64]) -> tuple[float, float]:

@@ -114,11 +114,7 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
         The disk is full, or the points need more memory than there is.
     """
     times = run_times()
-    if request.output.suffix.lower() != ".gpkg":
-        raise UsageError(f"{request.output}: a terrain model is a GeoPackage; give it a name that ends with .gpkg")
-    if not request.output.resolve().parent.is_dir():
-        raise UsageError(f"{request.output}: no such folder; make it first")
-    check_output(request.output, request.inputs, overwrite=request.overwrite)
+    _check_model(request)
     events.begin("reading measurements")
     measured, findings, crs, system = load(request)
     plan = plan_build(measured, request.settings)
@@ -137,14 +133,7 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
         gross = tuple(_gross(built, measured))
         rows = built.fit.suspects
         suspects = tuple(_named(built, measured, rows[:, 0].astype(np.int64), rows[:, 2:]))
-        events.begin("writing the model", len(built.figures), "units")
-        done = writer.done()
-        for of_unit in built.figures:
-            place = of_unit.column, of_unit.row
-            if place not in done:
-                unit = built.units.get(place)
-                writer.add(unit, of_unit if unit is not None else empty_figures(*place))
-            events.done()
+        _add_units(writer, built, events)
         totals = _totals(built, measured, findings, len(gross))
         header = ModelHeader(
             crs=crs,
@@ -181,6 +170,27 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
                 settings=request.settings,
             )
     return report
+
+
+def _check_model(request: BuildRequest) -> None:
+    """Refuse a name that a model cannot have, before anything is read."""
+    if request.output.suffix.lower() != ".gpkg":
+        raise UsageError(f"{request.output}: a terrain model is a GeoPackage; give it a name that ends with .gpkg")
+    if not request.output.resolve().parent.is_dir():
+        raise UsageError(f"{request.output}: no such folder; make it first")
+    check_output(request.output, request.inputs, overwrite=request.overwrite)
+
+
+def _add_units(writer: ModelWriter, built: Built, events: Events) -> None:
+    """Write the units that an earlier run has not."""
+    events.begin("writing the model", len(built.figures), "units")
+    done = writer.done()
+    for of_unit in built.figures:
+        place = of_unit.column, of_unit.row
+        if place not in done:
+            unit = built.units.get(place)
+            writer.add(unit, of_unit if unit is not None else empty_figures(*place))
+        events.done()
 
 
 def describe_plan(plan: BuildPlan, measured: MeasuredTerrain, crs: str, system: str | None) -> str:

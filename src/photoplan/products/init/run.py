@@ -181,8 +181,8 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     place = next((each.place for each in own.values()), None)
     crs, origin_of_crs = project_crs(request, table, terrain_info, place)
     used = _cameras(pairs, _described(request, pairs), infos, table.file if table else None)
-    lonely = lonely_files, lonely_names
-    for line in _summary(used, (pairs, len(own)), f"{crs_label(crs)} ({origin_of_crs})", lonely, table):
+    where = f"{crs_label(crs)} ({origin_of_crs})"
+    for line in _summary(used, pairs, len(own), where, lonely_files, lonely_names, table):
         talk(line)
     systems = height_systems(request, table, terrain_info, ellipsoidal=not pairs)
     of_terrain = f"terrain {height_label(systems[0])}, " if terrain is not None else ""
@@ -191,7 +191,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     poses: dict[str, tuple[Triple, Triple]] = {}
     if table is not None:
         centers, angles = placed(table, crs, systems[1])
-        check_joined(systems, crs, centers)
+        check_joined(*systems, crs, centers)
         poses = {i.name: (_triple(c), _triple(a)) for i, c, a in zip(table.images, centers, angles)}
         stated = on_map(stated_positions(table, {oriented.name: file for file, oriented in pairs}), crs)
         for said in differences([i.name for i in table.images], centers, stated):
@@ -212,7 +212,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
                 size=size,
             )
         )
-    project = _checked(request, terrain, systems, crs, dict(used.values()), images)
+    project = _checked(request, terrain, *systems, crs, dict(used.values()), images)
     return InitResult(request.path, project, tuple(f.name for f in lonely_files), tuple(lonely_names))
 
 
@@ -268,14 +268,15 @@ def _cameras(
 def _checked(
     request: InitRequest,
     terrain: StatedTerrain | None,
-    systems: tuple[str | None, str],
+    terrain_system: str | None,
+    height_system: str,
     crs: str,
     cameras: dict[str, CameraEntry],
     images: Sequence[ImageEntry],
 ) -> Project:
     """The project, checked as if it had been read."""
     orientation = {
-        "height_system": systems[1],
+        "height_system": height_system,
         "earth_curvature": request.earth_curvature,
         "refraction": request.refraction,
     }
@@ -290,7 +291,7 @@ def _checked(
         "images": [i.model_dump(exclude_none=True) for i in images],
     }
     if terrain is not None:
-        contents["terrain"] = {**terrain.model_dump(exclude_none=True), "height_system": systems[0]}
+        contents["terrain"] = {**terrain.model_dump(exclude_none=True), "height_system": terrain_system}
     return parse_project(contents, request.folder.absolute().resolve(), "project")
 
 
@@ -315,13 +316,14 @@ def _present(file: Path, folder: Path, *, or_folder: bool = False) -> str:
 
 def _summary(
     used: dict[str, tuple[str, CameraEntry]],
-    images: tuple[Sequence[tuple[Path, OrientedImage | Unoriented]], int],
+    pairs: Sequence[tuple[Path, OrientedImage | Unoriented]],
+    own: int,
     crs: str,
-    lonely: tuple[list[Path], list[str]],
+    without_orientation: list[Path],
+    without_file: list[str],
     table: OrientationTable | None,
 ) -> list[str]:
-    """What was found, in a few lines; `images` are those with a camera, and the number of those with polynomials."""
-    pairs, own = images
+    """What was found, in a few lines, of images with a camera and of so many with polynomials."""
     parts = [f"{len(pairs)} images" + ("" if table else " without orientation")] if pairs else []
     parts += [f"{own} images with rational polynomials (RPC)"] if own else []
     for name, camera in dict(used.values()).items():
@@ -329,8 +331,8 @@ def _summary(
         film = "film, " if camera.fiducial_system is not None else ""
         parts.append(f'camera "{name}"{size}, {film}{LENS_NAMES[camera.lens.type]}')
     lines = ["  " + " · ".join([*parts, crs])]
-    if lonely[0]:
-        lines.append(f"  left out, no orientation: {some([f.name for f in lonely[0]])}")
-    if lonely[1]:
-        lines.append(f"  left out, no image file: {some(lonely[1])}")
+    if without_orientation:
+        lines.append(f"  left out, no orientation: {some([f.name for f in without_orientation])}")
+    if without_file:
+        lines.append(f"  left out, no image file: {some(without_file)}")
     return lines + ([f"  {note}" for note in table.notes] if table else [])

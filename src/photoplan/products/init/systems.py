@@ -237,9 +237,9 @@ def placed(table: OrientationTable, crs: str, system: str) -> tuple[NDArray[np.f
     return centers, degrees_of(grid_rotation(step, XY) @ table.rotations)
 
 
-def check_joined(systems: tuple[str | None, str], crs: str, centers: NDArray[np.float64]) -> None:
+def check_joined(terrain: str | None, images: str, crs: str, centers: NDArray[np.float64]) -> None:
     """Fail now, not in every later command, if the height systems cannot be joined here."""
-    if systems[0] is None:
+    if terrain is None:
         return
     bounds = (centers[:, 0].min(), centers[:, 1].min(), centers[:, 0].max(), centers[:, 1].max())
-    height_step(systems[1], systems[0], crs, bounds)(centers)
+    height_step(images, terrain, crs, bounds)(centers)

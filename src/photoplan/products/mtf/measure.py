@@ -69,13 +69,15 @@ class Measuring:
         return sum(len(tiles_of(area)) for area in self.areas(image)) + self.most_edges
 
 
-def measure_image(name: tuple[str, Path], image: LightImage, how: Measuring, advance: Advance) -> ImageMtf:
+def measure_image(name: str, path: Path, image: LightImage, how: Measuring, advance: Advance) -> ImageMtf:
     """Find and measure the edges of an image.
 
     Parameters
     ----------
-    name : str and Path
-        What messages call it, and its file as it was given.
+    name : str
+        What messages call it.
+    path : Path
+        Its file as it was given.
     advance : callable
         Called with (tiles, pixels) as they are done.
 
@@ -107,8 +109,8 @@ def measure_image(name: tuple[str, Path], image: LightImage, how: Measuring, adv
     if enhancement.enhanced:
         notes.append(enhancement.warning)
     return ImageMtf(
-        name=name[0],
-        file=name[1],
+        name=name,
+        file=path,
         size=image.size,
         linearisation=image.linearisation.describe(),
         edges=tuple(edges),

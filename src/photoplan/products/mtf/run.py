@@ -97,7 +97,7 @@ def measure_mtf(request: MtfRequest, events: Events = SILENT) -> MtfReport:
     events.begin("edges", sum(measuring.steps(image) for image in opened.values()), "tiles")
     for path, image in opened.items():
         try:
-            results.append(measure_image((names[path], path), image, measuring, events.done))
+            results.append(measure_image(names[path], path, image, measuring, events.done))
         except (ResourceError, UsageError):
             raise
         except PhotoplanError as error:

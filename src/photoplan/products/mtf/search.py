@@ -100,7 +100,7 @@ def search_edges(
         advance(1, tile.size)
     for line in join_lines(open_lines):
         for part in _pieces(line):
-            _examine_alone(image, channel, (area, part), rules, found)
+            _examine_alone(image, channel, area, part, rules, found)
     numbered = [replace(region, of=k) for k, region in enumerate(sorted(found.regions, key=lambda r: -r.merit), 1)]
     parts = [part for region in numbered for part in parted(region, ceil(region.line.length / PART))]
     found.regions = sorted(parts, key=lambda region: -region.merit)
@@ -108,10 +108,9 @@ def search_edges(
 
 
 def _examine_alone(
-    image: LightImage, channel: int, where: tuple[Window, StraightEdge], rules: EdgeRules, found: FoundEdges
+    image: LightImage, channel: int, area: Window, line: StraightEdge, rules: EdgeRules, found: FoundEdges
 ) -> None:
     """Examine a line in a window of its own."""
-    area, line = where
     if line.length < rules.least_length:
         return
     reach = max(rules.halves) + 4

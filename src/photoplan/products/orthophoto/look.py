@@ -74,7 +74,7 @@ def with_resolution(project: Project, settings: OrthoSettings, looked: Sequence[
     own = two_figures(float(np.mean([one.look.gsd for one in looked]))) if looked else 1.0
     resolution = settings.resolution or own
     if looked and not force:
-        _refuse_too_fine(project, resolution, settings, looked)
+        _refuse_too_fine(resolution, settings, looked)
     return replace(settings, resolution=resolution)
 
 
@@ -116,7 +116,7 @@ def heights_in_feet(surface: Terrain, cameras: Sequence[Camera]) -> str | None:
     )
 
 
-def _refuse_too_fine(project: Project, resolution: float, settings: OrthoSettings, looked: Sequence[Looked]) -> None:
+def _refuse_too_fine(resolution: float, settings: OrthoSettings, looked: Sequence[Looked]) -> None:
     """Refuse a resolution at which most pixels would be made up."""
     finest = min((one.look.gsd for one in looked if one.look.gsd > 0), default=0.0)
     if not resolution * _FINER < finest:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.adjustment.linear import solve
-from photoplan.adjustment.robust import huber
+from photoplan.adjustment.robust import huber, spread
 from photoplan.matching.register import FOUND, STATES, PatchDisplacements
 from photoplan.plain import pick
 
@@ -148,10 +148,11 @@ def fit_smooth(found: PatchDisplacements, kind: str, overlap: float) -> SmoothMo
         weight = 1 / np.maximum(sigma[:, axis], np.median(sigma[:, axis])) ** 2
         fit = solve(A, d[:, axis], weight)
         for _ in range(10):
-            size = np.abs(fit.residuals) * np.sqrt(weight)
-            scale = max(float(np.median(size)) / 0.6745, 1e-9)
-            fit = solve(A, d[:, axis], weight * huber(size / scale, _LIMIT))
+            size = fit.residuals * np.sqrt(weight)
+            fit = solve(A, d[:, axis], weight * huber(size / max(spread(size), 1e-9), _LIMIT))
         rows.append(fit.unknowns)
         covariances.append(fit.covariance * max(overlap, 1.0))
         rms.append(float(np.sqrt((fit.residuals**2).mean())))
-    return SmoothModel(kind, middle, np.array(rows), np.array(covariances), (rms[0], rms[1]))
+    return SmoothModel(
+        kind=kind, middle=middle, unknowns=np.array(rows), covariances=np.array(covariances), rms=(rms[0], rms[1])
+    )

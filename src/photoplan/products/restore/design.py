@@ -148,7 +148,7 @@ def design_restoration(request: DesignRequest, events: Events = SILENT) -> Measu
     for channel in _channels(mtf.images, request.per_band):
         scene = _spectrum(opened, channel)
         edges = [e.measured for image in mtf.images for e in image.edges if e.channel == channel]
-        parts += _parts(request, (channel if request.per_band else None, size), edges, scene, notes)
+        parts += _parts(request, channel if request.per_band else None, size, edges, scene, notes)
     if mtf.enhancement is not None and mtf.enhancement.enhanced:
         notes.append(mtf.enhancement.warning)
     return MeasuredFilter(_filter(request, parts, size), tuple(parts), mtf, tuple(notes))
@@ -172,14 +172,14 @@ def _channels(images: Sequence[ImageMtf], per_band: bool) -> list[int]:
 
 def _parts(
     request: DesignRequest,
-    where: tuple[int | None, tuple[int, int]],
+    band: int | None,
+    size: tuple[int, int],
     edges: Sequence[EdgeMeasurement],
     scene: SceneSpectrum,
     notes: list[str],
 ) -> list[DesignedPart]:
     """The filters of a band: for the whole field, or for each part of it that has edges enough."""
-    band, size = where
-    whole = _designed(request, (band, None), edges, scene)
+    whole = _designed(request, band, None, edges, scene)
     for axis in whole.missing:
         lacking, other = ("rows", "columns") if axis == "x" else ("columns", "rows")
         notes.append(f"too few edges show the sharpness along {lacking}; that along {other} stands for it")
@@ -191,7 +191,7 @@ def _parts(
         for col in range(n):
             at = ((col + 0.5) * size[0] / n - 0.5, (row + 0.5) * size[1] / n - 0.5)
             here = [edge for edge in edges if _cell(edge, size, n) == (col, row)]
-            part = _designed(request, (band, at), here, scene, whole)
+            part = _designed(request, band, at, here, scene, whole)
             poor += part.edges == 0
             found.append(part)
     if poor:
@@ -210,7 +210,8 @@ def _cell(edge: EdgeMeasurement, size: tuple[int, int], n: int) -> tuple[int, in
 
 def _designed(
     request: DesignRequest,
-    place: tuple[int | None, tuple[float, float] | None],
+    band: int | None,
+    at: tuple[float, float] | None,
     edges: Sequence[EdgeMeasurement],
     spectrum: SceneSpectrum,
     whole: DesignedPart | None = None,
@@ -221,14 +222,16 @@ def _designed(
     except InputError:
         if whole is None:
             raise
-        return DesignedPart(*place, 0, whole.sharpness, whole.missing, whole.scenes, whole.design)
+        return replace(whole, band=band, at=at, edges=0)
     if whole is not None:
         x = whole.sharpness[0] if "x" in missing or x.doubt else x
         y = whole.sharpness[1] if "y" in missing or y.doubt else y
     transfer = curve_transfer(x.modulation(), y.modulation())
     scenes = whole.scenes if whole is not None else scenes_of(spectrum.power, transfer, spectrum.noise, request.noise)
     design = design_filter(x, y, scenes, request.options, spectrum.kept)
-    return DesignedPart(*place, len(edges), (x, y), missing, scenes, design)
+    return DesignedPart(
+        band=band, at=at, edges=len(edges), sharpness=(x, y), missing=missing, scenes=scenes, design=design
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,7 +141,7 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
             source = corrections.source(path)
             out = np.dtype(source.info.dtype if request.dtype == "same" else request.dtype)
             _check_bands(path, source.bands, request.bands)
-            chosen = _only(filter_, request.bands, source.bands)
+            chosen = _only(filter_, request.bands)
             reader = restored(source, chosen, light, out)
             target = request.folder / f"{stems[path.name]}_restored.tif"
             jobs.append(_job(request, reader, target, text, tuple(tools)))
@@ -160,7 +160,7 @@ def _check_bands(path: Path, count: int, wanted: Iterable[int]) -> None:
             raise InputError(f"{path}: band {band} is asked for; the image has {count}")
 
 
-def _only(filter_: RestorationFilter, bands: tuple[int, ...], count: int) -> RestorationFilter:
+def _only(filter_: RestorationFilter, bands: tuple[int, ...]) -> RestorationFilter:
     """The filter for some bands alone."""
     if not bands:
         return filter_

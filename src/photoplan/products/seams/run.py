@@ -138,7 +138,7 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
         shapes = {row: _multi(shape) for row, shape in sorted(polygons.items())}
         write_regions(request.path, found.names, shapes, found.grid.crs)
         named = {found.names[row - 1]: shape for row, shape in shapes.items()}
-        report = SeamsReport(found, notes, request.path, named, differences)
+        report = SeamsReport(survey=found, notes=notes, path=request.path, shapes=named, differences=differences)
         ran = {"workers": request.workers, "executor": request.executor, "memory": request.memory, **times()}
         write_run_record(request.path, key=key, inputs=inputs, run=ran, kind="seams", product=report, settings=settings)
         when_named(log.remove)

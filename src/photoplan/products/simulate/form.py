@@ -115,7 +115,7 @@ class Forming:
             with steps(self.output.name, self.workers, events, log) as run:
                 events.begin("images", count_parts(self.model, self.scene, len(self.frames)), "parts")
                 try:
-                    images = form_frames(self.model, self.scene, self.frames, (self.dtype, tags), run, log)
+                    images = form_frames(self.model, self.scene, self.frames, self.dtype, tags, run, log)
                 except MemoryError:
                     text = f"{self.scene.bands} × {self.scene.size[0]} × {self.scene.size[1]}"
                     raise ResourceError(f"too little memory for an image of {text} pixels; cut the scene") from None

@@ -118,7 +118,8 @@ def form_frames(
     model: ImageModel,
     scene: LightScene,
     frames: Sequence[tuple[Path, float]],
-    how: tuple[str, Mapping[str, str]],
+    dtype: str,
+    tags: Mapping[str, str],
     run: Steps,
     store: Store,
 ) -> list[SimulatedImage]:
@@ -129,7 +130,7 @@ def form_frames(
     model, scene
     frames : sequence of (Path, float)
         File and exposure of each.
-    how : (str, mapping)
+    dtype, tags
         Type of the pixels, and tags of the files.
     run, store
         Make the parts, and keep them.
@@ -143,7 +144,9 @@ def form_frames(
             light = cache(partial(sampled.whole, run(sampled, sampled.tiles, pixels=lambda tile: tile.size)))
         again = store.index(("frame", n)) in store.finished and not is_kept(store, n, path)
         name = ("frame", n, "again") if again else ("frame", n)
-        ((own, gain, facts),) = run(partial(_write, model, light, path, how), [FormedFrame(n, exposure, gain)], [name])
+        ((own, gain, facts),) = run(
+            partial(_write, model, light, path, dtype, tags), [FormedFrame(n, exposure, gain)], [name]
+        )
         images.append(SimulatedImage(path=path, frame=n, exposure=exposure, gain=own, facts=facts))
     return images
 
@@ -152,11 +155,12 @@ def _write(
     model: ImageModel,
     light: Callable[[], NDArray[np.float64]],
     path: Path,
-    how: tuple[str, Mapping[str, str]],
+    dtype: str,
+    tags: Mapping[str, str],
     frame: FormedFrame,
 ) -> tuple[float, float, dict[str, object]]:
     """Expose and write a frame; its gain, that of the next one, and what is known of it."""
     made = exposed(model, light(), frame)
-    values = made.values.astype(how[0], copy=False)
-    write_whole_image(path, values, {**how[1], "PHOTOPLAN_FRAME": str(frame.number)})
+    values = made.values.astype(dtype, copy=False)
+    write_whole_image(path, values, {**tags, "PHOTOPLAN_FRAME": str(frame.number)})
     return made.gain, made.next_gain, dict(made.facts)

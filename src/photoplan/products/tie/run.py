@@ -192,7 +192,7 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     with together():
         write_image_points(output, points)
         _enter(request.project, project, output)
-        report = _report(names, chosen, factor, (len(pairs), verified), found, tracks, notes)
+        report = _report(names, chosen, factor, len(pairs), len(verified), found, tracks, notes)
         report = replace(report, output=output, refined=refined, loops=loops, sources=tuple(images), found=tracks)
         write_run_record(
             output,
@@ -318,7 +318,8 @@ def _report(
     names: Sequence[str],
     chosen: str,
     factor: int,
-    pairs: tuple[int, Sequence[PairMatches]],
+    pairs: int,
+    verified: int,
     found: TracksFound,
     tracks: Tracks,
     notes: list[str],
@@ -331,8 +332,8 @@ def _report(
         images=tuple(names),
         chosen=chosen,
         factor=factor,
-        pairs=pairs[0],
-        verified=len(pairs[1]),
+        pairs=pairs,
+        verified=verified,
         tracks=found.tracks.count,
         ambiguous=found.ambiguous,
         points=tracks.count,

@@ -304,7 +304,14 @@ def _bundle(
         north = axes @ (0.0, 1.0, 0.0)
         turned = azimuth + math.atan2(north[0], north[1])
         row = (height - 1) / 2 + rise * scale
-        return Panorama(origin, request.size, turned, scale, row, request.panorama == "sphere")
+        return Panorama(
+            center=origin,
+            size=request.size,
+            azimuth=turned,
+            scale=scale,
+            horizon=row,
+            spherical=request.panorama == "sphere",
+        )
     focal = width / 2 / math.tan(math.radians(request.field_of_view or 60.0) / 2)
     interior = Interior.digital(request.size, (focal, focal * request.pixel_aspect))
     R = axes @ _rotation(azimuth, pitch, math.radians(request.roll))
@@ -336,7 +343,7 @@ def _stretched(request: CameraRequest, ground: ViewGround, target: ViewTarget, r
         center, warps = stretch.inverse(target.center), (stretch, *target.warps)
         target = ViewTarget(target.bundle, center, warps, bend / request.exaggeration)
     above = request.exaggeration * float(target.center[2] - ground.terrain.heights(target.center[:2]))
-    return ViewCamera(request, target, above, bend, radius)
+    return ViewCamera(request=request, target=target, above_ground=above, bend=bend, earth_radius=radius)
 
 
 def _reference(target: ViewTarget, ground: ViewGround) -> float:

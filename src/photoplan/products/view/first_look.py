@@ -38,7 +38,7 @@ def first_look(target: ViewTarget, surface: SeenSurface) -> FirstLook:
     seen = surface.at(target, uv)
     there = seen.owner >= 0
     if not there.any():
-        return FirstLook(0.0, None, None, None, None, None)
+        return FirstLook(ground=0.0, nearest=None, farthest=None, lowest=None, highest=None, pixel=None)
     away, Z = target.distance(seen.uvh[there]), seen.XYZ[there, 2]
     beside = target.bundle.directions(uv[there] + (1.0, 0.0)) - target.bundle.directions(uv[there])
     pixel = np.median(np.abs(seen.uvh[there, 2]) * np.linalg.norm(beside, axis=1))

@@ -84,7 +84,14 @@ def open_view_ground(path: Path, crs: str | None = None, water: float | None = N
 def _dry_ground(path: Path, crs: str | None) -> ViewGround:
     if path.suffix.lower() != ".toml":
         model = open_terrain(path, crs, "with `crs` EPSG:nnnn")
-        return ViewGround(model.surface, model.bounds, model.crs, model.height_system, None, (model.path,))
+        return ViewGround(
+            terrain=model.surface,
+            bounds=model.bounds,
+            crs=model.crs,
+            height_system=model.height_system,
+            project=None,
+            files=(model.path,),
+        )
     if not path.is_file():
         raise InputError(f"{path}: is no file; give a project.toml or a terrain model")
     project = load_project(path)

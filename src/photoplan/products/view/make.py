@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from photoplan import __version__
-from photoplan.engine.cluster import Question
 from photoplan.engine.executors import Workers, open_workers
 from photoplan.engine.run import Runner, Tally, Work
 from photoplan.errors import GeometryError, InputError, UsageError
@@ -23,11 +22,11 @@ from photoplan.io.image_form import ImageForm
 from photoplan.io.matrix_file import BANDS, MatrixFile
 from photoplan.io.naming import together, write_atomically
 from photoplan.io.product import DESCRIPTION, ProductFile, check_output
-from photoplan.io.run_record import input_entry, run_key, versions, write_run_record
+from photoplan.io.run_record import input_entry, run_key, write_run_record
 from photoplan.io.storage import PICTURES
 from photoplan.plain import json_text, plain
 from photoplan.plan.tiles import Tiles
-from photoplan.products.run import Run, clock, refuse_inputs
+from photoplan.products.run import Run, clock, question, refuse_inputs
 from photoplan.products.view.camera import CameraRequest, ViewCamera, view_camera
 from photoplan.products.view.content import open_layers
 from photoplan.products.view.first_look import FirstLook, first_look
@@ -190,7 +189,9 @@ def plan_view(request: ViewRequest) -> ViewPlan:
     if request.stereo is not None:
         pair = request.stereo.stated(first.nearest)
         told += [pair, eyes(camera, pair.metres)]
-    return ViewPlan(request, camera, first, address, run_key(f"view {request.kind}", told, inputs))
+    return ViewPlan(
+        request=request, camera=camera, first=first, address=address, key=run_key(f"view {request.kind}", told, inputs)
+    )
 
 
 def camera_request(request: ViewRequest) -> CameraRequest:
@@ -273,8 +274,8 @@ def make_view(plan: ViewPlan, run: Run) -> ViewResult:
         Disk or memory ran out.
     """
     run.check()
-    question = Question(versions, tuple(each for each, _ in plan.address.digests), str(_output(plan).parent.resolve()))
-    with open_workers(run.executor, run.workers, question, run.events) as workers, together():
+    asked = question((Path(each) for each, _ in plan.address.digests), _output(plan).parent)
+    with open_workers(run.executor, run.workers, asked, run.events) as workers, together():
         work = view_work(plan, run, workers)
         run.events.begin(work.name, work.count)
         (result,) = Runner[ViewResult](workers, run.in_flight(workers.threads), run.events).run([work])

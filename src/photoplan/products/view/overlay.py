@@ -211,7 +211,14 @@ def overlay(drawing: Drawing, sight: LinesOfSight, lettering: Lettering | None, 
     features = len(drawing.style) + len(drawing.points)
     facts = OverlayFacts(features, len(np.unique(seen.line)) + len(at), len(labels), len(asked) - len(labels))
     strokes = tuple((each.style, each.segments) for each in layers)
-    return Overlay(sight.target.bundle.size, strokes, tuple(layers), tuple(labels), text_size, facts)
+    return Overlay(
+        size=sight.target.bundle.size,
+        strokes=strokes,
+        layers=tuple(layers),
+        labels=tuple(labels),
+        text_size=text_size,
+        facts=facts,
+    )
 
 
 def simpler(seen: SeenLines, pieces: NDArray[np.int64]) -> list[NDArray[np.float64]]:

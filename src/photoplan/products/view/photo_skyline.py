@@ -225,7 +225,7 @@ def _matched(
         names, xy, XYZ = control
         off = (xy - target.to_view(XYZ)[:, :2]).tolist()
         points = tuple(ControlResidual(n, *at, *d) for n, at, d in zip(names, xy.tolist(), off))
-    return PhotoMatch(edge, residuals, points, target, line)
+    return PhotoMatch(edge=edge, residuals=residuals, control=points, target=target, line=line)
 
 
 def _edge(request: PhotoSkylineRequest, reader: RasterReader, line: Seen, search: int) -> _Floats:
@@ -262,7 +262,9 @@ def draw_match(path: Path, photo: Path, match: PhotoMatch) -> None:
         (LineStyle(_OF_TERRAIN, thick), at),
         (LineStyle(_OF_PHOTO, 4 * thick), at[:, [0, 1, 0, 1]]),
     )
-    Overlay(reader.size, strokes, (), (), 0.0, OverlayFacts(0, 0, 0, 0)).paint(picture, window)
+    Overlay(
+        size=reader.size, strokes=strokes, layers=(), labels=(), text_size=0.0, facts=OverlayFacts(0, 0, 0, 0)
+    ).paint(picture, window)
     write_png(path, np.concatenate([picture, np.full((1, *picture.shape[1:]), 255, np.uint8)]))
 
 

@@ -98,7 +98,7 @@ def skyline(request: SkylineRequest) -> Skyline:
             found = _skyline(request, ground, camera.target, skyline_of(camera.target, surface))
         else:
             matches = against_photo(photo, camera, lambda target, beyond: skyline_of(target, surface, beyond))
-            found = _beside(request, ground, camera, matches)
+            found = _beside(request, ground, camera, *matches)
         _write(found, ground.crs)
         record(outputs, {"camera": camera, **found.json_fields()})
     return found
@@ -115,11 +115,10 @@ def _skyline(request: SkylineRequest, ground: ViewGround, target: ViewTarget, se
 
 
 def _beside(
-    request: SkylineRequest, ground: ViewGround, camera: ViewCamera, matches: tuple[PhotoMatch, PhotoMatch | None]
+    request: SkylineRequest, ground: ViewGround, camera: ViewCamera, before: PhotoMatch, after: PhotoMatch | None
 ) -> Skyline:
     """A skyline with what a photograph says of it; the files of both are written."""
     assert request.photo is not None
-    before, after = matches
     last = before if after is None else after
     refined = None if after is None else refined_camera(camera, after, ground, request.photo.refined)
     if request.photo.refined is not None and refined is not None:

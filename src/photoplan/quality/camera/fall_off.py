@@ -154,7 +154,7 @@ def fit_fall_off(flat: NDArray[np.floating], settings: FallOffSettings | None = 
     symmetric = fit.model.camera_constant is not None or any(m == 0 for _, m in fit.model.terms)
     # No fall-off was seen: how well that is known, a term of it says.
     judged = fit if symmetric else adjust(blocks, settings, ((2, 0), *fit.model.terms), fit.weights)
-    found = _result(blocks, fit, _corner_sigmas(judged), (rank, shares))
+    found = _result(blocks, fit, _corner_sigmas(judged), rank, shares)
     # A surface that is not general leaves asymmetry too; only the general one can say that nothing smooth fits.
     general = settings.artificial == "surface"
     if general and found.residual_rms > _UNEVEN and found.neighbour_correlation > _STRUCTURE:
@@ -199,7 +199,7 @@ def _rank(fit: FallOffFit, shares: dict[str, float], settings: FallOffSettings) 
     )
 
 
-def _result(blocks: Blocks, fit: FallOffFit, of_corners: Array, rank: tuple[str, dict[str, float]]) -> FallOff:
+def _result(blocks: Blocks, fit: FallOffFit, of_corners: Array, rank: str, shares: dict[str, float]) -> FallOff:
     k, level, C, model = len(fit.free), float(fit.linear[0]), fit.covariance, fit.model
     factors, c = np.array(model.coefficients), model.camera_constant
     # a_k = (level · a_k) / level
@@ -221,8 +221,8 @@ def _result(blocks: Blocks, fit: FallOffFit, of_corners: Array, rank: tuple[str,
         sigma_camera_constant=None if constant is None or c is None else constant * c,
         sigma_principal_point=None if across is None or down is None else (across * unit, down * unit),
         corners=_corners(model, of_corners),
-        rank=rank[0],
-        separability=rank[1],
+        rank=rank,
+        separability=shares,
         residual_rms=float(np.sqrt(np.mean(relative[clean] ** 2))),
         residual_largest=float(np.abs(relative[clean]).max()),
         neighbour_correlation=blocks.neighbour_correlation(np.where(clean, fit.residuals, np.nan)),

@@ -113,9 +113,9 @@ def warm_up(
         )
     middle = tuple(float(v) for v in base.mean(axis=0))
     moved = mean - base[:, None]
-    values, cofactors, rest = _epochs(base - middle, moved, chosen, repeat)
-    sigmas, sigma0 = _sigmas(cofactors, rest, (repeat, P), reference)
-    courses = _courses(t, values, sigmas, chosen)
+    epochs = _epochs(base - middle, moved, chosen, repeat)
+    sigmas, sigma0 = _sigmas(epochs, repeat, P, reference)
+    courses = _courses(t, epochs.values, sigmas, chosen)
     return WarmUp(
         times=t - t[0],
         model=chosen,
@@ -200,10 +200,18 @@ def _design(d: Array, model: str) -> Array:
     return A.reshape(2 * k, -1)
 
 
-def _epochs(
-    d: Array, moved: Array, model: str, repeat: tuple[float, float] | None
-) -> tuple[Array, Array, tuple[Array, int, Array]]:
+@dataclass(frozen=True, eq=False)
+class _Epochs:
     """Parameters of every epoch, their cofactors; sums of squares of columns and rows, redundancy and weights."""
+
+    values: Array
+    cofactors: Array
+    squares: Array
+    freedom: int
+    weights: Array
+
+
+def _epochs(d: Array, moved: Array, model: str, repeat: tuple[float, float] | None) -> _Epochs:
     A = _design(d, model)
     k, m, u = len(d), moved.shape[1], A.shape[1]
     parts = Decomposed.of(A)
@@ -226,7 +234,7 @@ def _epochs(
         freedom += fit.redundancy
     # One epoch's redundancy goes into the reference.
     freedom -= 2 * k - u
-    return values, cofactors, (squares, max(freedom, 0), weights)
+    return _Epochs(values=values, cofactors=cofactors, squares=squares, freedom=max(freedom, 0), weights=weights)
 
 
 def _weights(repeat: tuple[float, float] | None) -> Array:
@@ -237,26 +245,25 @@ def _weights(repeat: tuple[float, float] | None) -> Array:
 
 
 def _sigmas(
-    cofactors: Array, rest: tuple[Array, int, Array], repeated: tuple[tuple[float, float] | None, Array], reference: str
+    epochs: _Epochs, repeat: tuple[float, float] | None, P: Array, reference: str
 ) -> tuple[Array, tuple[float, float]]:
     """Standard deviations of the parameters against the reference, and sigma0 of an epoch's columns and rows.
 
     The variance of unit weight comes from residuals where these have redundancy, else from repetitions.
     """
-    (squares, freedom, weights), (repeat, P) = rest, repeated
-    m = len(cofactors)
+    m, weights, freedom = len(epochs.cofactors), epochs.weights, epochs.freedom
     # Against the first epoch, every difference holds two epochs' errors; against the mean, a little less than one.
     both = 2.0 if reference == "first" else (m - 1.0) / m
     sigma0 = (math.nan, math.nan)
     if freedom >= 6:
-        level = float((squares * weights**2).sum()) / freedom / (2.0 if reference == "first" else 1.0)
+        level = float((epochs.squares * weights**2).sum()) / freedom / (2.0 if reference == "first" else 1.0)
         sigma0 = (math.sqrt(level) / float(weights[0]), math.sqrt(level) / float(weights[1]))
     elif repeat is not None:
         count = np.isfinite(P).all(axis=3).sum(axis=2)
         level = repeat[0] ** 2 / float(np.mean(count[count > 0]))
     else:
         level = math.nan
-    sigmas = np.sqrt(np.einsum("iuu->iu", cofactors) * level * both)
+    sigmas = np.sqrt(np.einsum("iuu->iu", epochs.cofactors) * level * both)
     if reference == "first":
         sigmas[0] = 0.0
     return sigmas, sigma0

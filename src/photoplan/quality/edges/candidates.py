@@ -153,7 +153,7 @@ def find_lines(
     steep = np.abs(u[:, 0]) >= np.abs(u[:, 1])
     part = offset[row, col].astype(float)
     points: Array = np.stack([col + np.where(steep, part, 0.0), row + np.where(steep, 0.0, part)], 1)
-    return _lines(points, u, size, (label, chains), least_length)
+    return _lines(points, u, size, label, chains, least_length)
 
 
 def _gradient(
@@ -179,9 +179,8 @@ def _gradient(
 
 
 def _lines(
-    points: Array, u: Array, size: Array, labels: tuple[NDArray[np.int32], int], least_length: float
+    points: Array, u: Array, size: Array, label: NDArray[np.int32], chains: int, least_length: float
 ) -> tuple[list[StraightEdge], Counter[str]]:
-    label, chains = labels
     counts = np.bincount(label, minlength=chains)
     order = np.argsort(label, kind="stable")
     starts = np.concatenate([[0], np.cumsum(counts)])

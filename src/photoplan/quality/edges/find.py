@@ -176,7 +176,7 @@ def examine(picture: EdgePicture, line: StraightEdge, rules: EdgeRules) -> tuple
     for half in sorted(rules.halves, reverse=True):
         if half < blur.least_half:
             break
-        region, reason = _clean_part(strip, blur, half, (rules, least_contrast))
+        region, reason = _clean_part(strip, blur, half, rules, least_contrast)
         if region is None:
             reasons[reason] += 1
             continue
@@ -191,8 +191,9 @@ def examine(picture: EdgePicture, line: StraightEdge, rules: EdgeRules) -> tuple
     return None, reasons.most_common(1)[0][0] if reasons else "blurred"
 
 
-def _clean_part(strip: Strip, blur: Blur, half: int, demands: tuple[EdgeRules, float]) -> tuple[EdgeRegion | None, str]:
-    rules, least_contrast = demands
+def _clean_part(
+    strip: Strip, blur: Blur, half: int, rules: EdgeRules, least_contrast: float
+) -> tuple[EdgeRegion | None, str]:
     sides = strip.sides(blur, half)
     good, why = sides.good_blocks(rules.evenness)
     start, end = _longest(_bridged(good))

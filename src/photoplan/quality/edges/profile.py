@@ -242,7 +242,7 @@ def fit_profile(
     rights = np.array([design[a:b].T @ values[a:b] for a, b in zip(blocks, ends)])
     normal, right, square = parts.sum(axis=0), rights.sum(axis=0), float(values @ values)
     trend = extra.shape[1] + TREND
-    root, scale, noise = _best_prior(basis, normal, right, (square, values.size, trend))
+    root, scale, noise = _best_prior(basis, normal, right, square, values.size, trend)
     turn = np.eye(design.shape[1])
     turn[trend:, trend:] = root * scale
     prior = np.zeros(design.shape[1])
@@ -270,14 +270,18 @@ def fit_profile(
 
 
 def _best_prior(
-    basis: ProfileBasis, normal: NDArray[np.float64], right: NDArray[np.float64], counts: tuple[float, int, int]
+    basis: ProfileBasis,
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+    square: float,
+    number: int,
+    trend: int,
 ) -> tuple[NDArray[np.float64], float, float]:
     """Covariance root, scale and noise: smoothness of the best restricted likelihood, scale as large as it allows.
 
     With the unknowns of the trend eliminated, the signal's normal equations are brought to diagonal form, in which
     the likelihood of every scale is a sum (Patterson and Thompson 1971).
     """
-    square, number, trend = counts
     factor = cho_factor(normal[:trend, :trend])
     solved = cho_solve(factor, np.column_stack([normal[:trend, trend:], right[:trend]]))
     reduced = normal[trend:, trend:] - normal[trend:, :trend] @ solved[:, :-1]

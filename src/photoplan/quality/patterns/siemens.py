@@ -126,7 +126,7 @@ def measure_star(
             f"radius of {inner:.0f}, and the star has to be twice as large at least"
         )
     pixels, sigma = find_centre(pixels, (max(0.35 * outer, inner), outer), sectors, what)
-    outer = rules.radius or _extent(values, pixels, sectors, outer)
+    outer = rules.radius or _extent(pixels, sectors, outer)
     rings = [fit_ring(*pixels.between(r - w, r + w), r, sectors, whole=True) for r, w in _radii(inner, outer)]
     _refuse_weak(rings, white_noise(values), what)
     wave = rules.wave or _wave(rings)
@@ -165,7 +165,7 @@ def _outer(values: Array, centre: tuple[float, float], rules: StarRules, what: s
     return rules.radius or room
 
 
-def _extent(values: Array, pixels: StarPixels, sectors: int, outer: float) -> float:
+def _extent(pixels: StarPixels, sectors: int, outer: float) -> float:
     """Radius up to which the wave goes on: the outermost ring that keeps 90 % of the strongest wave, and a margin."""
     step = max(1.5, outer / 200.0)
     radii = np.arange(outer / 3.0, outer - 1.0, step)

@@ -251,7 +251,7 @@ def _rays(nodes: Nodes, lines: Sequence[LineElement]) -> _WallRays:
             outward.append(np.full(len(here), out))
     if not node:
         empty = np.empty(0, np.int64)
-        return _WallRays(empty, np.empty(0), np.empty(0), empty, empty, empty)
+        return _WallRays(node=empty, angle=np.empty(0), height=np.empty(0), rank=empty, first=empty, last=empty)
     at, turn = np.concatenate(node), np.concatenate(angle)
     order = np.lexsort((turn, at))
     left, right = np.concatenate(on_left)[order], np.concatenate(on_right)[order]
@@ -281,7 +281,7 @@ def _sectors(
     np.minimum.at(low, first, height)
     np.maximum.at(high, first, height)
     rank[low[first] == high[first]] = 0
-    return _WallRays(at, turn, height, rank, first, last)
+    return _WallRays(node=at, angle=turn, height=height, rank=rank, first=first, last=last)
 
 
 def _find_sectors(

@@ -83,7 +83,14 @@ def mesh_nodes(unit: Unit, lines: Sequence[LineElement], neighbours: Mapping[Sid
     line_nodes[of_lines] = number[: len(of_lines)]
     segments = _segments(line_nodes, line_xy, breaks, needed, unit, lines)
     edges = np.concatenate([_mesh_edges(xy, needed), segments])
-    return Nodes(xy, values, np.unique(np.sort(edges, axis=1), axis=0), needed, line_nodes, line_xy)
+    return Nodes(
+        xy=xy,
+        values=values,
+        edges=np.unique(np.sort(edges, axis=1), axis=0),
+        needed=needed,
+        line_nodes=line_nodes,
+        line_xy=line_xy,
+    )
 
 
 def _local(unit: Unit, XY: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -50,7 +50,7 @@ def read(isd: Any, path: Path) -> StatedLine:
         )
     source = Isd(isd, path)
     try:
-        return StatedLine(path, FORM, _track(source), look(source), source.radii)
+        return StatedLine(file=path, form=FORM, track=_track(source), look=look(source), radii=source.radii)
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None

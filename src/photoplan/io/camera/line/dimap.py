@@ -50,7 +50,9 @@ def read(root: Element, path: Path) -> StatedLine:
         columns, lines = (int(_number(root, f".//Raster_Dimensions/{name}")) for name in ("NCOLS", "NROWS"))
         if not (2 <= columns <= _MAX_SIZE and 1 <= lines <= _MAX_SIZE):
             raise InputError(f"an image of {columns} × {lines} pixels")
-        return StatedLine(path, FORM, _track(model, lines), _look(model, columns), EARTH_RADII)
+        return StatedLine(
+            file=path, form=FORM, track=_track(model, lines), look=_look(model, columns), radii=EARTH_RADII
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

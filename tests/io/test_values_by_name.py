@@ -1,0 +1,105 @@
+"""Values have names: those of more than four fields are built by them, and no parameter is a bundle of others. Modules
+do not import each other in circles, not even inside functions or for types."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import photoplan
+
+ROOT = Path(photoplan.__file__).parent
+#: Fields up to which a value may be built by their order.
+MOST = 4
+#: Files that still build larger ones so.
+BY_ORDER = {
+    "cameras/line_correctable.py",
+    "matching/facets/observe.py",
+    "matching/facets/radiometry.py",
+    "matching/facets/reconstruct.py",
+    "matching/facets/search.py",
+    "products/surface/plan.py",
+    "products/surface/target.py",
+}
+#: Parameters that are tuples of different things, and what they are.
+BUNDLES = {
+    "io/orientation/text.py angle_block own": "the conventions of a format, a constant of its module",
+    "io/product_check.py _compare wanted": "pixels and their validity, as a tile has them",
+    "matching/facets/block.py _solved_exactly rounds": "not looked at yet",
+    "matching/refine.py work task": "an item of a step, handed over by `map`",
+    "products/mtf/patterns.py _measure named": "a field of its result",
+    "products/surface/job.py _view target": "one key of a cache",
+    "radiometry/seams.py solve item": "an item of a step, handed over by `map`",
+}
+#: Modules that import each other, one of them for types alone.
+CIRCLES = [("cameras/line_tremor.py", "cameras/line.py")]
+_Name = tuple[str, str]
+
+
+def modules() -> Iterator[tuple[str, ast.Module]]:
+    for file in sorted(ROOT.rglob("*.py")):
+        yield file.relative_to(ROOT).as_posix(), ast.parse(file.read_text(encoding="utf-8"))
+
+
+def is_value(node: ast.ClassDef) -> bool:
+    made = [ast.unparse(each) for each in node.decorator_list]
+    return any(each.startswith("dataclass") for each in made) or [ast.unparse(b) for b in node.bases] == ["NamedTuple"]
+
+
+def fields_of(node: ast.ClassDef) -> int:
+    entries = [each for each in node.body if isinstance(each, ast.AnnAssign)]
+    return sum("init=False" not in ast.unparse(each) and "ClassVar" not in ast.unparse(each) for each in entries)
+
+
+@pytest.mark.slow  # reads all of the code
+def test_larger_values_are_built_by_name_and_parameters_are_single_things() -> None:
+    trees = dict(modules())
+    large: set[_Name] = set()
+    for path, tree in trees.items():
+        made = [node for node in tree.body if isinstance(node, ast.ClassDef) and is_value(node)]
+        large |= {(path, node.name) for node in made if fields_of(node) > MOST}
+    assert ("surfaces/seen.py", "Seen") in large
+    by_order, bundles = set(), set()
+    for path, tree in trees.items():
+        known = {name: (path, name) for where, name in large if where == path}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("photoplan."):
+                file = node.module.removeprefix("photoplan.").replace(".", "/") + ".py"
+                known |= {each.asname or each.name: (file, each.name) for each in node.names}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) > MOST:
+                spread = any(isinstance(each, ast.Starred) for each in node.args)
+                if known.get(node.func.id) in large and not spread:
+                    by_order.add(path)
+            elif isinstance(node, ast.FunctionDef) and not path.startswith("kernels/"):
+                bundles |= {f"{path} {node.name} {each}" for each in bundled(node)}
+    assert by_order <= BY_ORDER
+    assert bundles <= set(BUNDLES)
+
+
+def bundled(node: ast.FunctionDef) -> Iterator[str]:
+    """Parameters of different things in one."""
+    for each in (*node.args.args, *node.args.kwonlyargs):
+        kind = each.annotation
+        if isinstance(kind, ast.Subscript) and ast.unparse(kind.value) == "tuple" and isinstance(kind.slice, ast.Tuple):
+            parts = {ast.unparse(part) for part in kind.slice.elts}
+            if len(parts) > 1 and "..." not in parts:
+                yield each.arg
+
+
+@pytest.mark.slow  # reads all of the code
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    ways: dict[str, set[str]] = {}
+    for path, tree in modules():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("photoplan."):
+                places = [f"{node.module}.{each.name}" for each in node.names] + [node.module]
+                named = {f"{place.removeprefix('photoplan.').replace('.', '/')}.py" for place in places if place}
+                ways.setdefault(path, set()).update(named)
+    for path, far in CIRCLES:
+        ways[path].remove(far)
+    TopologicalSorter(ways).prepare()
