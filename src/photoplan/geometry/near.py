@@ -124,10 +124,10 @@ def _near(ground: BodyGround, x: float, y: float, reach: float) -> NearGround:
         others = np.stack(np.meshgrid(between, between), axis=-1).reshape(-1, 2)
         miss = np.abs(_terms(others, count) @ coefficients - above(others)).max()
         if miss <= _ROUNDED * ground.radii[0]:
-            return NearGround(ground, middle, reach, origin, coefficients)
+            return NearGround(ground=ground, middle=middle, reach=reach, origin=origin, coefficients=coefficients)
     if not np.isfinite(origin).all():
         origin = np.zeros(3)
-    return NearGround(ground, middle, reach, origin, None)
+    return NearGround(ground=ground, middle=middle, reach=reach, origin=origin, coefficients=None)
 
 
 def _terms(unit: _Floats, count: int) -> _Floats:
