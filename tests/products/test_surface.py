@@ -247,6 +247,7 @@ def test_heights_that_fit_badly_are_told_with_what_helps() -> None:
         told += findings(planned(search=search, name="s"), {"a": 1.0}, 80.0, 0.1, 0.03, 0.01, 0.0)
     assert all("3.0% of the heights fit badly: see s_fit.tif" in line and "s_sigma.tif" in line for line in told)
     assert len(told) == 2 and "`search`" in told[0] and "`search`" not in told[1] and "`target`" in told[1]
+    assert "a larger `reach` where things stand more than 10 m above or below the start" in told[1]
 
 
 def test_heights_that_know_hardly_more_than_the_reach_are_told() -> None:

@@ -54,9 +54,12 @@ def findings(
         )
     if alone:
         listed = ", ".join(f"{name} {known[name]:.3g} ({others[name]:.3g})" for name in alone[:6])
+        whose, them = "its orientation is wrong, or it shows something else", "it"
+        if len(alone) > 1:
+            whose, them = "their orientations are wrong, or they show something else", "them"
         lines.append(
-            f"sigma0 of {listed} is far above that of the other images (in brackets): its orientation is wrong, or it "
-            "shows something else. `photoplan tie` and `photoplan adjust` orient anew; `images` leaves it out"
+            f"sigma0 of {listed} is far above that of the other images (in brackets): {whose}. `photoplan tie` and "
+            f"`photoplan adjust` orient anew; `images` leaves {them} out"
         )
     elif contrast > 0 and usual > _NOISY * contrast:
         coarse = ", the relief is finer than `resolution`" if plan.scheme.base else ""
@@ -67,7 +70,10 @@ def findings(
         )
     if misfit_share > _MISFITS:
         searched = plan.scheme.search is not None
-        helps = "`target` where walls are seen" if searched else "`search`, or a better `start` with a smaller `reach`"
+        helps = "`search`, or a better `start` with a smaller `reach`"
+        if searched:
+            reach = f"a larger `reach` where things stand more than {plan.scheme.reach:.3g} m above or below the start"
+            helps = f"{reach}, `target` where walls are seen"
         lines.append(
             f"{misfit_share:.1%} of the heights fit badly: see {plan.settings.name}_fit.tif. They lie at edges and "
             "moving things, or in regions that went wrong; their standard deviations are as large as what heights do "
