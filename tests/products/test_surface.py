@@ -218,7 +218,7 @@ def test_the_median_of_tiles_is_counted_in_classes() -> None:
 
 def planned(base: int = 0, search: object = None, name: str = "surface", apart_text: str = "") -> Any:
     """Of a plan what its findings look at."""
-    scheme = SimpleNamespace(base=base, search=search, reach=10.0)
+    scheme = SimpleNamespace(base=base, search=search, reach=20.0)
     return SimpleNamespace(scheme=scheme, settings=SimpleNamespace(name=name), height_error=0.1, apart_text=apart_text)
 
 
@@ -247,16 +247,15 @@ def test_heights_that_fit_badly_are_told_with_what_helps() -> None:
         told += findings(planned(search=search, name="s"), {"a": 1.0}, 80.0, 0.1, 0.03, 0.01, 0.0)
     assert all("3.0% of the heights fit badly: see s_fit.tif" in line and "s_sigma.tif" in line for line in told)
     assert len(told) == 2 and "`search`" in told[0] and "`search`" not in told[1] and "`target`" in told[1]
-    assert "a larger `reach` where things stand more than 10 m above or below the start" in told[1]
+    assert "a larger `reach` where things stand more than 20 m above or below the start" in told[1]
 
 
 def test_heights_that_know_hardly_more_than_the_reach_are_told() -> None:
-    """Standard deviations of 20 px where the reach is 100 px, or of 5 px; where few heights fit badly it is texture."""
-    told = [
-        "".join(findings(planned(), {"a": 1.0}, 80.0, s, m, 0.01, 0.0)) for s, m in ((20, 0.3), (5, 0.3), (20, 0.1))
-    ]
-    assert ["20% of the reach" in lines for lines in told] == [True, False, False]
-    assert ["hardly any texture" in lines for lines in told] == [False, False, True]
+    """Standard deviations of 50 px where the reach is 200 px, or of 5 px: these follow their surroundings."""
+    cases = ((50, 0.0), (50, 0.3), (5, 0.1))
+    told = ["".join(findings(planned(), {"a": 1.0}, 80.0, s, misfit, 0.01, 0.0)) for s, misfit in cases]
+    assert ["25% of the reach: images agree on no height" in lines for lines in told] == [True, True, False]
+    assert ["follows its surroundings" in lines for lines in told] == [False, False, True]
     assert findings(planned(apart_text="it lies apart"), {"a": 1.0}, 80.0, 0.1, 0.0, 0.01, 0.0) == ("it lies apart",)
 
 

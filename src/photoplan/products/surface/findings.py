@@ -12,7 +12,7 @@ from photoplan.products.surface.plan import SurfacePlan
 _ALONE, _NOISY, _MISFITS, _MOVING, _VAGUE, _ASTRAY = 1.6, 0.35, 0.02, 0.2, 1.0, 0.001
 #: Where this part of the heights fits badly, the median standard deviation tells that, and nothing of texture.
 _MOST_MISFIT = 0.25
-#: Unless it is this part of the reach and more: then nothing was found there.
+#: From this part of the reach on it tells that nothing was found there.
 _LOST = 0.1
 #: Standard deviations by which noise alone may still move heights in the last iteration.
 _NOISE_MOVES = 1.0
@@ -97,16 +97,16 @@ def findings(
         lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; a {helps} them")
     vague = sigma_px is not None and sigma_px > _VAGUE * pixel
     part = 0.0 if sigma_px is None else sigma_px * plan.height_error / plan.scheme.reach
-    if vague and misfit_share < _MOST_MISFIT:
+    if vague and part > _LOST:
+        lines.append(
+            f"the median standard deviation is {sigma_px:.2g} px of parallax, {part:.0%} of the reach: images agree on "
+            "no height there. The start is farther away (`start`, `reach`), there is hardly any texture, or orientations "
+            "are wrong (`photoplan tie`, `photoplan adjust`)"
+        )
+    elif vague and misfit_share < _MOST_MISFIT:
         lines.append(
             f"the median standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "
             "images do not determine follows its surroundings; mask it by the standard deviations, or choose a coarser "
             "`resolution`"
-        )
-    elif vague and part > _LOST:
-        lines.append(
-            f"the median standard deviation is {sigma_px:.2g} px of parallax, {part:.0%} of the reach, and many "
-            "heights fit badly: images agree on no height there. The start is farther away (`start`, `reach`), or "
-            "orientations are wrong (`photoplan tie`, `photoplan adjust`)"
         )
     return tuple(lines)
