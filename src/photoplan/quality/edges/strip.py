@@ -107,7 +107,7 @@ class Strip:
         dark_end, bright_end = (min(end + blur.seam, half - SIDE) for end in (blur.dark, blur.bright))
         dark = slice(outer, floor(self.half - dark_end))
         bright = slice(ceil(self.half + bright_end), self.half + half)
-        return Sides(self, dark, bright, slice(outer, 2 * self.half - outer))
+        return Sides.of(self, dark, bright, slice(outer, 2 * self.half - outer))
 
     def worst_reason(self) -> str:
         """Why no profile could be made."""
@@ -122,23 +122,34 @@ class Sides:
     dark: slice
     bright: slice
     window: slice
+    means: tuple[Array, Array]
+    """Of the blocks, on the dark and on the bright side; NaN: without a pixel."""
+    noises: tuple[float, float]
+    """Medians over the blocks of the deviation of pixels about the means of their bins, of both sides."""
+
+    @classmethod
+    def of(cls, strip: Strip, dark: slice, bright: slice, window: slice) -> Sides:
+        """Both sides with their means and noise, which are asked for again and again."""
+        means = _means(strip, dark), _means(strip, bright)
+        noises = _noise(strip, dark), _noise(strip, bright)
+        return cls(strip=strip, dark=dark, bright=bright, window=window, means=means, noises=noises)
 
     def blocks(self, chosen: NDArray[np.bool_]) -> Sides:
         """Only the blocks that are chosen."""
         s = self.strip
         sums = (each[chosen] for each in (s.count, s.total, s.square, s.saturated, s.invalid))
-        return Sides(Strip(s.line, s.block, s.half, *sums), self.dark, self.bright, self.window)
+        return Sides.of(Strip(s.line, s.block, s.half, *sums), self.dark, self.bright, self.window)
 
     @property
     def contrast(self) -> float:
         """Bright minus dark side, medians of the blocks."""
-        dark, bright = (float(_median(self._means(side))) for side in (self.dark, self.bright))
+        dark, bright = (float(_median(mean)) for mean in self.means)
         return bright - dark
 
     @property
     def noise(self) -> float:
         """Standard deviation of the pixels of both sides about the means of their blocks and bins."""
-        return sqrt(sum(self._noise(side) ** 2 for side in (self.dark, self.bright)) / 2)
+        return sqrt(sum(noise**2 for noise in self.noises) / 2)
 
     @property
     def snr(self) -> float:
@@ -155,10 +166,8 @@ class Sides:
         uneven = np.zeros(len(everything), bool)
         textured = np.zeros(len(everything), bool)
         contrast = self.contrast
-        for side in (self.dark, self.bright):
+        for side, mean, noise in zip((self.dark, self.bright), self.means, self.noises):
             count = s.count[:, side].sum(axis=1)
-            mean = self._means(side)
-            noise = self._noise(side)
             allowed = np.maximum(evenness * contrast, 4 * _TOGETHER**0.5 * noise / np.sqrt(np.maximum(count, 1)))
             middle = _median(mean)
             # Light changes slowly along an edge: each block is compared with those around it.
@@ -179,27 +188,25 @@ class Sides:
         """Why the blocks together are no edge to measure; empty if they are one."""
         contrast = self.contrast
         inner = self.strip.profile()[self.dark.stop : self.bright.start]
-        low, high = (float(_median(self._means(side))) for side in (self.dark, self.bright))
+        low, high = (float(_median(mean)) for mean in self.means)
         beyond = max(low - float(np.nanmin(inner)), float(np.nanmax(inner)) - high)
         # A line or a narrow bar: what rises at the edge falls again within the blur.
         if beyond > max(_SEAM * contrast, least_snr * self.noise / 2):
             return "two_sided"
         if not contrast > 0.0 or self.snr < least_snr:
             return "weak"
-        for side in (self.dark, self.bright):
-            mean, noise, s = self._means(side), self._noise(side), self.strip
+        s = self.strip
+        for side, mean, noise in zip((self.dark, self.bright), self.means, self.noises):
             count = s.count[:, side].sum(axis=1)
             # Blocks of a side that scatter more than noise does are texture.
-            turned = mean - np.polyval(np.polyfit(np.arange(len(mean)), mean, 1), np.arange(len(mean)))
-            scatter = float(np.std(turned, ddof=min(2, len(mean) - 1))) if len(mean) > 2 else 0.0
-            expected = _TOGETHER * noise / sqrt(float(np.median(count)))
-            if scatter > max(evenness / 2 * contrast, 2 * expected):
+            expected = _TOGETHER * noise / sqrt(float(_median(count)))
+            if _scatter(mean) > max(evenness / 2 * contrast, 2 * expected):
                 return "textured"
             if self._grain(side, noise) > 0.6 * evenness * contrast:
                 return "textured"
             bins = s.total[:, side].sum(axis=0) / np.maximum(s.count[:, side].sum(axis=0), 1)
             error = _TOGETHER**0.5 * noise / np.sqrt(np.maximum(s.count[:, side].sum(axis=0), 1))
-            if (np.abs(bins - np.median(bins)) > np.maximum(evenness * contrast, 4 * error)).any():
+            if (np.abs(bins - _median(bins)) > np.maximum(evenness * contrast, 4 * error)).any():
                 return "two_sided"
         return ""
 
@@ -213,42 +220,51 @@ class Sides:
             return 0.0
         means = np.where(full, total / np.maximum(count, 1), np.nan)
         # Slow changes along the edge are light, not texture.
-        local = np.stack([_running_median(column, 9) for column in means.T], axis=1)
-        apart = (means - local)[full]
-        expected = _TOGETHER * noise**2 / float(np.median(count[full]))
+        apart = (means - _running_median(means.T, 9).T)[full]
+        expected = _TOGETHER * noise**2 / float(_median(count[full]))
         return sqrt(max(float(np.mean(apart**2)) - expected, 0.0))
 
-    def _means(self, side: slice) -> Array:
-        count = self.strip.count[:, side].sum(axis=1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(count > 0, self.strip.total[:, side].sum(axis=1) / count, np.nan)
 
-    def _noise(self, side: slice) -> float:
-        """Median over the blocks of the deviation of pixels about the means of their bins."""
-        s = self.strip
-        count, total, square = s.count[:, side], s.total[:, side], s.square[:, side]
-        inner = (square - np.divide(total**2, count, out=np.zeros_like(total), where=count > 0)).sum(axis=1)
-        free = (count - (count > 0)).sum(axis=1)
-        some = free > 0
-        if not some.any():
-            return 0.0
-        return sqrt(max(float(np.median(inner[some] / free[some])), 0.0))
+def _means(s: Strip, side: slice) -> Array:
+    count = s.count[:, side].sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(count > 0, s.total[:, side].sum(axis=1) / count, np.nan)
+
+
+def _noise(s: Strip, side: slice) -> float:
+    count, total, square = s.count[:, side], s.total[:, side], s.square[:, side]
+    inner = (square - np.divide(total**2, count, out=np.zeros_like(total), where=count > 0)).sum(axis=1)
+    free = (count - (count > 0)).sum(axis=1)
+    some = free > 0
+    if not some.any():
+        return 0.0
+    return sqrt(max(float(_median(inner[some] / free[some])), 0.0))
+
+
+def _scatter(values: Array) -> float:
+    """Standard deviation about a straight line; 0 for no more than two values."""
+    if len(values) <= 2:
+        return 0.0
+    t = np.arange(len(values)) - (len(values) - 1) / 2
+    rest = values - values.mean() - (t @ values) / (t @ t) * t
+    return sqrt(float(rest @ rest) / (len(values) - 2))
 
 
 def _median(values: Array) -> Array:
     """Medians of the last axis without NaN; NaN where there is nothing else."""
-    ordered = np.sort(values, axis=-1)
-    known = np.isfinite(values).sum(axis=-1, keepdims=True)
-    low = np.take_along_axis(ordered, np.maximum(known - 1, 0) // 2, -1)
-    high = np.take_along_axis(ordered, np.minimum(known // 2, values.shape[-1] - 1), -1)
-    return np.asarray(np.where(known > 0, (low + high) / 2, np.nan)[..., 0])
+    ordered = np.sort(values, axis=-1).ravel()
+    known = np.isfinite(values).sum(axis=-1)
+    first = np.arange(known.size).reshape(known.shape) * values.shape[-1]
+    middle = (ordered[first + np.maximum(known - 1, 0) // 2] + ordered[first + known // 2]) / 2
+    return np.asarray(np.where(known > 0, middle, np.nan))
 
 
 def _running_median(values: Array, width: int) -> Array:
-    """Medians of so many neighbours, fewer at the ends."""
+    """Medians of so many neighbours along the last axis, fewer at the ends."""
     half = width // 2
-    padded = np.concatenate([np.full(half, np.nan), values, np.full(half, np.nan)])
-    return _median(np.lib.stride_tricks.sliding_window_view(padded, width))
+    padded = np.full((*values.shape[:-1], values.shape[-1] + 2 * half), np.nan)
+    padded[..., half : values.shape[-1] + half] = values
+    return _median(np.lib.stride_tricks.sliding_window_view(padded, width, axis=-1))
 
 
 def strip_along(
