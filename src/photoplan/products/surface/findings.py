@@ -100,8 +100,8 @@ def findings(
     if vague and part > _LOST:
         lines.append(
             f"the median standard deviation is {sigma_px:.2g} px of parallax, {part:.0%} of the reach: images agree on "
-            "no height there. The start is farther away (`start`, `reach`), there is hardly any texture, or orientations "
-            "are wrong (`photoplan tie`, `photoplan adjust`)"
+            "no height there. The start is farther away (`start`, `reach`), there is hardly any texture, or "
+            "orientations are wrong (`photoplan tie`, `photoplan adjust`)"
         )
     elif vague and misfit_share < _MOST_MISFIT:
         lines.append(
