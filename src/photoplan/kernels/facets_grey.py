@@ -238,6 +238,30 @@ def grey_at(values, s, t, x, y, dx, dy, out):
 
 
 @kernel
+def sample_pixels(values, ratio, places, weights, out):
+    """Grey values at the places of an image's pixels, all of shape (h, w); 0 where a weight is.
+
+    See `add_grey`.
+    """
+    x, y = np.empty(4), np.empty(4)
+    for r in range(places.shape[0]):
+        for c in range(places.shape[1]):
+            out[r, c] = 0.0
+            if not weights[r, c] > 0.0:
+                continue
+            s, t = places[r, c, 0] * ratio, places[r, c, 1] * ratio
+            i, j = int(s), int(t)
+            spline(s - i, x)
+            spline(t - j, y)
+            i, j = i + PAD - 1, j + PAD - 1
+            g = 0.0
+            for b in range(4):
+                row = values[j + b]
+                g += y[b] * (x[0] * row[i] + x[1] * row[i + 1] + x[2] * row[i + 2] + x[3] * row[i + 3])
+            out[r, c] = g
+
+
+@kernel
 def sample_grey(values, ratio, at, out):
     """Grey values at places (n, 2) of the posts inside them; out has shape (n,)."""
     x, y, dx, dy, found = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(3)

@@ -36,7 +36,7 @@ def add_means(places, weights, sums):
 
 @kernel
 def add_heights(
-    first, places, grey, weights, values, ratio, means, sigma, limit, system, right, noise, residuals,
+    first, places, grey, weights, values, ratio, means, sigma, limit, trusted, system, right, noise, residuals,
     factors, sums,
 ):  # fmt: skip
     """Add the equations of an image to the normal equations of the heights; residuals and robust factors.
@@ -53,6 +53,8 @@ def add_heights(
         Mean change of place with height of the pixels of all images in a facet.
     sigma, limit : float
         Standard deviation of the grey values, and the multiple of it from which weights fall (Huber 1964).
+    trusted : ndarray of bool, shape (rows, columns)
+        Posts around which pixels count in `sums`.
     system : ndarray, shape (7, rows, columns); right, noise : ndarray, shape (rows, columns)
         Normal equations; and a right-hand side of independent errors of the pixels, one standard deviation each.
     residuals, factors : ndarray, shape (h, w), float32
@@ -74,9 +76,10 @@ def add_heights(
             size = abs(misfit) / sigma
             factor = 1.0 if size <= limit else limit / size
             residuals[r, c], factors[r, c] = misfit, factor
-            sums[0] += factor
-            sums[1] += factor * size * size
-            sums[2] += 1.0
+            if trusted[int(v + 0.5), int(u + 0.5)]:
+                sums[0] += factor
+                sums[1] += factor * size * size
+                sums[2] += 1.0
             i, j = min(int(u), means.shape[1] - 1), min(int(v), means.shape[0] - 1)
             a = ratio * (found[1] * (places[r, c, 2] - means[j, i, 0]) + found[2] * (places[r, c, 3] - means[j, i, 1]))
             f, g = u - i, v - j

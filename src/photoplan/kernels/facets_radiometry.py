@@ -7,6 +7,10 @@ import numpy as np
 from photoplan.kernels.facets_rows import add_share
 from photoplan.kernels.jit import inner, kernel
 
+#: Shares of two nodes, 1 − a and a, by powers of a; and products of two of them, by how many are of the second.
+_ONE = np.array([[1.0, -1.0], [0.0, 1.0]])
+_TWO = np.array([[1.0, -2.0, 1.0], [0.0, 1.0, -1.0], [0.0, 0.0, 1.0]])
+
 
 @inner
 def _cell(places, r, c, lattice, rows, columns, share, index):
@@ -66,24 +70,60 @@ def add_radiometry(places, raw, weights, surface, shape, lattice, system, right)
         Unknowns: offsets of all n nodes, then gains.
     """
     rows, columns = shape
-    n = rows * columns
     share, index = np.empty(4), np.empty(4, np.int64)
+    # Σ p · a^i · b^j · (1, G, G²), Σ p · g · a^i · b^j · (1, G) of neighbouring pixels in a cell: all follows from them.
+    both, single, before = np.zeros((3, 3, 3)), np.zeros((2, 2, 2)), -1
     for r in range(raw.shape[0]):
         for c in range(raw.shape[1]):
             p = weights[r, c]
             if not p > 0.0:
                 continue
             _cell(places, r, c, lattice, rows, columns, share, index)
-            g = surface[r, c]
-            for k in range(4):
-                right[index[k]] += p * share[k] * raw[r, c]
-                right[n + index[k]] += p * share[k] * g * raw[r, c]
-                for q in range(4):
-                    both = p * share[k] * share[q]
-                    system[index[k], index[q]] += both
-                    system[index[k], n + index[q]] += both * g
-                    system[n + index[k], index[q]] += both * g
-                    system[n + index[k], n + index[q]] += both * g * g
+            if index[0] != before:
+                if before >= 0:
+                    _add_cell(before, rows, columns, both, single, system, right)
+                before = index[0]
+            a, b = share[1] + share[3], share[2] + share[3]
+            G, g = surface[r, c], raw[r, c]
+            for j in range(3):
+                q = p
+                for i in range(3):
+                    both[j, i, 0] += q
+                    both[j, i, 1] += q * G
+                    both[j, i, 2] += q * G * G
+                    q *= a
+                if j < 2:
+                    single[j, 0, 0] += p * g
+                    single[j, 0, 1] += p * g * G
+                    single[j, 1, 0] += p * a * g
+                    single[j, 1, 1] += p * a * g * G
+                p *= b
+    if before >= 0:
+        _add_cell(before, rows, columns, both, single, system, right)
+
+
+@inner
+def _add_cell(first, rows, columns, both, single, system, right):
+    """Add the sums of a cell, whose upper left node is number `first`, to the equations, and empty them."""
+    n = rows * columns
+    for k in range(4):
+        to = first + k // 2 * columns + k % 2
+        for j in range(2):
+            for i in range(2):
+                part = _ONE[k // 2, j] * _ONE[k % 2, i]
+                right[to] += part * single[j, i, 0]
+                right[n + to] += part * single[j, i, 1]
+        for q in range(4):
+            other = first + q // 2 * columns + q % 2
+            for j in range(3):
+                for i in range(3):
+                    part = _TWO[k // 2 + q // 2, j] * _TWO[k % 2 + q % 2, i]
+                    system[to, other] += part * both[j, i, 0]
+                    system[to, n + other] += part * both[j, i, 1]
+                    system[n + to, other] += part * both[j, i, 1]
+                    system[n + to, n + other] += part * both[j, i, 2]
+    both[:] = 0.0
+    single[:] = 0.0
 
 
 @kernel

@@ -13,6 +13,14 @@ def add_product(a, b, out):
 
 
 @inner
+def add_both(a, b, d, out, other):
+    """out += a · b and other += a · d, element by element; `out` and `other` share nothing."""
+    for i in range(len(out)):
+        out[i] += a[i] * b[i]
+        other[i] += a[i] * d[i]
+
+
+@inner
 def add_share(share, a, out):
     """out += share · a."""
     for i in range(len(out)):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from photoplan.kernels.facets_rows import add_product, add_share, dot
-from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.facets_rows import add_both, add_product, add_share, dot
+from photoplan.kernels.jit import inner, kernel, maker
 
 #: Rows and columns between the posts of an entry: see `facets_height.OFFSETS`.
 _DOWN, _ALONG = (0, 0, 0, 1, 1, 1, 2), (0, 1, 2, -1, 0, 1, 0)
+#: Times by which the parts whose variances are computed at once are longer than wide.
+_LONG = 12
 
 
 @kernel
@@ -78,6 +80,53 @@ def _times(system, x, y):
                 add_product(part, x[j, i0:i1], y[j + dj, i0 + di : i1 + di])
 
 
+@maker
+def _scaled(system, scale, kind):
+    """The same system with unknowns such that its diagonal is 1, which is left out, by rows: (rows, 6, columns)."""
+    rows, columns = scale.shape
+    out = np.zeros((rows, 6, columns), kind.dtype)
+    for j in range(rows):
+        for k in range(1, 7):
+            dj, di = _DOWN[k], _ALONG[k]
+            if j + dj < rows:
+                for i in range(max(0, -di), columns - max(0, di)):
+                    out[j, k - 1, i] = system[k, j, i] * scale[j, i] * scale[j + dj, i + di]
+    return out
+
+
+@inner
+def _go_on(system, share, residual, way, product, part):
+    """way = residual + share · way, product = system · way of a scaled system; way · product."""
+    rows, columns = way.shape
+    total = 0.0
+    for row in range(min(2, rows)):
+        _renew(share, residual[row], way[row], product[row])
+    for j in range(rows):
+        if j + 2 < rows:
+            _renew(share, residual[j + 2], way[j + 2], product[j + 2])
+        for k in range(1, 7):
+            dj, di = _DOWN[k], _ALONG[k]
+            if j + dj < rows:
+                i0, i1 = max(0, -di), columns - max(0, di)
+                own, there = way[j, i0:i1], way[j + dj, i0 + di : i1 + di]
+                here, other = product[j, i0:i1], product[j + dj, i0 + di : i1 + di]
+                if dj == 0:
+                    add_product(system[j, k - 1, i0:i1], there, here)
+                    add_product(system[j, k - 1, i0:i1], own, other)
+                else:
+                    add_both(system[j, k - 1, i0:i1], there, own, here, other)
+        total += dot(way[j : j + 1], product[j : j + 1], part)
+    return total
+
+
+@inner
+def _renew(share, residual, way, product):
+    """A row of what `_go_on` begins with: the diagonal is 1."""
+    for i in range(len(way)):
+        way[i] = residual[i] + share * way[i]
+        product[i] = way[i]
+
+
 @kernel
 def solve_heights(system, right, rounds, enough, out):
     """Heights' corrections by conjugate gradients, preconditioned by the diagonal.
@@ -89,8 +138,8 @@ def solve_heights(system, right, rounds, enough, out):
     right : ndarray, shape (rows, columns)
     rounds, enough
         Iterations at most; they end when what is left of the equations has fallen to this part.
-    out : ndarray, shape (rows, columns)
-        Start and result.
+    out : ndarray, shape (rows, columns), float32 or float64
+        Start and result; what it lacks is found with numbers of its kind.
 
     Returns
     -------
@@ -98,37 +147,33 @@ def solve_heights(system, right, rounds, enough, out):
         Iterations.
     """
     rows, columns = right.shape
-    residual, product = np.empty((rows, columns)), np.empty((rows, columns))
-    way, improved = np.zeros((rows, columns)), np.empty((rows, columns))
-    part, diagonal = np.empty(8), np.empty((rows, columns))
-    _times(system, out, product)
+    scale, left = np.empty((rows, columns)), np.empty((rows, columns))
+    _times(system, out, left)
+    work = np.zeros((4, rows, columns), out.dtype)
+    residual, way, product, more = work[0], work[1], work[2], work[3]
+    first, before = 0.0, 1.0
     for j in range(rows):
         for i in range(columns):
-            residual[j, i] = right[j, i] - product[j, i]
-            diagonal[j, i] = 1.0 / max(system[0, j, i], 1e-300)
-            improved[j, i] = diagonal[j, i] * right[j, i]
-    first = dot(right, improved, part)
-    before = 1.0
-    for k in range(rounds):
-        for j in range(rows):
-            for i in range(columns):
-                improved[j, i] = diagonal[j, i] * residual[j, i]
-        size = dot(residual, improved, part)
-        if not size > enough * enough * first:
-            return k
-        share = 0.0 if k == 0 else size / before
-        for j in range(rows):
-            for i in range(columns):
-                way[j, i] = improved[j, i] + share * way[j, i]
-        _times(system, way, product)
-        curve = dot(way, product, part)
+            # What no equation knows stays.
+            scale[j, i] = 1.0 / np.sqrt(system[0, j, i]) if system[0, j, i] > 0.0 else 0.0
+            residual[j, i] = (right[j, i] - left[j, i]) * scale[j, i]
+            first += (right[j, i] * scale[j, i]) ** 2
+    part, system = np.empty(8, out.dtype), _scaled(system, scale, out)
+    size, k = dot(residual, residual, part), 0
+    while k < rounds and size > enough * enough * first:
+        curve = _go_on(system, residual.dtype.type(0.0 if k == 0 else size / before), residual, way, product, part)
         if not curve > 0.0:
-            return k
+            break
+        along = residual.dtype.type(size / curve)
+        before, size, k = size, 0.0, k + 1
         for j in range(rows):
-            add_share(size / curve, way[j], out[j])
-            add_share(-size / curve, product[j], residual[j])
-        before = size
-    return rounds
+            add_share(along, way[j], more[j])
+            add_share(-along, product[j], residual[j])
+            size += dot(residual[j : j + 1], residual[j : j + 1], part)
+    for j in range(rows):
+        for i in range(columns):
+            out[j, i] += scale[j, i] * more[j, i]
+    return k
 
 
 @inner
@@ -154,16 +199,17 @@ def _invert(band, inverse, column):
 @kernel
 def variances(system, side, margin, out):
     """Variances of heights, part by part, with `margin` posts around each beyond which nothing changes; NaN where a
-    part is singular.
+    part is singular. Parts are `side` columns wide and _LONG times as many rows long: narrow bands take least.
 
     See `solve_heights`; `out` has shape (rows, columns).
     """
     rows, columns = out.shape
     column = np.empty(2 * (side + 2 * margin) + 1)
-    for row in range(0, rows, side):
+    length = _LONG * side
+    for row in range(0, rows, length):
         for col in range(0, columns, side):
             j0, i0 = max(0, row - margin), max(0, col - margin)
-            j1, i1 = min(rows, row + side + margin), min(columns, col + side + margin)
+            j1, i1 = min(rows, row + length + margin), min(columns, col + side + margin)
             n, m = j1 - j0, i1 - i0
             band, inverse = np.zeros((n * m, 2 * m + 1)), np.empty((n * m, 4 * m + 1))
             for j in range(n):
@@ -174,6 +220,6 @@ def variances(system, side, margin, out):
             done = _factor(band)
             if done:
                 _invert(band, inverse, column)
-            for j in range(row, min(rows, row + side)):
+            for j in range(row, min(rows, row + length)):
                 for i in range(col, min(columns, col + side)):
                     out[j, i] = inverse[(j - j0) * m + i - i0, 2 * m] if done else np.nan

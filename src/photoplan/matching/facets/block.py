@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.facets_grey import OFFSETS, PAD, add_errors, add_grey, sample_grey, solve_grey
+from photoplan.kernels.facets_grey import OFFSETS, PAD, add_errors, add_grey, sample_grey, sample_pixels, solve_grey
 from photoplan.kernels.facets_height import add_heights, add_means
 from photoplan.kernels.facets_signs import signs_at
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
@@ -44,7 +44,7 @@ _MOST, _LEFT = 400, 0.01
 #: Part of the variance of grey values that is not noise from which on images are taken to show the same.
 _COMMON = 0.5
 #: Posts of a part whose variances are computed at once, and around it.
-_SIDE, _MARGIN = 24, 8
+_SIDE, _MARGIN = 8, 8
 #: Posts along the border of a block from which nothing is learnt about its roughness.
 _BORDER = 6
 #: Times by which curvatures weigh more to see what they take away.
@@ -187,9 +187,9 @@ class FacetBlock:
         add_curvatures(stiffer * self.roughness.weights, out)
         return out
 
-    def _solved(self, *rights: _Doubles) -> _Doubles:
+    def _solved(self, *rights: _Doubles) -> _Floats:
         """Solutions of the normal equations for right-hand sides, shape (k, rows, columns)."""
-        out, system = np.zeros((len(rights), *self.facets.shape)), self._equations()
+        out, system = np.zeros((len(rights), *self.facets.shape), np.float32), self._equations()
         for right, x in zip(rights, out):
             solve_heights(system, right, _MOST, _LEFT, x)
         return out
@@ -254,9 +254,8 @@ class FacetBlock:
 
     def surface_at(self, sight: Sight, weights: _Floats) -> _Floats:
         """Grey values of the surface where a view's pixels lie; 0 where none is used."""
-        out = np.zeros(sight.raw.shape, np.float32)
-        used = weights > 0
-        out[used] = self.grey_values(sight.places[used][:, :2].astype(float))
+        out = np.empty(sight.raw.shape, np.float32)
+        sample_pixels(self.values, self.facets.ratio, sight.places, weights, out)
         return out
 
     def _improve_radiometry(self, weights: Sequence[_Floats]) -> None:
@@ -283,28 +282,18 @@ class FacetBlock:
             )
         self.system, right = np.zeros((7, rows, columns)), np.zeros((rows, columns))
         self.noise = np.zeros((rows, columns))
-        found, residuals = np.zeros((len(self.sights), 3)), _NONE
+        found = np.zeros((len(self.sights), 3))
+        trusted = np.ones((rows, columns), bool) if self.trusted is None else self.trusted
         for n, (sight, g, w) in enumerate(zip(self.sights, grey, weights)):
             residuals = np.empty(g.shape, np.float32)
             add_heights(
                 sight.first, sight.places, g, w, self.values, self.facets.ratio, self.ways,
-                self.sigmas[n], _LIMIT, self.system, right, self.noise, residuals, self._factors[n], found[n],
+                self.sigmas[n], _LIMIT, trusted, self.system, right, self.noise, residuals, self._factors[n], found[n],
             )  # fmt: skip
-            found[n] = self._telling(sight, residuals, n, found[n])
         self.counted = counted
         pixels = sum(float(np.count_nonzero(w)) for w in weights)
         self._weigh(found, int((self.density > 0).sum()) * float(found[:, 2].sum()) / max(pixels, 1.0))
         return right
-
-    def _telling(self, sight: Sight, residuals: _Floats, n: int, sums: _Doubles) -> _Doubles:
-        """Sums of a view's robust factors, squared residuals and pixels: those around trusted posts."""
-        if self.trusted is None:
-            return sums
-        used = np.isfinite(residuals)
-        i, j = np.rint(sight.places[used][:, :2]).astype(int).T
-        told = self.trusted[j, i]
-        f, v = (a[used][told].astype(float) for a in (self._factors[n], residuals))
-        return np.array([f.sum(), float(f @ (v / self.sigmas[n]) ** 2), float(len(f))])
 
     def _weigh(self, found: _Doubles, unknowns: float) -> None:
         """Standard deviations of the views' grey values, by variance components (Förstner 1979)."""
