@@ -1,22 +1,28 @@
 """Grey facets: a surface of cubic B-splines through the pixels of all images, by conjugate gradients.
 
 Coefficients count from `PAD` before the first height post; with `ratio` grey facets along a side of a height facet, the
-place (u, v) of the posts is (u · ratio, v · ratio) of the grey facets. A system is kept by offsets: entry
-7 · dj + di + 3 at (j, i) couples it with (j + dj, i + di); of dj = 0 only di >= 0 is used.
+place (u, v) of the posts is (u · ratio, v · ratio) of the grey facets. Pixels are added facet by facet: what has one
+address for one facet is there when the next pixel wants it; from this the system is made. It is kept by rows, then by
+offsets: entry 7 · dj + di of row j couples column i with (j + dj, i + di); of dj = 0 only di >= 0 is used.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from photoplan.kernels.facets_rows import add_product, add_share, dot
+from photoplan.kernels.facets_rows import add_both, add_few, add_product, add_share, dot
 from photoplan.kernels.facets_signs import sign_at
-from photoplan.kernels.jit import inner, kernel, maker
+from photoplan.kernels.jit import inner, kernel
 
 PAD = 2
 """Coefficients before the first and behind the last post."""
-OFFSETS = 28
-"""Entries of a row of the system, some of them unused."""
+OFFSETS = 25
+"""Entries of the system."""
+SUMS = 44
+"""Sums of a facet, by the row of its four coefficients: the ten pairs of its columns (0 0, 1 1, 2 2, 3 3, 0 1, 1 2,
+2 3, 0 2, 1 3, 0 3) with each of four rows from there on, and the right-hand side of its columns."""
+#: As many as `add_few` takes at once.
+_TEN, _FOUR = (0,) * 10, (0,) * 4
 #: The inverse of (1 4 1)/6 at 0 to 3 nodes: √3 · (√3 − 2)^k.
 _INVERSE = np.array([3**0.5 * (3**0.5 - 2) ** k for k in range(4)], np.float32)
 
@@ -42,8 +48,8 @@ def slope(f, w):
 
 
 @kernel
-def add_grey(places, grey, weights, ratio, system, right, density):
-    """Add the observation equations g = G(u, v) of an image to the normal equations of the grey facets.
+def add_grey(places, grey, weights, ratio, sums, density):
+    """Add the observation equations g = G(u, v) of an image to sums of the grey facets.
 
     Parameters
     ----------
@@ -53,11 +59,13 @@ def add_grey(places, grey, weights, ratio, system, right, density):
         Grey values in the system of the surface, and their weights; 0: not to be used.
     ratio : int
         Grey facets along a side of a height facet.
-    system : ndarray, shape (m, n, OFFSETS), float32
-    right, density : ndarray, shape (m, n), float32
-        Right-hand side, and sums of weights by the nearest coefficient.
+    sums : ndarray, shape (m, n + 3, SUMS), float32
+        Added; see `made_grey`. A facet whose first coefficient is in column i is at i + 3.
+    density : ndarray, shape (m, n), float32
+        Sums of weights by the nearest coefficient.
     """
-    x, y = np.empty(4), np.empty(4)
+    x, y, columns = np.empty(4), np.empty(4), np.empty(4, np.float32)
+    pairs, flat, width = np.empty(10, np.float32), sums.reshape(-1), sums.shape[1] * SUMS
     for r in range(places.shape[0]):
         for c in range(places.shape[1]):
             p = weights[r, c]
@@ -68,20 +76,42 @@ def add_grey(places, grey, weights, ratio, system, right, density):
             spline(s - i, x)
             spline(t - j, y)
             density[int(t + 0.5) + PAD, int(s + 0.5) + PAD] += p
-            i, j = i + PAD - 1, j + PAD - 1
-            x0, x1, x2, x3 = np.float32(x[0]), np.float32(x[1]), np.float32(x[2]), np.float32(x[3])
+            for a in range(4):
+                columns[a] = x[a]
+            x0, x1, x2, x3 = columns[0], columns[1], columns[2], columns[3]
+            pairs[0], pairs[1], pairs[2], pairs[3], pairs[4] = x0 * x0, x1 * x1, x2 * x2, x3 * x3, x0 * x1
+            pairs[5], pairs[6], pairs[7], pairs[8], pairs[9] = x1 * x2, x2 * x3, x0 * x2, x1 * x3, x0 * x3
+            at = (j + PAD - 1) * width + (i + PAD + 2) * SUMS
             for b in range(4):
-                for a in range(4):
-                    first = np.float32(p * y[b] * x[a])
-                    right[j + b, i + a] += first * grey[r, c]
-                    row = system[j + b, i + a]
-                    for e in range(b, 4):
-                        # Four at once; of a row's own entries those to the left are not used.
-                        both, k = first * np.float32(y[e]), 7 * (e - b) + 3 - a
-                        row[k] += both * x0
-                        row[k + 1] += both * x1
-                        row[k + 2] += both * x2
-                        row[k + 3] += both * x3
+                part = p * y[b]
+                for e in range(b, 4):
+                    add_few(part * y[e], pairs, _TEN, flat, at + 10 * (e - b))
+                add_few(part * grey[r, c], columns, _FOUR, flat, at + 40)
+                at += width
+
+
+@kernel
+def made_grey(sums, system, right):
+    """The normal equations from the sums of all images: system of shape (m, OFFSETS, n), right-hand side (m, n)."""
+    system[:] = np.float32(0.0)
+    for j in range(right.shape[0]):
+        for i in range(right.shape[1]):
+            # The facets of which a coefficient is the first, second, third, fourth column.
+            for dj in range(4):
+                k = 10 * dj
+                a, b = sums[j, i + 3, k : k + 10], sums[j, i + 2, k : k + 10]
+                c, d = sums[j, i + 1, k : k + 10], sums[j, i, k : k + 10]
+                to = system[j, 7 * dj : 7 * dj + 4]
+                to[0, i] = a[0] + b[1] + c[2] + d[3]
+                to[1, i] = a[4] + b[5] + c[6]
+                to[2, i] = a[7] + b[8]
+                to[3, i] = a[9]
+                if dj > 0:
+                    to = system[j, 7 * dj - 3 : 7 * dj]
+                    to[2, i] = b[4] + c[5] + d[6]
+                    to[1, i] = c[7] + d[8]
+                    to[0, i] = d[9]
+            right[j, i] = sums[j, i + 3, 40] + sums[j, i + 2, 41] + sums[j, i + 1, 42] + sums[j, i, 43]
 
 
 @kernel
@@ -109,20 +139,23 @@ def add_errors(places, first, weights, ratio, right):
 
 @inner
 def _times(system, x, y):
-    """y = system · x, system by rows, then by offsets: shape (m, OFFSETS, n)."""
+    """y = system · x."""
     rows, columns = x.shape
     y[:] = np.float32(0.0)
     for j in range(rows):
-        for i in range(columns):
-            y[j, i] += system[j, 3, i] * x[j, i]
-        for k in range(4, OFFSETS):
-            dj, di = k // 7, k % 7 - 3
+        add_product(system[j, 0], x[j], y[j])
+        for k in range(1, OFFSETS):
+            dj = (k + 3) // 7
+            di = k - 7 * dj
             if j + dj < rows:
                 # Slices, since an index that might be negative would be looked at.
                 i0, i1 = max(0, -di), columns - max(0, di)
-                part = system[j, k, i0:i1]
-                add_product(part, x[j + dj, i0 + di : i1 + di], y[j, i0:i1])
-                add_product(part, x[j, i0:i1], y[j + dj, i0 + di : i1 + di])
+                part, there = system[j, k, i0:i1], slice(i0 + di, i1 + di)
+                if dj > 0:
+                    add_both(part, x[j + dj, there], x[j, i0:i1], y[j, i0:i1], y[j + dj, there])
+                else:
+                    add_product(part, x[j, there], y[j, i0:i1])
+                    add_product(part, x[j, i0:i1], y[j, there])
 
 
 @inner
@@ -143,26 +176,13 @@ def _unfiltered(x, scratch):
             add_share(_INVERSE[k], here[: columns - k], out[k:])
 
 
-@maker
-def _by_rows(system):
-    """The same system, by rows, then by offsets."""
-    rows, columns, count = system.shape
-    out = np.empty((rows, count, columns), np.float32)
-    for j in range(rows):
-        for first in range(0, columns, 16):
-            for k in range(count):
-                for i in range(first, min(columns, first + 16)):
-                    out[j, k, i] = system[j, i, k]
-    return out
-
-
 @kernel
 def solve_grey(system, right, diagonal, values, rounds, enough):
     """Improve coefficients by conjugate gradients, preconditioned in the grey values at the nodes.
 
     Parameters
     ----------
-    system : ndarray, shape (m, n, OFFSETS), float32
+    system : ndarray, shape (m, OFFSETS, n), float32
     right : ndarray, shape (m, n), float32
     diagonal : ndarray, shape (m, n), float32
         About the weight of the grey value at each node, positive.
@@ -180,7 +200,7 @@ def solve_grey(system, right, diagonal, values, rounds, enough):
     rows, columns = values.shape
     residual, product = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
     improved, way = np.empty((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
-    part, system = np.empty(8, np.float32), _by_rows(system)
+    part = np.empty(8, np.float32)
     _times(system, values, product)
     for j in range(rows):
         for i in range(columns):

@@ -15,8 +15,8 @@ _TWO = np.array([[1.0, -2.0, 1.0], [0.0, 1.0, -1.0], [0.0, 0.0, 1.0]])
 @inner
 def _cell(places, r, c, lattice, rows, columns, share, index):
     """Shares and numbers of the four nodes of the lattice around a pixel's place."""
-    x = min(max((places[r, c, 0] - lattice[0]) / lattice[2], 0.0), columns - 1.0)
-    y = min(max((places[r, c, 1] - lattice[1]) / lattice[2], 0.0), rows - 1.0)
+    x = min(max((places[r, c, 0] - lattice[0]) * (1.0 / lattice[2]), 0.0), columns - 1.0)
+    y = min(max((places[r, c, 1] - lattice[1]) * (1.0 / lattice[2]), 0.0), rows - 1.0)
     i, j = min(int(x), columns - 2), min(int(y), rows - 2)
     a, b = x - i, y - j
     for k in range(4):
@@ -71,7 +71,7 @@ def add_radiometry(places, raw, weights, surface, shape, lattice, system, right)
     """
     rows, columns = shape
     share, index = np.empty(4), np.empty(4, np.int64)
-    # Σ p · a^i · b^j · (1, G, G²), Σ p · g · a^i · b^j · (1, G) of neighbouring pixels in a cell: all follows from them.
+    # Σ p · a^i · b^j · (1, G, G²), Σ p · g · a^i · b^j · (1, G) of pixels in a cell: all follows from them.
     both, single, before = np.zeros((3, 3, 3)), np.zeros((2, 2, 2)), -1
     for r in range(raw.shape[0]):
         for c in range(raw.shape[1]):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from photoplan.kernels import numba_parts
 from photoplan.kernels.jit import inner
 
 
@@ -18,6 +21,16 @@ def add_both(a, b, d, out, other):
     for i in range(len(out)):
         out[i] += a[i] * b[i]
         other[i] += a[i] * d[i]
+
+
+@inner
+def add_few_loops(share, a, count_tag, out, at):
+    """out[at : at + n] += share · a of one-dimensional float32, with n the length of `count_tag`, part of its type."""
+    for k in range(len(count_tag)):
+        out[at + k] += np.float32(share) * a[k]
+
+
+add_few = numba_parts.add_few if numba_parts.USABLE else add_few_loops
 
 
 @inner

@@ -14,7 +14,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.facets_grey import OFFSETS, PAD, add_errors, add_grey, sample_grey, sample_pixels, solve_grey
+from photoplan.kernels.facets_grey import (
+    OFFSETS,
+    PAD,
+    SUMS,
+    add_errors,
+    add_grey,
+    made_grey,
+    sample_grey,
+    sample_pixels,
+    solve_grey,
+)
 from photoplan.kernels.facets_height import add_heights, add_means
 from photoplan.kernels.facets_signs import signs_at
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
@@ -89,6 +99,8 @@ class FacetBlock:
     """Of each view: Σ of robust factors times squared residuals in its own grey values; redundancy."""
     ways: _Doubles = field(default_factory=lambda: np.empty((0, 0, 2)))
     """Mean change of the pixels' places with height in each facet, posts per metre, (rows − 1, columns − 1, 2)."""
+    residuals: list[_Floats] = field(default_factory=list)
+    """Of every view's pixels, the surface's grey value less theirs in its system, shape (h, w); NaN: not used."""
     density: _Floats = field(default_factory=lambda: _NONE)
     """Weights that lie on each coefficient."""
     texture: GreyTexture | None = None
@@ -98,12 +110,12 @@ class FacetBlock:
     """Heights where the last equations were set up, and their right-hand side, of the pixels alone."""
 
     def adjust(self, most: int, radiometry: bool, texture: bool = False) -> None:
-        """Iterate until the heights stay; perhaps with the radiometry improved in the first iteration, and texture told
-        from noise."""
+        """Iterate while heights are elsewhere than where equations were set up; perhaps with the radiometry improved in
+        the first iteration, and texture told from noise, which takes one."""
         for k in range(most):
-            self.iterate(radiometry and k == 0, texture and k == 0)
-            if self.moves[-1] < ENOUGH:
+            if self.moves and not (texture and k == 0) and self._moved < ENOUGH:
                 break
+            self.iterate(radiometry and k == 0, texture and k == 0)
 
     def iterate(self, radiometry: bool = True, texture: bool = False) -> None:
         """One correction of everything; perhaps with texture told from noise from then on."""
@@ -117,9 +129,13 @@ class FacetBlock:
             grey, weights = self.observed()
         self._pull = self.heights, self._heights(grey, weights, errors)
         self._settle()
-        known = self.counted > 1
-        change = self.heights - self._pull[0]
-        self.moves.append(float(np.sqrt(np.mean(change[known] ** 2)) * self.scale) if known.any() else 0.0)
+        self.moves.append(self._moved)
+
+    @property
+    def _moved(self) -> float:
+        """Mean change of the heights since the equations were set up, pixels of parallax."""
+        change = (self.heights - self._pull[0])[self.counted > 1]
+        return float(np.sqrt(np.mean(change**2)) * self.scale) if change.size else 0.0
 
     def _settle(self) -> None:
         """Heights by the equations of the last iteration and the curvatures' weights as they are now."""
@@ -239,10 +255,12 @@ class FacetBlock:
     ) -> tuple[_Floats, _Floats | None]:
         """The grey values of the surface; returns the weights that lie on each, and perhaps errors of theirs."""
         shape, ratio, errors = self.values.shape, self.facets.ratio, None
-        system = np.zeros((*shape, OFFSETS), np.float32)
-        right, density = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        sums, density = np.zeros((shape[0], shape[1] + 3, SUMS), np.float32), np.zeros(shape, np.float32)
         for sight, g, w in zip(self.sights, grey, weights):
-            add_grey(sight.places, g, w, ratio, system, right, density)
+            add_grey(sight.places, g, w, ratio, sums, density)
+        system, right = np.empty((shape[0], OFFSETS, shape[1]), np.float32), np.empty(shape, np.float32)
+        made_grey(sums, system, right)
+        del sums
         self.values = _solved_exactly(system, right, density, self.values, _ROUNDS)
         if drawn:
             right[:] = 0.0
@@ -283,12 +301,13 @@ class FacetBlock:
         self.system, right = np.zeros((7, rows, columns)), np.zeros((rows, columns))
         self.noise = np.zeros((rows, columns))
         found = np.zeros((len(self.sights), 3))
+        self.residuals = [np.empty(g.shape, np.float32) for g in grey]
         trusted = np.ones((rows, columns), bool) if self.trusted is None else self.trusted
         for n, (sight, g, w) in enumerate(zip(self.sights, grey, weights)):
-            residuals = np.empty(g.shape, np.float32)
             add_heights(
                 sight.first, sight.places, g, w, self.values, self.facets.ratio, self.ways,
-                self.sigmas[n], _LIMIT, trusted, self.system, right, self.noise, residuals, self._factors[n], found[n],
+                self.sigmas[n], _LIMIT, trusted, self.system, right, self.noise, self.residuals[n], self._factors[n],
+                found[n],
             )  # fmt: skip
         self.counted = counted
         pixels = sum(float(np.count_nonzero(w)) for w in weights)
@@ -316,7 +335,7 @@ def _solved_exactly(
     """Coefficients of grey facets from their normal equations and the weights on each of them, beginning with `values`:
     as exact as a part of their own standard deviations. Those that hardly any pixel knows stay near what they were."""
     usual = np.float32(density[density > 0].mean() if (density > 0).any() else 1.0)
-    system[..., 3] += np.float32(1e-4) * usual
+    system[:, 0] += np.float32(1e-4) * usual
     right += np.float32(1e-4) * usual * values
     solve_grey(system, right, smoothed(density) + np.float32(0.05) * usual, values, *rounds)
     return values

@@ -133,9 +133,4 @@ def residual_pictures(block: FacetBlock) -> list[_Floats]:
 def standardised(block: FacetBlock) -> list[_Floats]:
     """Residuals of every view's pixels, the surface's grey value less theirs, in their standard deviations; NaN: not
     used."""
-    grey, weights = block.observed()
-    found = []
-    for sight, g, w, sigma in zip(block.sights, grey, weights, block.sigmas):
-        left = (block.surface_at(sight, w) - g) / np.float32(sigma)
-        found.append(np.where(w > 0, left, np.float32(np.nan)))
-    return found
+    return [residuals / np.float32(sigma) for residuals, sigma in zip(block.residuals, block.sigmas)]

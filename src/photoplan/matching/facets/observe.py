@@ -112,14 +112,18 @@ class Sight:
     """Column and row of the first pixel."""
     places: _Floats = field(default_factory=lambda: np.empty((0, 0, 4), np.float32))
     """Where the pixels lie on the surface, see `facets_transfer.transfer`."""
+    on: _Doubles | None = None
+    """Heights of the surface that they were carried to."""
 
     def onto(self, heights: _Doubles) -> Sight:
         """The same pixels, carried to a surface of heights at the posts."""
+        if self.on is heights:
+            return self
         places = np.empty((*self.raw.shape, 4), np.float32)
         steep = np.empty((-(-(heights.shape[0] - 1) // CELL), -(-(heights.shape[1] - 1) // CELL)))
         steepness(heights, steep)
         transfer(self.ways, *self.steps, heights - self.level, steep, _WALL, places)
-        return replace(self, places=places)
+        return replace(self, places=places, on=heights)
 
 
 def look(view: View, level: int, facets: Facets, heights: tuple[float, float]) -> Sight | None:

@@ -28,7 +28,7 @@ from photoplan.surfaces.objects import without_objects
 _Doubles = NDArray[np.float64]
 
 #: Grey facets along a part that is reconstructed at once, and blocks of image pyramids that are kept, bytes in all.
-_PART, _KEPT = 768, 256 << 20
+_PART, _KEPT = 1008, 256 << 20
 MISFIT = 2.0
 """Heights around which residuals are so many times larger than expected are told of: they may be wrong."""
 #: Bytes of a grey facet while it is adjusted: its equations twice, and what the pixels need.

@@ -27,7 +27,7 @@ from photoplan.products.surface.target import SeenTarget, frame_of, over_frame, 
 from photoplan.project.scenes import ScenesAddress
 
 #: Side of a tile of heights; those of grey values are as many times larger as they are finer.
-TILE = 256
+TILE = 336
 #: Grey facets along a side of a height facet at most: images that are finer still are reduced.
 MOST_RATIO = 6
 #: And cells that a search compares: heights are found to parts of their pixels all the same.
