@@ -203,12 +203,12 @@ class FacetBlock:
         add_curvatures(stiffer * self.roughness.weights, out)
         return out
 
-    def _solved(self, *rights: _Doubles) -> _Floats:
+    def _solved(self, *rights: _Doubles) -> _Doubles:
         """Solutions of the normal equations for right-hand sides, shape (k, rows, columns)."""
         out, system = np.zeros((len(rights), *self.facets.shape), np.float32), self._equations()
         for right, x in zip(rights, out):
             solve_heights(system, right, _MOST, _LEFT, x)
-        return out
+        return out.astype(float)
 
     def parallax(self) -> float:
         """How far the outermost views of a place part when its height changes, grey facets (pixels) per metre."""
