@@ -31,6 +31,16 @@ def test_without_a_terminal_a_line_now_and_then(capsys: pytest.CaptureFixture[st
     ]
 
 
+def test_slow_rates_are_told_in_pixels() -> None:
+    """Heights of a surface: 65,536 in a minute."""
+    clock = Clock()
+    with Telling(False, terminal=False, clock=clock) as events:
+        events.begin("tiles", 4)
+        clock.now += 0.5 * SELDOM
+        events.done(1, 65_536)
+        assert events.line(clock.now + 45.0) == "tiles: 1/4 tiles 1092 px/s 0:03:00 left"
+
+
 def test_on_a_terminal_a_line_that_moves_and_gives_way(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     with Telling(False, print, terminal=True, clock=clock) as events:

@@ -14,6 +14,8 @@ from photoplan.cli.output import say
 #: Seconds between two lines where there is no terminal, and between two changes of the line on one.
 SELDOM, OFTEN = 30.0, 0.1
 _BAR = 24
+#: Pixels a second below which they are told one by one, as of heights of a surface.
+_SLOW = 1e4
 
 
 class Telling:
@@ -86,7 +88,8 @@ class Telling:
         elif self._finished:
             words.append(f"{self._finished} {self._unit}")
         if self._pixels:
-            words.append(f"{self._pixels / 1e6 / took:.3g} Mpx/s")
+            rate = self._pixels / took
+            words.append(f"{rate / 1e6:.3g} Mpx/s" if rate >= _SLOW else f"{rate:.0f} px/s")
         if 0 < self._finished < self._units:
             words.append(f"{_time(took / self._finished * (self._units - self._finished))} left")
         else:
