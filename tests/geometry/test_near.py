@@ -46,6 +46,13 @@ def test_far_away_and_over_wide_areas_places_are_those_of_the_ground() -> None:
     assert np.array_equal(wide(XYZ[1:2] / 10), MOON(XYZ[1:2] / 10) - wide.origin)
 
 
+def test_places_without_a_map_are_left_out() -> None:
+    XYZ = np.array([[600_000.0, 5_340_000.0, 10.0]])
+    corners = np.array([[596_000.0, 5_336_000.0], [np.nan, np.nan], [604_000.0, 5_344_000.0]])
+    assert np.array_equal(near_ground(UTM, corners)(XYZ), near_ground(UTM, corners[::2])(XYZ))
+    assert np.array_equal(near_ground(UTM, corners[1:2])(XYZ), UTM(XYZ))
+
+
 def test_points_are_put_onto_their_rays() -> None:
     corners = np.array([[596_000.0, 5_336_000.0], [604_000.0, 5_344_000.0]])
     near = near_ground(UTM, corners)

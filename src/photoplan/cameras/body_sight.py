@@ -16,7 +16,7 @@ _Floats = NDArray[np.float64]
 #: Heights of any ground, metres: of the earth, and of other bodies, where they are at most this part of the radius.
 _EARTH, _ELSEWHERE, _PART = (-500.0, 9_000.0), (-10_000.0, 25_000.0), 0.1
 #: Heights are met when they were missed by less than this before the last step, metres.
-_CLOSE = 1e-7
+_CLOSE = 1e-8
 
 
 def heights_of(ground: BodyGround) -> tuple[float, float]:

@@ -67,7 +67,8 @@ class LineCamera:
     def near(self) -> NearGround:
         """The ground that it sees."""
         _, S, d, r = self._spread
-        return near_ground(self.ground, self.ground.to_map(S + r[:, None] * d)[:, :2])
+        # Grids of heights may end before the image does.
+        return near_ground(self.ground, self.ground.bare.to_map(S + r[:, None] * d)[:, :2])
 
     @cached_property
     def sight(self) -> LineSight:

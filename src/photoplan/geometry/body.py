@@ -60,7 +60,7 @@ class BodyGround:
     @property
     def bare(self) -> BodyGround:
         """The same with heights above the ellipsoid."""
-        return BodyGround(self.crs, "ellipsoidal", self.radii)
+        return self if self.heights == "ellipsoidal" else BodyGround(self.crs, "ellipsoidal", self.radii)
 
     @property
     def on_earth(self) -> bool:
