@@ -10,6 +10,7 @@ from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
 
@@ -36,6 +37,8 @@ STYLE = {
     "text.parse_math": False,
 }
 _DPI = 150
+#: Width of a plot over the whole page, inches.
+_WIDE = 7.2
 _PARTS = ("cm", "collections", "colors", "figure", "lines", "patches", "path", "ticker")
 
 
@@ -124,3 +127,37 @@ def round_down(value: float, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> float:
 def shortened(name: str, most: int = 14) -> str:
     """A name that fits into a picture: its end, since names of a block often begin alike."""
     return name if len(name) <= most else "…" + name[1 - most :]
+
+
+@styled
+def draw_normalised(values: NDArray[np.float64], limit: float, what: str) -> bytes:
+    """Histogram of normalised residuals with the normal curve, on a linear and on a logarithmic scale.
+
+    Beyond the limit, if it is not 0, they count as gross errors; what lies off the scale is in its last classes.
+    """
+    fig = figure_of(_WIDE, 2.9)
+    panels = fig.subplots(1, 2)
+    z = values[np.isfinite(values)]
+    edge = max(5.0, limit + 0.5)
+    bins = np.linspace(-edge, edge, 81 if len(z) > 2000 else 41)
+    t = np.linspace(-edge, edge, 401)
+    normal = np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi)
+    for axes in panels:
+        if len(z):
+            weight = np.full(len(z), 1 / (len(z) * (bins[1] - bins[0])))
+            axes.hist(np.clip(z, -edge, edge), bins=bins, weights=weight, color=SKY, label=what)
+        axes.plot(t, normal, color=RED, linewidth=1.5, label="normal curve")
+        for side in (-limit, limit) if limit else ():
+            axes.axvline(side, color=SOFT, linestyle=":", linewidth=1.0)
+        axes.set(xlim=(-edge, edge), xlabel="normalised residual")
+    panels[0].set_ylabel("density")
+    panels[0].legend(loc="upper right", fontsize=8)
+    if len(z):
+        said = f"mean {z.mean():+.2f}\nspread {z.std():.2f}"
+        panels[0].text(0.02, 0.96, said, transform=panels[0].transAxes, va="top", fontsize=8)
+    floor = 0.5 / max(1, len(z)) / (bins[1] - bins[0])
+    panels[1].set_yscale("log")
+    panels[1].yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda v, _: f"{v:g}"))
+    panels[1].yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+    panels[1].set(ylim=(floor, 1.0), title="the same, logarithmic")
+    return png(fig)

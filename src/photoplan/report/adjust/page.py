@@ -7,7 +7,7 @@ import numpy as np
 from photoplan.orientation.check_points import CheckAccuracy
 from photoplan.products.adjust.figures import AdjustFigures
 from photoplan.report.adjust.corrections import correction_parts
-from photoplan.report.adjust.plots import draw_control, draw_field, draw_network, draw_normalised, draw_sigmas
+from photoplan.report.adjust.plots import draw_control, draw_field, draw_network, draw_sigmas
 from photoplan.report.adjust.tables import (
     Row,
     camera_parts,
@@ -24,6 +24,7 @@ from photoplan.report.adjust.tables import (
     to_unit,
     warning,
 )
+from photoplan.report.drawing import draw_normalised
 from photoplan.report.page import figure, headline, page, section, table
 
 
@@ -149,7 +150,7 @@ def _groups(facts: AdjustFigures) -> list[str]:
             "where the redundancy is more than about 30."
         ),
         figure(
-            draw_normalised(facts.normalised, facts.critical),
+            draw_normalised(facts.normalised, facts.critical, "image points"),
             "Normalised residuals of image points",
             "Each residual divided by its own standard deviation, beside the normal curve; dotted: the limit beyond "
             "which "

@@ -126,37 +126,6 @@ def draw_sigmas(facts: AdjustFigures) -> bytes:
 
 
 @styled
-def draw_normalised(values: NDArray[np.float64], limit: float) -> bytes:
-    """Histogram of normalised residuals with the normal curve, on a linear and on a logarithmic scale."""
-    fig = figure_of(_WIDTH, 2.9)
-    panels = fig.subplots(1, 2)
-    z = values[np.isfinite(values)]
-    edge = max(5.0, limit + 0.5)
-    bins = np.linspace(-edge, edge, 81 if len(z) > 2000 else 41)
-    t = np.linspace(-edge, edge, 401)
-    normal = np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi)
-    for axes in panels:
-        if len(z):
-            weight = np.full(len(z), 1 / (len(z) * (bins[1] - bins[0])))
-            axes.hist(np.clip(z, -edge, edge), bins=bins, weights=weight, color=SKY, label="image points")
-        axes.plot(t, normal, color=RED, linewidth=1.5, label="normal curve")
-        for side in (-limit, limit):
-            axes.axvline(side, color=SOFT, linestyle=":", linewidth=1.0)
-        axes.set(xlim=(-edge, edge), xlabel="normalised residual")
-    panels[0].set_ylabel("density")
-    panels[0].legend(loc="upper right", fontsize=8)
-    if len(z):
-        said = f"mean {z.mean():+.2f}\nspread {z.std():.2f}"
-        panels[0].text(0.02, 0.96, said, transform=panels[0].transAxes, va="top", fontsize=8)
-    floor = 0.5 / max(1, len(z)) / (bins[1] - bins[0])
-    panels[1].set_yscale("log")
-    panels[1].yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda v, _: f"{v:g}"))
-    panels[1].yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
-    panels[1].set(ylim=(floor, 1.0), title="the same, logarithmic")
-    return png(fig)
-
-
-@styled
 def draw_field(field: ResidualField) -> tuple[bytes, str]:
     """Mean residual vectors over the image format, and how many times they are enlarged."""
     xmin, ymin, xmax, ymax = field.frame

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.io.product import check_output
-from photoplan.report.drawing import has_matplotlib, load_matplotlib
+from photoplan.report.drawing import draw_normalised, has_matplotlib, load_matplotlib
 from photoplan.report.dtm.plots import (
     LINE_WORDS,
     draw_covariance,
@@ -16,7 +16,6 @@ from photoplan.report.dtm.plots import (
     draw_filter_map,
     draw_gross,
     draw_heights,
-    draw_normalised,
     draw_sigmas,
 )
 from photoplan.report.dtm.samples import BuildFacts, PlottedError
@@ -110,7 +109,7 @@ def _surface(facts: BuildFacts) -> list[str]:
 def _fit(facts: BuildFacts) -> list[str]:
     return [
         figure(
-            draw_normalised(facts.normalised, facts.limit),
+            draw_normalised(facts.normalised, facts.limit, "points"),
             "Histogram of normalised residuals",
             "Difference of each point from what its neighbours predict, in its standard deviations, beside the normal "
             "curve. A narrower histogram means that standard deviations are too large, a wider one that they are too "

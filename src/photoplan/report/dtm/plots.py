@@ -51,28 +51,6 @@ def draw_sigmas(area: ReportMap) -> bytes:
 
 
 @styled
-def draw_normalised(values: NDArray[np.float64], limit: float) -> bytes:
-    """Histogram of normalised residuals with the normal curve."""
-    fig, axes = axes_of(_WIDTH, 2.9)
-    z = values[np.isfinite(values)]
-    edge = 5.0
-    bins = np.linspace(-edge, edge, 81 if len(z) > 2000 else 41)
-    if len(z):
-        weight = np.full(len(z), 1 / (len(z) * (bins[1] - bins[0])))
-        axes.hist(np.clip(z, -edge, edge), bins=bins, weights=weight, color=SKY, label="points")
-        axes.text(0.01, 0.93, f"mean {z.mean():+.2f}, spread {z.std():.2f}", transform=axes.transAxes, va="top")
-    t = np.linspace(-edge, edge, 301)
-    axes.plot(t, np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi), color=RED, linewidth=1.5, label="normal curve")
-    if 0 < limit < edge:
-        for side in (-limit, limit):
-            axes.axvline(side, color=SOFT, linestyle=":", linewidth=1.0)
-        axes.annotate("limit", (limit, 0.3), (3, 0), textcoords="offset points", color=SOFT, fontsize=8)
-    axes.set(xlim=(-edge, edge), xlabel="normalised residual (all beyond ±5 in the last class)", ylabel="density")
-    axes.legend(loc="upper right")
-    return png(fig)
-
-
-@styled
 def draw_covariance(facts: CovarianceTest) -> bytes:
     """Fitted functions, and the test by the covariance of residuals."""
     fig = figure_of(_WIDTH, 3.1)
