@@ -95,7 +95,7 @@ def near_ground(ground: BodyGround, XY: _Floats) -> NearGround:
     """The surroundings of map points (n, 2), with room; NaN is left out."""
     XY = XY[np.isfinite(XY).all(axis=1)]
     if not len(XY):
-        return NearGround(ground, np.zeros(2), 0.0, np.zeros(3), None)
+        return NearGround(ground=ground, middle=np.zeros(2), reach=0.0, origin=np.zeros(3), coefficients=None)
     low, high = XY.min(axis=0), XY.max(axis=0)
     # Cameras that see nearly the same have the same.
     reach = 2.0 ** float(np.ceil(np.log2(0.7 * (high - low).max() + 1000.0)))
