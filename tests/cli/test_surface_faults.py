@@ -125,11 +125,13 @@ def test_images_without_overlap_are_told(project: Path) -> None:
 
 
 def test_bounds_that_reach_far_beyond_the_images_are_told(project: Path) -> None:
-    """Three images see a square of some 80 m; nothing is said of bounds inside."""
+    """Three images see a square of some 80 m; nothing is said of bounds inside. One of them may see none."""
     far = X0 - 500, Y0 - 500, X0 + 500, Y0 + 500
     said = surface(project, "--bounds", *far, "--dry-run")
     assert said.code == 0 and re.search(r"two images see 0\.[67]\d% of these bounds at most", said.out), said.out
     assert "of these bounds" not in surface(project, "--dry-run").out
+    said = surface(project, "--bounds", X0 - 38, Y0 - 10, X0 - 26, Y0 + 10, "--dry-run")
+    assert said.out.startswith("surface of 3 images, 2 of which see more than 1% of it: "), said.out
 
 
 def test_fault_02_undeclared_height_systems(project: Path) -> None:

@@ -219,7 +219,8 @@ def test_the_median_of_tiles_is_counted_in_classes() -> None:
 def planned(base: int = 0, search: object = None, name: str = "surface", apart_text: str = "") -> Any:
     """Of a plan what its findings look at."""
     scheme = SimpleNamespace(base=base, search=search, reach=20.0)
-    return SimpleNamespace(scheme=scheme, settings=SimpleNamespace(name=name), height_error=0.1, apart_text=apart_text)
+    settings, parts = SimpleNamespace(name=name), {"beside": 0.0}
+    return SimpleNamespace(scheme=scheme, settings=settings, height_error=0.1, apart_text=apart_text, parts=parts)
 
 
 def test_pixels_of_reduced_images_are_those_that_count() -> None:
@@ -234,6 +235,13 @@ def test_pixels_of_reduced_images_are_those_that_count() -> None:
     vague = [findings(plan, {"a": 1.0}, 80.0, 11.0, part, 0.01, 0.0) for part in (0.1, 0.4)]
     assert ["hardly any texture" in "".join(lines) for lines in vague] == [True, False]
     assert len(told[1]) == 1 and "the relief is finer than" in told[1][0] and "finer than" not in told[0][0]
+
+
+def test_an_image_that_sees_nothing_but_margins_is_not_named() -> None:
+    sigma0: dict[str, float | None] = {"a": 1.0, "b": 1.1, "c": 0.9}
+    for name, told in (("beside", False), ("inside", True)):
+        lines = "".join(findings(planned(), {**sigma0, name: 5.0}, 80.0, 0.1, 0.0, 0.01, 0.0))
+        assert (f"sigma0 of {name} 5 (1)" in lines) == told
 
 
 def test_that_there_is_no_height_is_told() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from photoplan.products.surface.plan import SurfacePlan
+from photoplan.products.surface.plan import HARDLY, SurfacePlan
 
 #: An image whose sigma0 is so many times the median of the others is told of; or all, if sigma0 is this part of the
 #: contrast of the surface. Parts of the heights that fit badly, last corrections, and standard deviations, pixels of
@@ -45,7 +45,9 @@ def findings(
     others = {
         name: float(np.median([v for other, v in known.items() if other != name])) for name in known if len(known) > 2
     }
-    alone = [name for name, usual in others.items() if known[name] > _ALONE * usual]
+    # Of others too few pixels tell, or those of margins alone.
+    judged = [name for name in others if plan.parts.get(name, 1.0) > HARDLY]
+    alone = [name for name in judged if known[name] > _ALONE * others[name]]
     usual = float(np.median([*known.values()])) if known else 0.0
     if not known:
         lines.append(

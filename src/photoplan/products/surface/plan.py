@@ -23,7 +23,7 @@ from photoplan.plain import pick
 from photoplan.products.orthophoto.look import extent_text
 from photoplan.products.surface.begin import start_apart
 from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start, number
-from photoplan.products.surface.target import SeenTarget, frame_of, over_frame, over_map
+from photoplan.products.surface.target import SeenTarget, frame_of, over_frame, over_map, seen_part
 from photoplan.project.scenes import ScenesAddress
 
 #: Side of a tile of heights; those of grey values are as many times larger as they are finer.
@@ -48,6 +48,8 @@ _SHARED = 0.2
 _PARALLEL = 1e-4
 #: Part of stated bounds that two images see, below which it is told: there are no heights elsewhere.
 _MOSTLY = 0.5
+HARDLY = 0.01
+"""Part of the bounds up to which an image sees so little that its figures tell nothing."""
 #: Levels at most.
 _LEVELS = 8
 #: Pixels of parallax of the reach from which on heights are searched; those for which the coarsest level of a search
@@ -78,6 +80,8 @@ class SurfacePlan:
     """By how much a start that is not the project's terrain lies above that (below: negative), metres; 0: they meet."""
     seen_share: float
     """Part of the bounds that lies inside those of what two images see, 0 to 1."""
+    parts: dict[str, float]
+    """Part of the bounds that each image sees, 0 to 1; one with 0 may still see margins of tiles."""
     key: str
     """Hash of all that decides the product."""
 
@@ -102,8 +106,12 @@ class SurfacePlan:
         reduced = f", images reduced by {2**s.base}" if s.base else ""
         pixels = f"{s.ratio**2} pixel{'s' * (s.ratio > 1)} of each image per height"
         far = f" at {self.frame.distance:.4g} m" if isinstance(self.frame, ImageFrame) else ""
+        seeing = sum(part > HARDLY for part in self.parts.values())
+        images = f"{len(self.images)} images"
+        if seeing < len(self.images):
+            images += f", {seeing} of which see more than {HARDLY:.0%} of it"
         return "\n".join([
-            f"surface of {len(self.images)} images: {g.width} × {g.height} heights of {g.resolution:g} m, grey values "
+            f"surface of {images}: {g.width} × {g.height} heights of {g.resolution:g} m, grey values "
             f"of {g.resolution / s.ratio:.3g} m",
             f"  GSD {self.gsd:.3g} m, {pixels}{reduced}; one pixel of parallax is {self.height_error:.3g} m of height",
             f"  {s.coarsest + 1} level{'s' * (s.coarsest > 0)}, the coarsest with heights of "
@@ -144,6 +152,7 @@ class SurfacePlan:
                 "gsd",
                 "key",
                 "seen_share",
+                "parts",
                 height_of_a_pixel="height_error",
                 start_apart_m="apart",
             ),
@@ -246,6 +255,7 @@ def plan_surface(
         height_error=height_error,
         apart=apart,
         seen_share=seen_share,
+        parts={one.name: seen_part(one, grid.bounds) for one in looked},
         key=_key(project, used, settings, scheme=scheme, grid=grid, frame=frame),
     )
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.cameras.base import Camera
 from photoplan.cameras.base import project as project_points
@@ -72,6 +73,18 @@ class SeenTarget:
     """Its mean ground sampling distance, metres."""
 
 
+def seen_part(one: SeenTarget, bounds: Bounds) -> float:
+    """Part of the bounds that an image sees on the mean of its heights, by a lattice of points, 0 to 1."""
+    u, v = (bounds[k] + (bounds[k + 2] - bounds[k]) * (np.arange(_POINTS) + 0.5) / _POINTS for k in (0, 1))
+    at = project_points(one.camera, np.stack([*np.meshgrid(u, v), np.full((_POINTS,) * 2, sum(one.heights) / 2)], -1))
+    return float(_inside(one.camera, at).mean())
+
+
+def _inside(camera: Camera, at: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which image points (..., 2) lie on pixels; NaN does not."""
+    return np.asarray(((at > -0.5) & (at < np.array(camera.size) - 0.5)).all(axis=-1))
+
+
 def over_map(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[SeenTarget], list[str]]:
     """Images that see terrain, and a line for each that sees none; see `look_at`."""
     looked, blind = look_at(project, names, force, events)
@@ -103,7 +116,7 @@ def over_frame(
         # From behind nothing of a wall is seen, nor the far side of a column.
         point, way = camera.rays(at, height)
         along = np.abs((uvh - point) - ((uvh - point) * way).sum(axis=1)[:, None] * way).max(axis=1)
-        inside = ((at > -0.5) & (at < np.array(camera.size) - 0.5)).all(axis=1) & (way[:, 2] < 0) & (along < _SAME)
+        inside = _inside(camera, at) & (way[:, 2] < 0) & (along < _SAME)
         events.done()
         if not inside.any():
             stands = frame.inverse(camera.camera.vantage.point)
