@@ -230,7 +230,7 @@ def test_fault_30_finite_nonsense(project: Path, words: list[object], code: int,
 )
 def test_a_run_that_is_ended_goes_on(project: Path, number: signal.Signals) -> None:
     """Two tiles: of the first one images see nothing, the second one is held up."""
-    bounds = (X0 - 430, Y0 - 6, X0 + 4, Y0 + 6)
+    bounds = (X0 - 570, Y0 - 6, X0 + 4, Y0 + 6)
     words = ["surface", project, "--resolution", 1.5, "--bounds", *bounds, "--workers", 1]
     products, begun = project.parent / "products", project.parent / "begun"
     begun.mkdir()
