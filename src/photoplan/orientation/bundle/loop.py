@@ -32,7 +32,8 @@ _CONVERGED = 1e-3
 _ROUNDING = 1e-6
 #: The same for the robust start, and its least number of iterations.
 _ROUGHLY, _LEAST = 0.5, 8
-#: Largest relative change of the sum of squares at the end.
+#: Largest relative change of the sum of squares at the end; below _CONVERGED ** 2 variances it means nothing either, for
+#: that is what an unknown makes that is off by the largest step. Coordinates of millions of metres are rounded by more.
 _SETTLED = 1e-9
 #: Damped steps are short for that reason alone. But where so many of them one after the other lower the sum of squares
 #: by less than this part of a variance each, what is left to go means nothing: an unknown that is off by its whole
@@ -91,6 +92,7 @@ class Loop:
             weight = base * robust_weights(model, e * np.sqrt(base), turn) if robust else base
             weight = np.where(np.isfinite(e), weight, 0.0)
             before = _cost(e, weight)
+            redundancy = max(1.0, float((weight > 0).sum()) - model.columns.count - 3 * len(model.point_names))
             if descent.leads_nowhere(state, before) and not robust:
                 state = descent.taken_up()
                 continue
@@ -98,17 +100,17 @@ class Loop:
             # Not in the middle of steps that made things worse: rays are parallel there that are not.
             if watch is not None and watch.stops(turn, model, state, rows, calm=state is descent.best):
                 return state
-            step = descent.step(state, rows, weight, before)
+            step = descent.step(state, rows, weight, before, redundancy)
             state, after = step.state, step.cost
             self.count += 1
             self._progress(self.count, float(np.sqrt(after / max(1.0, float((weight > 0).sum())))))
-            variance = after / max(1.0, float((weight > 0).sum()) - model.columns.count - 3 * len(model.point_names))
+            variance = after / redundancy
             gains = [*gains[1:], abs(before - after) / max(variance, 1e-300)]
             if robust:
                 if turn >= _LEAST and step.largest < _ROUGHLY:
                     return state
             elif step.ends(abs(cost - after) <= _SETTLED * after or after < 1e-18 * len(e), max(gains)):
-                if descent.is_least(after):
+                if descent.is_least(after, redundancy):
                     return state
                 descent.go_back()
             cost = after
@@ -177,15 +179,15 @@ class _Descent:
         self._gone_back, self._damping, self._patience = True, _FIRST_DAMPING, 0
         return self.best
 
-    def is_least(self, cost: float) -> bool:
+    def is_least(self, cost: float, redundancy: float) -> bool:
         """Whether an end with this sum of squares counts: it is the best one, or no other way is left."""
-        return self._gone_back or cost <= self._least * (1.0 + 1e-9) + 1e-12
+        return self._gone_back or _is_no_more(cost, self._least, redundancy)
 
     def go_back(self) -> None:
         """Take up the best state next, unless the state at hand is better."""
         self._away = _AWAY
 
-    def step(self, state: State, rows: Rows, weight: _Floats, before: float) -> _Step:
+    def step(self, state: State, rows: Rows, weight: _Floats, before: float, redundancy: float) -> _Step:
         """A step that lowers the sum of squares, damped until it does; a whole one may raise it for once."""
         model = self._model
         while True:
@@ -193,7 +195,7 @@ class _Descent:
             moves, points = reduced.solved(model, state)
             moved = state.moved(model.columns, moves, along_rays(model, state, points))
             after = _cost(whitened(model, residuals_of(model, moved)), weight)
-            if after <= before * (1.0 + 1e-9) + 1e-12:
+            if _is_no_more(after, before, redundancy):
                 break
             if self._patience > 0 and self._damping == 0.0 and after < np.inf:
                 self._patience -= 1
@@ -207,6 +209,11 @@ class _Descent:
         self._damping = 0.0 if self._damping <= _FIRST_DAMPING else self._damping / 10.0
         largest = float(np.abs(moves / reduced.scale).max()) if len(moves) else 0.0
         return _Step(moved, after, largest, self._damping > 0.0)
+
+
+def _is_no_more(after: float, before: float, redundancy: float) -> bool:
+    """Whether a sum of squares is no larger than another, but for what means nothing."""
+    return after <= before + max(_SETTLED, _CONVERGED**2 / redundancy) * before + 1e-12
 
 
 def _left(gains: list[float]) -> float:
