@@ -32,8 +32,8 @@ _CONVERGED = 1e-3
 _ROUNDING = 1e-6
 #: The same for the robust start, and its least number of iterations.
 _ROUGHLY, _LEAST = 0.5, 8
-#: Largest relative change of the sum of squares at the end; below _CONVERGED ** 2 variances it means nothing either, for
-#: that is what an unknown makes that is off by the largest step. Coordinates of millions of metres are rounded by more.
+#: Largest relative change of the sum of squares at the end. Below _CONVERGED ** 2 variances it means nothing either: an
+#: unknown that is off by the largest step makes as much, and rounding of large coordinates may make more than 1e-9.
 _SETTLED = 1e-9
 #: Damped steps are short for that reason alone. But where so many of them one after the other lower the sum of squares
 #: by less than this part of a variance each, what is left to go means nothing: an unknown that is off by its whole
