@@ -123,3 +123,17 @@ def test_the_pull_of_curvatures_is_half_the_gradient_of_their_sum() -> None:
     step[30, 30] = 1e-4
     sums = [(rough.weights * curvatures(heights + s) ** 2).sum() / 2 for s in (step, -step)]
     assert slope[30, 30] == pytest.approx((sums[0] - sums[1]) / 2e-4, rel=1e-5)
+
+
+def test_a_breakline_bends_more_than_its_hill_and_a_hill_is_none() -> None:
+    """Curvatures of a smooth hill, all far larger than their band's variance, count; those of a ditch do not."""
+    v, u = np.mgrid[:120, :120].astype(float)
+    hill = 10 * np.sin(u / 6.4 + 0.4) * np.cos(v / 6.4)
+    roughness = Roughness.uniform(hill.shape, 0.02)
+    inner = (slice(None), slice(12, -12), slice(12, -12))
+    factors = roughness.around(hill).factors[inner]
+    assert np.percentile(factors, 5) > 0.4 and 0.9 < np.median(factors) < 1.3
+    ditch = roughness.around(hill - 5 * (np.abs(u - 60) < 2)).factors
+    assert ditch[0, 12:-12, 58:63:4].max() < 0.1 and np.median(ditch[inner]) > 0.8
+    flat = roughness.around(5.0 * (u > 60))
+    assert flat.factors[0, 30:90, 60].max() < 1e-3 and (flat.squares == roughness.squares).all()

@@ -16,7 +16,10 @@ from tools.facet_scene import CONTRAST, GROUND, GSD, Scene, write_scene
 from tools.sketched import drawn
 from tools.small_block import X0, Y0
 
+from photoplan.io.project.file import load_project
 from photoplan.products.surface.findings import findings
+from photoplan.products.surface.plan import plan_surface
+from photoplan.products.surface.settings import SurfaceSettings
 from photoplan.products.surface.spread import counted, median
 from photoplan.report import surface as report
 
@@ -100,6 +103,17 @@ def test_five_images_of_different_brightness(scene: Scene, made: Path) -> None:
     assert ((sigma0 > 0.4) & (sigma0 < 0.8)).all()
     assert max(record["product"]["corrections_px"]) < 0.05 and record["product"]["redundancy"] > 1000
     assert (made / "surface.png").exists()
+
+
+def test_grey_values_are_as_fine_as_the_pixels_where_images_are_enough(scene: Scene) -> None:
+    project = load_project(scene.path)
+
+    def ratio(resolution: float, *images: str) -> int:
+        return plan_surface(project, SurfaceSettings(resolution, bounds=BOUNDS), images or None).scheme.ratio
+
+    # Pixels of 0.5 m: of five images four facets on 1.55 m have three each, of two images one.
+    assert ratio(1.5) == ratio(1.45) == 3 and ratio(1.55) == ratio(2.0) == 4
+    assert ratio(1.55, "i1", "i2") == 3 and ratio(1.8, "i1", "i2") == 4
 
 
 def test_residuals_of_a_surface_that_fits(made: Path) -> None:

@@ -42,8 +42,8 @@ def judged(scene: Scene, project: Path, folder: Path, *how: object) -> tuple[flo
         (SHAKEN, 50, 1, 0.06, 1.4),
         (SHAKEN, 10, 1, 0.06, 1.4),
         (CALM, 50, 1, 0.015, 1.2),
-        # A pixel is taken for a point, but a line 25° ahead sees slopes by longer or shorter ones than level ground.
-        (CALM, 50, 4, 0.02, 2.0),
+        # What bilinear facets miss of the curvature is not stated.
+        (CALM, 50, 4, 0.018, 1.5),
     ],
     ids=["turbulent", "turbulent, noise", "calm", "calm, strong relief"],
 )
@@ -77,4 +77,4 @@ def test_lines_frames_films_and_polynomials_together(tmp_path: Path) -> None:
     print(record["sigma0"])
     assert set(record["sigma0"]) == {"forward", "nadir", "frame", "film", "satellite"}
     assert all(0.4 < value < 1 for value in record["sigma0"].values())
-    assert np.sqrt(square) < 0.02 and np.sqrt(normalised) < 1.7 and abs(bias) < 0.01
+    assert np.sqrt(square) < 0.01 and 0.8 < np.sqrt(normalised) < 1.2 and abs(bias) < 0.01

@@ -2,7 +2,8 @@
 
 A second difference of the heights is observed to be zero (Wrobel, Kaiser and Hausladen 1992). How little that says,
 its variance, is a component estimated from the heights themselves, in patches and for each direction, since terrain is
-rough here and smooth there. Differences follow Student's distribution, which lets breaklines be.
+rough here and smooth there. Differences follow Student's distribution, which lets breaklines be: those far larger than
+others around, since all those of a smooth hill may be larger than what their band, below, tells.
 
 Terrain's curvatures are not independent, so that the variance of those from post to post says little of those over
 the distance by which a surface is smoothed. With N = S + R of pixels and curvatures, what smoothing takes away of a
@@ -27,6 +28,8 @@ _Doubles = NDArray[np.float64]
 _PATCH = 24
 #: Degrees of freedom of the curvatures.
 _FREEDOM = 4.0
+#: Steps to the usual size of the curvatures of a patch, each of which takes more than half of what is left of the way.
+_STEPS = 5
 #: The part with which the mean of a block takes part in the variances of each patch, and what these change at once.
 _SHARED, _STEADY, _MOST = 0.25, 0.5, 64.0
 
@@ -83,8 +86,9 @@ class Roughness:
 
     def around(self, heights: _Doubles) -> Roughness:
         """The same variances, with the robust factors of heights (rows, columns)."""
-        single = curvatures(heights) ** 2 / self.squares
-        return Roughness(self.squares, np.where(self.factors > 0, (_FREEDOM + 1) / (_FREEDOM + single), 0.0))
+        found, inside = curvatures(heights) ** 2, self.factors > 0
+        single = found / _usual(found, self.squares, inside)
+        return Roughness(self.squares, np.where(inside, (_FREEDOM + 1) / (_FREEDOM + single), 0.0))
 
     def estimated(self, heights: _Doubles, smoother: Smoother) -> Roughness:
         """Variances with which the band around the smoothing length holds what it does in heights (rows, columns)."""
@@ -132,6 +136,17 @@ class Roughness:
         for _ in range(count - 1):
             bands.append(smoother.solve([self.gradient(band) for band in bands[-1]]))
         return bands, taken
+
+
+def _usual(found: _Doubles, least: _Doubles, inside: NDArray[np.bool_]) -> _Doubles:
+    """What squares of curvatures usually are around each: the scale of Student's distribution that is most probable for
+    those of a patch (by the EM algorithm, Lange, Little and Taylor 1989), not below `least`; all (3, rows, columns)."""
+    share = np.maximum(np.stack([_means(part.astype(float)) for part in inside]), 1.0 / _PATCH**2)
+    scale = least
+    for _ in range(_STEPS):
+        weighed = np.where(inside, found * (_FREEDOM + 1) / (_FREEDOM + found / scale), 0.0)
+        scale = np.maximum(np.stack([_means(part) for part in weighed]) / share, least)
+    return scale
 
 
 def _transposed(c: _Doubles) -> _Doubles:

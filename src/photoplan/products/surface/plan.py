@@ -221,7 +221,7 @@ def plan_surface(
     grid = MapGrid.covering(bounds, settings.resolution, project.crs if frame is None else "")
     if min(grid.width, grid.height) < 2:
         raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
-    ratio, base = _facets(settings.resolution / gsd, MOST_RATIO)
+    ratio, base = _facets(settings.resolution / gsd, MOST_RATIO, _images_of_a_place(looked, grid))
     height_error, usual = _heights_of_a_pixel(looked, gsd)
     flying = _flying_height(looked)
     if 0 < _MOST_WRONG * flying < (settings.reach or 0.0):
@@ -341,10 +341,26 @@ def _flying_height(looked: Sequence[SeenTarget]) -> float:
     return float(np.median(heights))
 
 
-def _facets(pixels: float, most: int) -> tuple[int, int]:
-    """Facets along a height facet of so many pixels, and the level of the images whose pixels are as large as they."""
+def _facets(pixels: float, most: int, images: float = 0.0) -> tuple[int, int]:
+    """Facets along a height facet of so many pixels, and the level of the images whose pixels are as large as they.
+
+    Facets are no coarser than pixels where so many images see a place that any two, which tell its height, leave a
+    pixel for each facet to the others: coarser ones do not hold what pixels show, which moves heights over whole
+    stretches where pixels drift along the facets. Of three images, slopes and finer grey values mix.
+    """
     base = max(0, math.ceil(math.log2(pixels / most)))
-    return max(1, round(pixels / 2**base)), base
+    pixels /= 2**base
+    ratio = max(1, round(pixels))
+    finer = ratio < 0.999 * pixels and (images - 2) * (pixels / (ratio + 1)) ** 2 >= 1
+    return ratio + finer, base
+
+
+def _images_of_a_place(looked: Sequence[SeenTarget], grid: MapGrid) -> float:
+    """How many images see a place of a grid in the mean, by their footprints."""
+    b = np.array(grid.bounds)
+    seen = np.array([one.bounds for one in looked])
+    sides = np.minimum(seen[:, 2:], b[2:]) - np.maximum(seen[:, :2], b[:2])
+    return float(np.maximum(sides, 0.0).prod(axis=1).sum() / np.prod(b[2:] - b[:2]))
 
 
 def _search(looked: Sequence[SeenTarget], pixels: float, height_error: float, reach: float, most: int) -> Search:
