@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -14,7 +12,6 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from photoplan import __version__
 from photoplan.engine.steps import steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
@@ -23,7 +20,7 @@ from photoplan.geometry.heights import check_height_system, height_label
 from photoplan.io.naming import together, when_named
 from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
-from photoplan.io.run_record import run_times, write_run_record
+from photoplan.io.run_record import run_key, run_times, write_run_record
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
@@ -120,7 +117,8 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
     plan = plan_build(measured, request.settings)
     events.talk(describe_plan(plan, measured, crs, system))
     facts = [input_facts(path) for path in request.inputs]
-    key = _key(request, facts, plan, crs, system)
+    decides = [request.settings, repr(request.options), repr(plan.layout), crs, system]
+    key = run_key("terrain model", decides, request.inputs)
     kept = ResultLog.beside(request.output, key, locked=True)
     with (
         ModelWriter(
@@ -253,15 +251,6 @@ def _check_memory(measured: MeasuredTerrain) -> None:
             f"{measured.count} points need about {needed >> 20} MiB, {free >> 20} MiB are free; build parts of the "
             "area and join them with `photoplan dtm refine`, or thin the points"
         )
-
-
-def _key(request: BuildRequest, facts: Sequence[dict[str, Any]], plan: BuildPlan, crs: str, system: str | None) -> str:
-    text = json.dumps(
-        [facts, asdict(request.settings), repr(request.options), repr(plan.layout), crs, system, __version__],
-        sort_keys=True,
-        default=str,
-    )
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _gross(built: Built, measured: MeasuredTerrain) -> list[GrossError]:

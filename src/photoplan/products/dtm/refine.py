@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,12 +10,12 @@ from typing import Any
 import numpy as np
 import shapely
 
-from photoplan import __version__
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.heights import common_system
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
+from photoplan.io.run_record import run_key
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
@@ -120,16 +119,8 @@ def _polygons(request: RefineRequest, coarse: ModelReader) -> Any:
 
 
 def _key(request: RefineRequest, coarse: ModelReader, fine: ModelReader) -> str:
-    facts = (
-        coarse.header.identity,
-        fine.header.identity,
-        input_facts(request.polygons)["sha256_sampled"],
-        request.transition,
-        request.width,
-        request.height_system,
-        __version__,
-    )
-    return hashlib.sha256(repr(facts).encode()).hexdigest()
+    decides = [coarse.header.identity, fine.header.identity, request.transition, request.width, request.height_system]
+    return run_key("refined model", decides, [request.polygons])
 
 
 def _add(

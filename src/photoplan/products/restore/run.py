@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from photoplan import __version__
 from photoplan.engine.executors import threads
 from photoplan.engine.run import Kept, Runner, Work, tiles_in_flight
 from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
@@ -24,7 +21,7 @@ from photoplan.io.names import unique_stems
 from photoplan.io.naming import tidy
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
-from photoplan.io.run_record import record_path
+from photoplan.io.run_record import record_path, run_key
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
@@ -173,7 +170,7 @@ def _only(filter_: RestorationFilter, bands: tuple[int, ...]) -> RestorationFilt
 def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str, tools: tuple[Path, ...]) -> Job:
     info = reader.info
     digest = fingerprint(info.path).digest
-    facts = [__version__, digest, text, request.settings["bands"], str(reader.dtype), request.linearisation]
+    facts = [text, request.settings["bands"], str(reader.dtype), request.linearisation]
     aligned, lit = reader.step(AlignStep), reader.step(FallOffStep)
     if aligned is not None:
         facts.append(model_figures(aligned.model))
@@ -182,7 +179,7 @@ def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str
     light = restoration_of(reader).restorer.linearisation
     if light.grey is not None and light.light is not None:
         facts += [light.grey.tolist(), light.light.tolist()]
-    key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+    key = run_key("restored image", facts, [{"sampled_sha256": digest}])
     nodata: Nodata = kept_nodata(info, reader.dtype)
     if request.compress == "jpeg" and (reader.dtype != np.uint8 or reader.bands not in (1, 3)):
         raise InputError(
