@@ -126,7 +126,7 @@ def test_a_picture_names_what_is_along_its_axes(on_map: Path, tmp_path: Path, mo
 
     monkeypatch.setattr(maps, "png", kept)
     maps.draw_surface(on_map / "surface.tif", tmp_path / "s.png", ("u", "v"))
-    assert drawn == ["u [m]v [m]", "u [m]", "u [m]", "m", "m"]
+    assert drawn == ["v [m]", "", "u [m]v [m]", "u [m]", "m", "m", ""]
 
 
 def test_heights_along_an_image_are_the_ground(scene: Scene, tmp_path: Path) -> None:
