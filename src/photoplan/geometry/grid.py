@@ -201,8 +201,8 @@ class MapGrid:
     """Columns."""
     height: int
     """Rows."""
-    crs: str
-    """Coordinate reference system as a string that pyproj reads (usually `EPSG:…` or WKT); empty: it is no map."""
+    crs: str | None
+    """Coordinate reference system as a string that pyproj reads (usually `EPSG:…` or WKT); None: it is no map."""
 
     def __post_init__(self) -> None:
         check_resolution(self.resolution)
@@ -211,7 +211,7 @@ class MapGrid:
             raise UsageError(f"grid of {self.width} × {self.height} pixels; it must hold at least one")
 
     @classmethod
-    def covering(cls, bounds: tuple[float, float, float, float], resolution: float, crs: str) -> MapGrid:
+    def covering(cls, bounds: tuple[float, float, float, float], resolution: float, crs: str | None) -> MapGrid:
         """The grid that covers `bounds` (xmin, ymin, xmax, ymax) with edges on multiples of `resolution`.
 
         Grids of one resolution therefore share their pixels, whatever their bounds: a crop of a product is the
@@ -259,7 +259,7 @@ class MapGrid:
     def placement(self) -> Placement:
         """The same for files, which know other places than maps too."""
         corner = (self.resolution, 0.0, self.left, 0.0, -self.resolution, self.top)
-        return Placement((self.width, self.height), corner, self.crs or None)
+        return Placement((self.width, self.height), corner, self.crs)
 
     def to_map(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Pixel coordinates (column, row) to map X, Y; shapes (..., 2)."""

@@ -128,7 +128,7 @@ def check_vectors(path: Path) -> None:
 
 
 def write_features(
-    path: Path, kind: str, shapes: Sequence[Any], columns: Mapping[str, NDArray[Any]], crs: str, layer: str
+    path: Path, kind: str, shapes: Sequence[Any], columns: Mapping[str, NDArray[Any]], crs: str | None, layer: str
 ) -> None:
     """Write one layer as a GeoPackage that appears under its name only when it is complete; replaces an older one.
 

@@ -78,7 +78,7 @@ def source_regions(path: Path, grid: MapGrid) -> dict[int, Any]:
     return {row: shape if shape.geom_type == "MultiPolygon" else shapely.MultiPolygon([shape]) for row, shape in whole}
 
 
-def write_regions(path: Path, images: Sequence[str], shapes: Mapping[int, Any], crs: str) -> None:
+def write_regions(path: Path, images: Sequence[str], shapes: Mapping[int, Any], crs: str | None) -> None:
     """Write regions as a GeoPackage with the layer `regions`: columns image, source and area_m2.
 
     Raises

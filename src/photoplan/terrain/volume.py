@@ -118,7 +118,7 @@ def volume_between(a: Terrain, b: Terrain, polygon: Any, settings: VolumeSetting
 
 def integrate(a: Terrain, b: Terrain, polygon: Any, cell: float, run: Map = map) -> Sums:
     """The integral with cells of one size; grids of all sizes share their edges at multiples of the cell."""
-    grid = MapGrid.covering(tuple(float(v) for v in polygon.bounds), cell, "")  # type: ignore[arg-type]
+    grid = MapGrid.covering(tuple(float(v) for v in polygon.bounds), cell, None)  # type: ignore[arg-type]
     total = Sums()
     for part in run(partial(_window_sums, a, b, polygon, grid), grid.window.tiles(TILE)):
         total = Sums(*(x + y for x, y in zip(astuple(total), astuple(part))))
@@ -302,7 +302,7 @@ class _Fields:
 
 def _fields(a: Terrain, b: Terrain, model: ErrorModel, polygon: Any, cell: float) -> _Fields:
     side = _side(model.length, cell, polygon)
-    grid = MapGrid.covering(tuple(float(v) for v in polygon.bounds), side, "")  # type: ignore[arg-type]
+    grid = MapGrid.covering(tuple(float(v) for v in polygon.bounds), side, None)  # type: ignore[arg-type]
     dense = grid.window.size <= MOST_CELLS and side <= model.length
     fields = [np.zeros((grid.height, grid.width)) for _ in range(3)] if dense else []
     sums, areas, unknown = np.zeros(3), np.zeros(3), 0.0

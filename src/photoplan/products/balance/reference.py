@@ -71,6 +71,7 @@ def open_reference(path: Path, grid: MapGrid, bands: int, dtype: np.dtype[Any]) 
     placement = placement_of(reader.info)
     if placement.transform is None or placement.crs is None:
         raise InputError(f"{path}: no georeference or no CRS; a reference is a raster on the map")
+    assert grid.crs is not None, "overlaps are sampled on the map"
     a, b = placement.coefficients[:2]
     return Reference(path, grid.crs, grid.bounds, float(np.hypot(a, b)))
 

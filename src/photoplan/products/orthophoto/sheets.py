@@ -124,6 +124,7 @@ def _item(product: OrthoProduct, result: ProductResult) -> str:
     """STAC item 1.0 with the projection extension; dated by when the sheet was made: a project does not know when its
     images were taken."""
     grid = product.grid
+    assert grid.crs is not None, "sheets are cut from maps"
     left, bottom, right, top = grid.bounds
     clip = product.plan.clip
     outline = shapely.box(left, bottom, right, top) if not isinstance(clip, Regions) else clip.shapes[0][0]

@@ -207,7 +207,7 @@ def plan_surface(
         bounds = settings.bounds or own
         if bounds is None:
             raise UsageError(f"target {settings.target}: it has no end; give `bounds`, u and v on it in metres")
-        MapGrid.covering(bounds, settings.resolution, "")
+        MapGrid.covering(bounds, settings.resolution, None)
         settings = replace(settings, bounds=bounds, start="0" if settings.start == "terrain" else settings.start)
         looked, blind = over_frame(project, names, frame, bounds, float(settings.start), events)
     check_bands(project, settings.bands, [one.name for one in looked])
@@ -218,7 +218,7 @@ def plan_surface(
             f"resolution {settings.resolution:g} m is finer than the images see the {settings.seen} ({gsd:.3g} m): a "
             f"height needs some pixels; choose {3 * gsd:.2g} m, or {gsd:.2g} m at least"
         )
-    grid = MapGrid.covering(bounds, settings.resolution, project.crs if frame is None else "")
+    grid = MapGrid.covering(bounds, settings.resolution, project.crs if frame is None else None)
     if min(grid.width, grid.height) < 2:
         raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
     ratio, base = _facets(settings.resolution / gsd, MOST_RATIO, _images_of_a_place(looked, grid))
@@ -299,7 +299,7 @@ def _bounds(settings: SurfaceSettings, looked: Sequence[SeenTarget], blind: Sequ
     if settings.bounds is None:
         return (xmin, ymin, xmax, ymax), 1.0
     b = settings.bounds
-    MapGrid.covering(b, settings.resolution, "")
+    MapGrid.covering(b, settings.resolution, None)
     if not (b[0] < xmax and xmin < b[2] and b[1] < ymax and ymin < b[3]):
         together = extent_text((xmin, ymin, xmax, ymax))
         raise GeometryError(f"bounds {extent_text(b)}: no two images see anything there; together they see {together}")

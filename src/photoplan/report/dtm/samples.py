@@ -204,7 +204,7 @@ def _map(built: Built, surface: HybridSurface) -> ReportMap:
     left, top = layout.corner(min(columns), min(rows))
     right, bottom = layout.corner(max(columns) + 1, max(rows) + 1)
     resolution = max(right - left, top - bottom) / _SIDE
-    target = MapTarget(MapGrid.covering((left, bottom, right, top), resolution, ""))
+    target = MapTarget(MapGrid.covering((left, bottom, right, top), resolution, None))
     grid = target.grid
     heights = np.full((grid.height, grid.width), np.nan, np.float32)
     sigmas = heights.copy()
