@@ -59,7 +59,9 @@ class SurfaceJob:
     @property
     def bytes(self) -> int:
         """Memory that a tile takes."""
-        return ((self.part + 2 * MARGIN) * self.scheme.ratio) ** 2 * _EACH + 2 * (_PART**2) * len(self.address.scenes)
+        m, part = self.scheme.ratio, self.part
+        posts = (min(part, self.grid.width) + 2 * MARGIN) * (min(part, self.grid.height) + 2 * MARGIN)
+        return posts * m**2 * _EACH + 2 * _PART**2 * len(self.address.scenes)
 
     def __call__(self, tile: Tile) -> Made:
         """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""
