@@ -164,6 +164,8 @@ def draw_surface(heights: Path, picture: Path, coordinates: tuple[str, str] = ("
     extent = left, right, bottom, top
     with mpl.rc_context(STYLE):
         fig = figure_of(12.0, float(np.clip(8.6 * (top - bottom) / (right - left) + 1.5, 5.0, 18.0)))
+        # Maps keep their shape: laid out otherwise, the names of the axes leave the picture.
+        fig.set_layout_engine("compressed")
         axes = fig.subplots(2, 2, sharex=True, sharey=True).ravel()
         # A few heights that went wrong would take all colours from the rest.
         low, high = _most(z, 0.5)
