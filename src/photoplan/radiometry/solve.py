@@ -30,6 +30,8 @@ class Solved:
     def of(cls, N: csr_array, H: _Floats) -> Solved:
         """Factor equations with a positive definite matrix."""
         whole = csc_matrix(N + diags(_RIDGE * N.diagonal()))
+        # SciPy 1.11 factors matrices with places of 32 bits alone.
+        whole.indices, whole.indptr = (each.astype(np.intc, copy=False) for each in (whole.indices, whole.indptr))
         # An order that fills little: a band would be as wide as the block, and its cost an image grow with that.
         factor = splu(whole, permc_spec="COLAMD", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         if not len(H):
