@@ -32,8 +32,9 @@ from photoplan.matching.register import (
     contradicting,
     match_grid,
 )
+from photoplan.matching.smooth_displacement import MODELS, SmoothModel, fit_smooth
 from photoplan.plain import pick
-from photoplan.products.register.figures import MODELS, RegisterFigures, SmoothModel, figures_of, fit_smooth
+from photoplan.products.register.figures import RegisterFigures, figures_of
 from photoplan.products.register.pair import Pair, open_pair
 
 #: Patches of a tile along each side, and of all at most.
