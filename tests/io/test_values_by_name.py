@@ -18,10 +18,6 @@ MOST = 4
 #: Files that still build larger ones so.
 BY_ORDER = {
     "cameras/line_correctable.py",
-    "matching/facets/observe.py",
-    "matching/facets/radiometry.py",
-    "matching/facets/reconstruct.py",
-    "matching/facets/search.py",
     "products/surface/plan.py",
     "products/surface/target.py",
 }
@@ -29,7 +25,6 @@ BY_ORDER = {
 BUNDLES = {
     "io/orientation/text.py angle_block own": "the conventions of a format, a constant of its module",
     "io/product_check.py _compare wanted": "pixels and their validity, as a tile has them",
-    "matching/facets/block.py _solved_exactly rounds": "not looked at yet",
     "matching/refine.py work task": "an item of a step, handed over by `map`",
     "products/mtf/patterns.py _measure named": "a field of its result",
     "products/surface/job.py _view target": "one key of a cache",

@@ -261,13 +261,13 @@ class FacetBlock:
         system, right = np.empty((shape[0], OFFSETS, shape[1]), np.float32), np.empty(shape, np.float32)
         made_grey(sums, system, right)
         del sums
-        self.values = _solved_exactly(system, right, density, self.values, _ROUNDS)
+        self.values = _solved_exactly(system, right, density, self.values, *_ROUNDS)
         if drawn:
             right[:] = 0.0
             for n, (sight, w) in enumerate(zip(self.sights, weights)):
                 # Of each image others.
                 add_errors(sight.places, (sight.first[0] + (n << 20), sight.first[1]), w, ratio, right)
-            errors = _solved_exactly(system, right, density, np.zeros(shape, np.float32), _FULLY)
+            errors = _solved_exactly(system, right, density, np.zeros(shape, np.float32), *_FULLY)
         return density, errors
 
     def surface_at(self, sight: Sight, weights: _Floats) -> _Floats:
@@ -330,12 +330,12 @@ class FacetBlock:
 
 
 def _solved_exactly(
-    system: _Floats, right: _Floats, density: _Floats, values: _Floats, rounds: tuple[int, float]
+    system: _Floats, right: _Floats, density: _Floats, values: _Floats, rounds: int, enough: float
 ) -> _Floats:
     """Coefficients of grey facets from their normal equations and the weights on each of them, beginning with `values`:
     as exact as a part of their own standard deviations. Those that hardly any pixel knows stay near what they were."""
     usual = np.float32(density[density > 0].mean() if (density > 0).any() else 1.0)
     system[:, 0] += np.float32(1e-4) * usual
     right += np.float32(1e-4) * usual * values
-    solve_grey(system, right, smoothed(density) + np.float32(0.05) * usual, values, *rounds)
+    solve_grey(system, right, smoothed(density) + np.float32(0.05) * usual, values, rounds, enough)
     return values

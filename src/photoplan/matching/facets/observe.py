@@ -85,7 +85,7 @@ def facets_of(grid: MapGrid, window: Window, level: int, ratio: int, margin: int
     last = -(-(np.array(window.stop) - 1) // step) + margin
     left, top = grid.to_map(first * step)
     columns, rows = (last - first + 1).tolist()
-    return Facets(float(left), float(top), grid.resolution * step, (rows, columns), ratio)
+    return Facets(left=float(left), top=float(top), pitch=grid.resolution * step, shape=(rows, columns), ratio=ratio)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +205,8 @@ def _followed(
     if worst(cross(at[some], sum(levels) / 2), mean[some]) > _OFF:
         middle = cross(at, sum(levels) / 2)
     ways = np.concatenate([middle, (high - low) / (2 * half), (mean - middle) / half**2], axis=-1)
-    return Sight(raw, ways, (right, down), sum(levels) / 2, (window.col, window.row))
+    first_pixel = window.col, window.row
+    return Sight(raw=raw, ways=ways, steps=(right, down), level=sum(levels) / 2, first=first_pixel)
 
 
 def _on_level(camera: Camera, xy: NDArray[Any], height: float) -> _Doubles:

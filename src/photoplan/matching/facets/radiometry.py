@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ class Transfer:
         new = blank(facets)
         XY = new._nodes.posts
         offsets, gains = self._nodes.sampled(self.offsets, XY), self._nodes.sampled(self.gains, XY)
-        return Transfer(offsets, gains, new.left, new.top, new.pitch)
+        return replace(new, offsets=offsets, gains=gains)
 
     def apply(self, sight: Sight, facets: Facets) -> _Floats:
         """Grey values of a view's pixels in the system of the surface, shape (h, w); NaN off the surface."""
@@ -59,11 +59,12 @@ class Transfer:
         self._tie(system, right, contrast)
         solve_radiometry(system, right)
         offsets, gains = right[:n].reshape(rows, columns), right[n:].reshape(rows, columns)
-        return Transfer(offsets, np.maximum(gains, 0.05), self.left, self.top, self.pitch)
+        return replace(self, offsets=offsets, gains=np.maximum(gains, 0.05))
 
     @property
     def _nodes(self) -> Facets:
-        return Facets(self.left, self.top, self.pitch, (self.offsets.shape[0], self.offsets.shape[1]), 1)
+        rows, columns = self.offsets.shape
+        return Facets(left=self.left, top=self.top, pitch=self.pitch, shape=(rows, columns), ratio=1)
 
     def _lattice(self, facets: Facets) -> tuple[float, float, float]:
         u, v = facets.to_posts((self.left, self.top))
@@ -98,7 +99,8 @@ def blank(facets: Facets) -> Transfer:
     bottom = facets.top - (facets.shape[0] - 1) * facets.pitch
     columns = max(2, int(np.ceil(right / pitch - 1e-6) - first) + 1)
     rows = max(2, int(top - np.floor(bottom / pitch + 1e-6)) + 1)
-    return Transfer(np.zeros((rows, columns)), np.ones((rows, columns)), first * pitch, top * pitch, pitch)
+    offsets, gains = np.zeros((rows, columns)), np.ones((rows, columns))
+    return Transfer(offsets=offsets, gains=gains, left=first * pitch, top=top * pitch, pitch=pitch)
 
 
 def first_guess(sights: Sequence[Sight], facets: Facets) -> list[Transfer]:
@@ -112,9 +114,7 @@ def first_guess(sights: Sequence[Sight], facets: Facets) -> list[Transfer]:
     for own, spread in found:
         new = blank(facets)
         gain = spread / contrast if contrast > 0 and spread > 0.05 * contrast else 1.0
-        out.append(
-            Transfer(new.offsets + np.nan_to_num(own - gain * mean), new.gains * gain, new.left, new.top, new.pitch)
-        )
+        out.append(replace(new, offsets=new.offsets + np.nan_to_num(own - gain * mean), gains=new.gains * gain))
     return out
 
 
@@ -123,4 +123,4 @@ def levelled(transfers: Sequence[Transfer]) -> list[Transfer]:
     own grey values."""
     offset = np.mean([t.offsets for t in transfers], axis=0)
     gain = np.mean([t.gains for t in transfers], axis=0)
-    return [Transfer(t.offsets - t.gains * offset / gain, t.gains / gain, t.left, t.top, t.pitch) for t in transfers]
+    return [replace(t, offsets=t.offsets - t.gains * offset / gain, gains=t.gains / gain) for t in transfers]

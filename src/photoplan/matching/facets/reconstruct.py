@@ -196,7 +196,14 @@ def _opened(
     if len(sights) < 2:
         return None
     transfers, sigmas = _radiometry(own, sights, facets, before)
-    block = FacetBlock(facets, sights, transfers, heights, Roughness.uniform(facets.shape, 1.0), sigmas)
+    block = FacetBlock(
+        facets=facets,
+        sights=sights,
+        transfers=transfers,
+        heights=heights,
+        roughness=Roughness.uniform(facets.shape, 1.0),
+        sigmas=sigmas,
+    )
     block.views, block.scale = own, block.parallax()
     # Loose until it is estimated: from a stiff start, what does not fit would be taken for noise. Curvatures over twice
     # the distance are larger than those to be estimated.

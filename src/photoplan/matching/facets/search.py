@@ -246,7 +246,7 @@ def _level(
     scatter(total, first, low, steps, _PROBABLE * whole, _FAINT, *kept, variance)
     heights = planes.heights(steps, level)
     step = _STEP * 2**level * planes.pixels(heights)
-    return Searched(facets, heights, margin / whole, variance * step**2, nearby)
+    return Searched(facets=facets, heights=heights, margin=margin / whole, variance=variance * step**2, ends=nearby)
 
 
 def _cells(active: NDArray[np.bool_], m: int, shape: tuple[int, int], half: tuple[int, int]) -> NDArray[np.bool_]:
