@@ -42,8 +42,7 @@ def judged(scene: Scene, project: Path, folder: Path, *how: object) -> tuple[flo
         (SHAKEN, 50, 1, 0.06, 1.4),
         (SHAKEN, 10, 1, 0.06, 1.4),
         (CALM, 50, 1, 0.015, 1.2),
-        # What bilinear facets miss of the curvature is not stated.
-        (CALM, 50, 4, 0.018, 1.5),
+        (CALM, 50, 4, 0.015, 1.2),
     ],
     ids=["turbulent", "turbulent, noise", "calm", "calm, strong relief"],
 )

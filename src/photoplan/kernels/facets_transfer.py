@@ -1,4 +1,8 @@
-"""Pixels of an image carried along their rays to a surface of bilinear height facets (direct transfer)."""
+"""Pixels of an image carried along their rays to a surface of height facets (direct transfer).
+
+Rays are followed to bilinear facets, then over to the curved ones: along each axis a facet bends by what the second
+differences around it have in common. So slopes and hills are curved, while an edge is none the rounder.
+"""
 
 from __future__ import annotations
 
@@ -109,6 +113,46 @@ def steepness(posts, out):
 
 
 @inner
+def _bend(a, b, c, d, e, f):
+    """What the second differences of six posts have in common: the least of them; 0 if they bend both ways."""
+    least, most = np.inf, -np.inf
+    for second in (a - 2.0 * b + c, b - 2.0 * c + d, c - 2.0 * d + e, d - 2.0 * e + f):
+        least, most = min(least, second), max(most, second)
+    return max(least, 0.0) + min(most, 0.0)
+
+
+@kernel
+def bends(posts, out):
+    """By how much facets bend: what the second differences at both ends of a side, and at the next posts, have in common.
+
+    `out` has shape (2, rows, columns): of the side from a post to the next along columns, and along rows; 0 near the
+    border.
+    """
+    rows, columns = posts.shape
+    out[:] = 0.0
+    for j in range(rows):
+        for i in range(2, columns - 3):
+            out[0, j, i] = _bend(
+                posts[j, i - 2], posts[j, i - 1], posts[j, i], posts[j, i + 1], posts[j, i + 2], posts[j, i + 3]
+            )
+    for j in range(2, rows - 3):
+        for i in range(columns):
+            out[1, j, i] = _bend(
+                posts[j - 2, i], posts[j - 1, i], posts[j, i], posts[j + 1, i], posts[j + 2, i], posts[j + 3, i]
+            )
+
+
+@inner
+def _bulge(bent, u, v):
+    """How much higher a curved facet is than a bilinear one."""
+    i, j = min(int(u), bent.shape[2] - 2), min(int(v), bent.shape[1] - 2)
+    a, b = u - i, v - j
+    along = (1.0 - b) * bent[0, j, i] + b * bent[0, j + 1, i]
+    down = (1.0 - a) * bent[1, j, i] + a * bent[1, j, i + 1]
+    return -0.5 * (a * (1.0 - a) * along + b * (1.0 - b) * down)
+
+
+@inner
 def _hit(posts, steep, u, v, ku, kv, qu, qv, top, bottom, slope, z):
     """Where a ray first meets the surface: at once where all below the ray from above is gentle, else by a search from
     above; z: about there."""
@@ -127,7 +171,7 @@ def _hit(posts, steep, u, v, ku, kv, qu, qv, top, bottom, slope, z):
 
 
 @kernel
-def transfer(ways, right, down, posts, steep, wall, out):
+def transfer(ways, right, down, posts, bent, steep, wall, out):
     """Where the rays of all pixels of a window first meet the surface: what hides behind it is met by none.
 
     Parameters
@@ -139,8 +183,8 @@ def transfer(ways, right, down, posts, steep, wall, out):
         Pixels between neighbours of the lattice, whose first one is the window's first pixel.
     posts : ndarray, shape (m, n)
         Heights, metres, none of them NaN.
-    steep : ndarray
-        See `steepness`.
+    bent, steep : ndarray
+        See `bends` and `steepness`.
     wall : float
         Times by which pixels lie closer on a facet than on level ground beyond which they are left out; infinite: none.
     out : ndarray, shape (height, width, 4), float32
@@ -184,7 +228,9 @@ def transfer(ways, right, down, posts, steep, wall, out):
                     towards = max(1.0 - _rise(posts, u, v, ku, kv), _GRAZING)
                     if towards > wall:
                         continue
-                    out[r, c, 0], out[r, c, 1] = u, v
+                    higher = _bulge(bent, u, v) / towards
+                    out[r, c, 0] = min(max(u + higher * ku, 0.0), columns - 1.0)
+                    out[r, c, 1] = min(max(v + higher * kv, 0.0), rows - 1.0)
                     out[r, c, 2], out[r, c, 3] = ku / towards, kv / towards
                 if np.isnan(z):
                     z = 0.5 * (top + bottom)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Camera, project, tremor_of
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.facets_transfer import CELL, steepness, transfer
+from photoplan.kernels.facets_transfer import CELL, bends, steepness, transfer
 from photoplan.matching.facets.pyramid import Pyramid
 
 _Floats = NDArray[np.float32]
@@ -122,7 +122,9 @@ class Sight:
         places = np.empty((*self.raw.shape, 4), np.float32)
         steep = np.empty((-(-(heights.shape[0] - 1) // CELL), -(-(heights.shape[1] - 1) // CELL)))
         steepness(heights, steep)
-        transfer(self.ways, *self.steps, heights - self.level, steep, _WALL, places)
+        bent = np.empty((2, *heights.shape))
+        bends(heights, bent)
+        transfer(self.ways, *self.steps, heights - self.level, bent, steep, _WALL, places)
         return replace(self, places=places, on=heights)
 
 
