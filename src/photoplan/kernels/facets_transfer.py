@@ -123,7 +123,7 @@ def _bend(a, b, c, d, e, f):
 
 @kernel
 def bends(posts, out):
-    """By how much facets bend: what the second differences at the ends of a side, and at the next posts, have in common.
+    """By how much facets bend: what second differences at the ends of a side, and at the next posts, have in common.
 
     `out` has shape (2, rows, columns): of the side from a post to the next along columns, and along rows; 0 near the
     border.
