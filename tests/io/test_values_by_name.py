@@ -17,21 +17,13 @@ ROOT = Path(photoplan.__file__).parent
 MOST = 4
 #: Files that still build larger ones so.
 BY_ORDER = {
-    "cameras/line_correctable.py",
     "products/surface/plan.py",
     "products/surface/target.py",
 }
 #: Parameters that are tuples of different things, and what they are.
 BUNDLES = {
-    "io/orientation/text.py angle_block own": "the conventions of a format, a constant of its module",
-    "io/product_check.py _compare wanted": "pixels and their validity, as a tile has them",
-    "matching/refine.py work task": "an item of a step, handed over by `map`",
-    "products/mtf/patterns.py _measure named": "a field of its result",
     "products/surface/job.py _view target": "one key of a cache",
-    "radiometry/seams.py solve item": "an item of a step, handed over by `map`",
 }
-#: Modules that import each other, one of them for types alone.
-CIRCLES = [("cameras/line_tremor.py", "cameras/line.py")]
 _Name = tuple[str, str]
 
 
@@ -95,6 +87,4 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
                 places = [f"{node.module}.{each.name}" for each in node.names] + [node.module]
                 named = {f"{place.removeprefix('photoplan.').replace('.', '/')}.py" for place in places if place}
                 ways.setdefault(path, set()).update(named)
-    for path, far in CIRCLES:
-        ways[path].remove(far)
     TopologicalSorter(ways).prepare()

@@ -57,7 +57,7 @@ class LineCamera:
         return self if self.breaks is None else self.breaks.smooth
 
     @cached_property
-    def breaks(self) -> LineTremor | None:
+    def breaks(self) -> LineTremor[LineCamera] | None:
         """What of a turbulent flight changes from line to line; None: the trajectory is smooth."""
         if not self.track.per_line:
             return None

@@ -107,7 +107,16 @@ class CorrectableLine:
             sigma = np.repeat([p.boresight, p.lever_arm, p.time_offset], [3, 3, 1])[free]
             values = np.concatenate([start.boresight, start.lever_arm, [start.time_offset]])[free]
             names = tuple(f"{MOUNT[k]} of {{}}" for k in free)
-            sets.append(Corrections(self.keys[0], (self.mount,), names, values[None], prior_rows(sigma), "mount"))
+            sets.append(
+                Corrections(
+                    key=self.keys[0],
+                    owners=(self.mount,),
+                    parameters=names,
+                    values=values[None],
+                    known=prior_rows(sigma),
+                    owner="mount",
+                )
+            )
         if spline is not None:
             count = len(spline.coefficients)
             size = np.tile(np.repeat([p.position, p.attitude], 3), count)
@@ -120,7 +129,11 @@ class CorrectableLine:
             began = start.spline
             same = began is not None and began.coefficients.shape == spline.coefficients.shape
             values = began.coefficients if began is not None and same else spline.coefficients
-            sets.append(Corrections(self.keys[1], owners, _SPLINE, values, rows, "knot"))
+            sets.append(
+                Corrections(
+                    key=self.keys[1], owners=owners, parameters=_SPLINE, values=values, known=rows, owner="knot"
+                )
+            )
         return tuple(sets)
 
     def correction(self, values: Mapping[str, _Floats]) -> LineCorrection:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
+from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.line_sight import LineSight, to_sphere
+from photoplan.cameras.base import Camera
+from photoplan.cameras.line_look import LineLook
+from photoplan.cameras.line_sight import FOUND, LineSight, to_sphere
 from photoplan.cameras.line_straight import StraightFlight
 from photoplan.cameras.line_track import LineTrack
+from photoplan.geometry.body import BodyGround
 from photoplan.geometry.motion import Course, rotations
-
-if TYPE_CHECKING:
-    from photoplan.cameras.line import LineCamera
+from photoplan.geometry.near import NearGround
 
 _Floats = NDArray[np.float64]
 _Rows = NDArray[np.int64]
@@ -50,13 +51,34 @@ class Moments:
     """Position in the image, (k, 2)."""
 
 
+class _LineImage(Camera, Hashable, Protocol):
+    """What is asked of an image of a line here."""
+
+    @property
+    def track(self) -> LineTrack: ...
+    @property
+    def look(self) -> LineLook: ...
+    @property
+    def ground(self) -> BodyGround: ...
+    @property
+    def near(self) -> NearGround: ...
+    @property
+    def sight(self) -> LineSight: ...
+    def along(self, track: LineTrack) -> Self: ...
+    def seen_from(self, P: _Floats, close: float = FOUND) -> _Floats: ...
+    def moments(self, XYZ: ArrayLike) -> Moments: ...
+
+
+_L = TypeVar("_L", bound=_LineImage)
+
+
 @dataclass(frozen=True, eq=False)
-class LineTremor:
+class LineTremor(Generic[_L]):
     """A trajectory as a smooth one, and shifts against it that change from line to line (see `cameras.base.Tremor`)."""
 
-    smooth: LineCamera
+    smooth: _L
     """As the smooth part of the trajectory would see the ground."""
-    rough: LineCamera
+    rough: _L
     """The whole."""
     largest: _Floats
     """Largest shifts along x and y of blocks of lines, the first before, the last behind the image, (k, 2), pixels."""
@@ -74,7 +96,7 @@ class LineTremor:
         if last <= first:
             return None
         first, last = max(first // _SHARED * _SHARED, int(np.floor(begin))), -(-last // _SHARED) * _SHARED
-        return _straight_part(self, first, min(last, int(np.ceil(end))))
+        return _straight_part(self.rough, first, min(last, int(np.ceil(end))))
 
     def _rows(self, low: float, high: float) -> tuple[int, int]:
         """First and last row at which anything can be seen that the smooth part sees from row `low` to `high` on."""
@@ -154,7 +176,7 @@ class StraightPart:
     """
 
     smooth: StraightFlight
-    rough: LineCamera
+    rough: _LineImage
     rows: tuple[int, int]
 
     def shifts(self, columns: _Floats, rows: _Floats, heights: Sequence[float]) -> _Floats:
@@ -197,15 +219,15 @@ class StraightPart:
 
 
 @lru_cache(maxsize=64)
-def _straight_part(tremor: LineTremor, first: int, last: int) -> StraightPart:
-    return StraightPart(_straightened(tremor.rough, first, last), tremor.rough, (first, last))
+def _straight_part(rough: _LineImage, first: int, last: int) -> StraightPart:
+    return StraightPart(_straightened(rough, first, last), rough, (first, last))
 
 
-def smoothed(camera: LineCamera) -> LineTremor | None:
+def smoothed(camera: _L) -> LineTremor[_L] | None:
     """A trajectory without what changes from line to line, and that; None: there is next to nothing of it."""
     knots = _KNOTS
     while True:
-        smooth = replace(camera, track=_smooth_track(camera.track, knots))
+        smooth = camera.along(_smooth_track(camera.track, knots))
         largest, even = _largest(camera, smooth)
         if even or knots >= 2 * camera.track.lines:
             break
@@ -213,7 +235,7 @@ def smoothed(camera: LineCamera) -> LineTremor | None:
     return LineTremor(smooth, camera, largest) if largest[1:-1].max() > _LEAST else None
 
 
-def _straightened(camera: LineCamera, first: int, last: int) -> StraightFlight:
+def _straightened(camera: _LineImage, first: int, last: int) -> StraightFlight:
     """Positions at an even speed and one attitude, as the lines from `first` to `last` have on average."""
     start, poses = camera.track.poses
     some = poses[first - start : last + 1 - start]
@@ -264,7 +286,7 @@ def _by_rows(track: LineTrack, positions: Course, attitudes: Course) -> LineTrac
     )
 
 
-def _largest(camera: LineCamera, calm: LineCamera) -> tuple[_Floats, bool]:
+def _largest(camera: _LineImage, calm: _LineImage) -> tuple[_Floats, bool]:
     """Largest shifts of blocks of lines, (k, 2), and whether the smooth part flies evenly.
 
     The first block lies before the image, the last behind it.

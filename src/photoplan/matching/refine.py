@@ -71,6 +71,17 @@ class Refined:
     """Median of the correlations of those that are kept."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Points that a reference image has in common with another."""
+
+    a: int
+    b: int
+    first: NDArray[np.int64]
+    """Rows of the points in the one, (n,)."""
+    second: NDArray[np.int64]
+
+
 def disc(radius: int) -> NDArray[np.float64]:
     """Weights of a round patch, shape (2 radius + 1, 2 radius + 1)."""
     v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1]
@@ -201,26 +212,25 @@ def refine_tracks(
         Does the work image by image, as `map` does: it may use threads.
     """
     reference = reference_points(tracks, [g.size for g in images])
-    tasks = [(a, b, first, second) for a, b, first, second in _image_pairs(tracks, reference)]
+    pairs = list(_image_pairs(tracks, reference))
 
-    def work(task: tuple[int, int, NDArray[np.int64], NDArray[np.int64]]) -> Matched:
-        a, b, first, second = task
-        return _match_points(tracks, images, (a, b), (first, second), settings)
+    def work(pair: _Pair) -> Matched:
+        at = np.rint(tracks.xy[pair.first]).astype(np.int64)
+        affine = local_affines(tracks, pair.first, pair.second)
+        near = tracks.xy[pair.second] + np.einsum("nij,nj->ni", affine, at - tracks.xy[pair.first])
+        return match_between((images[pair.a], images[pair.b]), at, (near, affine), settings)
 
     xy = tracks.xy.copy()
     xy[reference] = np.rint(xy[reference])
     variance = np.full((len(tracks), 2), np.nan)
     correlation = np.full(len(tracks), np.nan)
-    for (_, _, _, second), found in zip(tasks, run(work, tasks)):
-        xy[second], correlation[second] = found.xy, found.correlation
-        variance[second] = found.covariance[:, [0, 1], [0, 1]] / 2 * factor**2
-    return _accepted(tracks, reference, (xy, variance, correlation), settings)
+    for pair, found in zip(pairs, run(work, pairs)):
+        xy[pair.second], correlation[pair.second] = found.xy, found.correlation
+        variance[pair.second] = found.covariance[:, [0, 1], [0, 1]] / 2 * factor**2
+    return _accepted(tracks, reference, xy, variance, correlation, settings)
 
 
-def _image_pairs(
-    tracks: Tracks, reference: NDArray[np.int64]
-) -> Iterator[tuple[int, int, NDArray[np.int64], NDArray[np.int64]]]:
-    """Reference image, other image, and the rows of their points in common tracks."""
+def _image_pairs(tracks: Tracks, reference: NDArray[np.int64]) -> Iterator[_Pair]:
     other = np.setdiff1d(np.arange(len(tracks)), reference)
     first = reference[tracks.track[other]]
     key = np.stack([tracks.image[first], tracks.image[other]], axis=1)
@@ -228,30 +238,17 @@ def _image_pairs(
     which = which.reshape(-1)
     for k, (a, b) in enumerate(pairs):
         rows = which == k
-        yield int(a), int(b), first[rows], other[rows]
-
-
-def _match_points(
-    tracks: Tracks,
-    images: Sequence[Grey],
-    pair: tuple[int, int],
-    rows: tuple[NDArray[np.int64], NDArray[np.int64]],
-    settings: RefineSettings,
-) -> Matched:
-    first, second = rows
-    affine = local_affines(tracks, first, second)
-    at = np.rint(tracks.xy[first]).astype(np.int64)
-    near = tracks.xy[second] + np.einsum("nij,nj->ni", affine, at - tracks.xy[first])
-    return match_between((images[pair[0]], images[pair[1]]), at, (near, affine), settings)
+        yield _Pair(int(a), int(b), first[rows], other[rows])
 
 
 def _accepted(
     tracks: Tracks,
     reference: NDArray[np.int64],
-    found: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    xy: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    correlation: NDArray[np.float64],
     settings: RefineSettings,
 ) -> Refined:
-    xy, variance, correlation = found
     is_reference = np.zeros(len(tracks), bool)
     is_reference[reference] = True
     settled = np.isfinite(correlation)

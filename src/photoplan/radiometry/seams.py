@@ -185,14 +185,16 @@ class _Level:
         """Expand images part by part till none gains, and parts again that a neighbour has changed; labels change."""
         changed: list[list[_Box]] = [[outer] for _, outer in self._parts]
 
-        def solve(item: tuple[int, list[_Box]]) -> tuple[_Box, _Labels] | None:
+        asked: dict[int, list[_Box]] = {}
+
+        def solve(k: int) -> tuple[_Box, _Labels] | None:
             """What becomes of a part in which boxes have changed: where labels are new, and which; None: nowhere."""
-            outer = self._parts[item[0]][1]
+            outer = self._parts[k][1]
             part, wide = self.part(outer, 1), grown(outer, 1, self.shape)
             free = np.zeros(wide[2:], np.bool_)
             free[_slices(outer, wide)] = True if near is None else near[_slices(outer)]
             before = labels[_slices(wide)]
-            after = part.settled(before, free, [(b[0] - wide[0], b[1] - wide[1], *b[2:]) for b in item[1]])
+            after = part.settled(before, free, [(b[0] - wide[0], b[1] - wide[1], *b[2:]) for b in asked[k]])
             at = np.argwhere(after != before)
             if not len(at):
                 return None
@@ -202,10 +204,10 @@ class _Level:
 
         for _ in range(_SWEEPS):
             for group in self._apart:
-                items = [(k, changed[k]) for k in group if changed[k] and self._asked(k, near)]
+                asked = {k: changed[k] for k in group if changed[k] and self._asked(k, near)}
                 for k in group:
                     changed[k] = []
-                for (k, _), found in zip(items, list(run(solve, items)), strict=True):
+                for k, found in zip(asked, list(run(solve, asked)), strict=True):
                     if found is None:
                         continue
                     box, labels[_slices(found[0])] = found

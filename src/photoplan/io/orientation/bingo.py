@@ -13,11 +13,10 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, name_losses, require_map
-from photoplan.io.orientation.table import Direction, TableFormat
+from photoplan.io.orientation.table import TableFormat
 from photoplan.io.orientation.text import angle_block, angle_lines, word_lines
 
 #: Angle unit, rotation, direction.
-OWN: tuple[str, str, Direction] = ("gon", "pok", "camera-to-ground")
 KEYWORD = "ORIA"
 #: Characters of an image name that BINGO takes at most (Catalyst's guide on export to BINGO).
 NAME = 15
@@ -38,7 +37,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     ]
     if not rows:
         raise InputError(f"{path}: no line begins with {KEYWORD}; this is no orientation file of BINGO")
-    return angle_block(path, form, rows, OWN)
+    return angle_block(path, form, rows)
 
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:

@@ -12,11 +12,10 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, require_map
-from photoplan.io.orientation.table import Direction, TableFormat
+from photoplan.io.orientation.table import TableFormat
 from photoplan.io.orientation.text import angle_block, angle_lines, word_lines
 
 #: Angle unit, rotation, direction.
-OWN: tuple[str, str, Direction] = ("gon", "pok", "camera-to-ground")
 COLUMNS = 7
 #: Characters of a name.
 NAME = 20
@@ -44,7 +43,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
             )
         # What follows are standard deviations or a camera's number.
         rows.append((line, line.words[0], line.words[1:COLUMNS]))
-    return angle_block(path, form, rows, OWN)
+    return angle_block(path, form, rows)
 
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock
-from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.plain_files import read_text
 from photoplan.io.table_lines import number
 
@@ -86,10 +86,8 @@ def checked_rotation(values: ArrayLike, where: str, tolerance: float = ORTHOGONA
     return np.asarray(U @ Vt, np.float64)
 
 
-def angle_block(
-    path: Path, form: TableFormat, rows: Sequence[tuple[Words, str, Sequence[str]]], own: tuple[str, str, Direction]
-) -> OrientationBlock:
-    """Block of lines with a name, X, Y, Z and φ, ω, κ in this order.
+def angle_block(path: Path, form: TableFormat, rows: Sequence[tuple[Words, str, Sequence[str]]]) -> OrientationBlock:
+    """Block of lines as `angle_lines` writes them: a name, X, Y, Z and φ, ω, κ in this order.
 
     Parameters
     ----------
@@ -97,15 +95,13 @@ def angle_block(
         What the user declares against the format's own conventions.
     rows : sequence of (Words, str, sequence of str)
         Line, name and six numbers as text.
-    own : tuple
-        Angle unit, rotation and direction that the format defines.
 
     Raises
     ------
     InputError
         A number is missing or is none, or an angle is more than a full circle.
     """
-    unit, rotation, direction = form.conventions(*own)
+    unit, rotation, direction = form.conventions("gon", "pok", "camera-to-ground")
     images = []
     for line, name, words in rows:
         X, Y, Z, phi, omega, kappa = numbers(words, line.where, f"image {name!r}: X, Y, Z, phi, omega, kappa", 6)

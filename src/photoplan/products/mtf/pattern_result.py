@@ -23,8 +23,9 @@ from photoplan.quality.patterns.usaf import UsafBars, UsafResult
 class PatternResult:
     """One pattern in one channel."""
 
-    image: tuple[str, Path]
-    """Name, which no other image of the report has, and file."""
+    image: str
+    """Name, which no other image of the report has."""
+    file: Path
     band: str
     window: Window
     """All that was measured lies in it."""
@@ -41,7 +42,7 @@ class PatternResult:
     def name(self) -> str:
         """Names it within the report."""
         w = self.window
-        return f"{self.image[0]}, {self.band}, column {w.col}, row {w.row}, {w.width} × {w.height}"
+        return f"{self.image}, {self.band}, column {w.col}, row {w.row}, {w.width} × {w.height}"
 
     def curves(self) -> dict[str, tuple[str, MtfCurve]]:
         """Curves by name: ``mtf`` or ``contrast``, and the curve."""
@@ -77,7 +78,7 @@ class PatternResult:
 
     def rows(self) -> Iterator[list[object]]:
         """Rows of the table: curve, direction, group, element, frequency, value, standard deviation, resolved."""
-        head = [self.image[0], self.band, self.window.col, self.window.row]
+        head = [self.image, self.band, self.window.col, self.window.row]
         if isinstance(self.found, UsafResult):
             for bars in self.found.bars:
                 kind = [_kind(bars), bars.group, bars.element, bars.frequency, bars.lp_mm, bars.contrast, bars.sigma]

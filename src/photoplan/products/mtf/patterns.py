@@ -78,7 +78,7 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
             image = LightImage.open(path, linearisation)
             if request.linearisation is None and image.reader.dtype == "uint8":
                 encoded = True
-            results.append(_measure((names[path], path), image, request))
+            results.append(_measure(names[path], image, request))
         except (ResourceError, UsageError):
             raise
         except PhotoplanError as error:
@@ -147,10 +147,9 @@ def _read(image: LightImage, window: Window, channel: int) -> tuple[Array, NDArr
     return light, clipped
 
 
-def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest) -> ImagePattern:
-    """The patterns of an image, by its name and file, in every channel that is asked for."""
-    name, path = named
-    results: list[PatternResult] = []
+def _measure(name: str, image: LightImage, request: PatternRequest) -> ImagePattern:
+    """The patterns of an image in every channel that is asked for."""
+    path, results = image.reader.path, list[PatternResult]()
     windows = _windows(image, request.rois)
     levels = _levels(image.linearisation, image.reader.dtype, request.levels)
     for channel in image.channels(request.band):
@@ -167,7 +166,8 @@ def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest
             parts = tuple(window for _, window in sorted(zip(groups, windows), key=lambda part: part[0].frequency))
             results.append(
                 PatternResult(
-                    image=named,
+                    image=name,
+                    file=path,
                     band=band,
                     window=_hull(windows),
                     found=curve,
@@ -183,12 +183,20 @@ def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest
             if request.pattern == "star":
                 rules = StarRules(sectors=request.sectors, levels=levels)
                 found = measure_star(light, rules, clipped=clipped, what=what)
-                results.append(PatternResult(named, band, window, found, pixel_um=request.pixel_um))
+                results.append(PatternResult(name, path, band, window, found=found, pixel_um=request.pixel_um))
             else:
                 usaf = UsafRules(request.group, None if request.group is not None else request.pixel_um)
                 target = measure_usaf(light, usaf, clipped=clipped, what=what)
                 results.append(
-                    PatternResult(named, band, window, target, pixel_um=request.pixel_um, notes=_stretched(light))
+                    PatternResult(
+                        image=name,
+                        file=path,
+                        band=band,
+                        window=window,
+                        found=target,
+                        pixel_um=request.pixel_um,
+                        notes=_stretched(light),
+                    )
                 )
     return ImagePattern(
         name=name, file=path, size=image.size, linearisation=image.linearisation.describe(), results=tuple(results)

@@ -198,7 +198,7 @@ def _marks(result: PatternResult) -> list[tuple[tuple[float, float], str, bool]]
 
 def _light(result: PatternResult, linearisation: Linearisation) -> NDArray[np.float32]:
     """Light of the pattern's window, one of some pixels."""
-    image = LightImage.open(result.image[1], linearisation)
+    image = LightImage.open(result.file, linearisation)
     step = _thinning(result.window)
     return np.asarray(image.picture(result.window, image.channels(None)[0]).grey[::step, ::step], np.float32)
 
