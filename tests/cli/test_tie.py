@@ -12,6 +12,7 @@ from tools.real_projects import drone_project
 
 from photoplan.io.image_points import read_image_points
 from photoplan.io.project.file import load_project
+from photoplan.io.run_record import record_path
 from photoplan.products.tie import inputs as tie_work
 
 NEAR = ("DJI_0025", "DJI_0026", "DJI_0033")
@@ -66,8 +67,9 @@ def test_another_run_begins_with_what_is_known(
     """Features and matches are kept for other numbers of points too; a damaged file costs only time."""
     output = tmp_path / "b.csv"
     options = ["tie", project, *names(*NEAR[:2]), *FAST, "-o", output, "--no-refine", "--no-picture"]
+    record = record_path(output)
     assert photoplan(*options).code == 0
-    content = output.read_bytes()
+    content, key = output.read_bytes(), json.loads(record.read_text())["key"]
 
     def never(*_: object, **__: object) -> None:
         raise AssertionError("features and matches are kept")
@@ -76,8 +78,10 @@ def test_another_run_begins_with_what_is_known(
         patch.setattr(tie_work, "extract_features", never)
         patch.setattr(tie_work, "match_features", never)
         assert photoplan(*options, "--overwrite", "--per-image", 20).code == 0
-        assert output.read_bytes() != content
+        assert output.read_bytes() != content and json.loads(record.read_text())["key"] != key
         assert photoplan(*options, "--overwrite").code == 0
+    # Meanwhile the project has got the table: that moves no point.
+    assert json.loads(record.read_text())["key"] == key
     assert output.read_bytes() == content
     kept = output.with_suffix(".matches")
     kept.write_bytes(kept.read_bytes()[:200])

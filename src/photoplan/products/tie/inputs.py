@@ -5,7 +5,6 @@ Images and pairs are tasks; their features and verified matches are kept on the 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -38,7 +37,6 @@ from photoplan.matching.pairs import (
     pairs_by_footprints,
     pairs_by_likeness,
 )
-from photoplan.matching.tracks import Tracks
 from photoplan.matching.verify import Calibration, PairMatches, VerifySettings, verify_pair
 from photoplan.project.ground import ground_of
 from photoplan.project.image_size import check_camera_size
@@ -274,6 +272,11 @@ class FeatureStore:
     def __getitem__(self, k: int) -> Features:
         return self._cached(k)
 
+    @property
+    def seen(self) -> list[tuple[str, ...]]:
+        """What matches of each image depend on beside the settings."""
+        return [(*name, repr(i.calibration), _place(i)) for name, i in zip(self.names, self.images)]
+
 
 def find_features(store: FeatureStore, run: Steps) -> list[Features]:
     """Features of all images, without their descriptors."""
@@ -305,18 +308,10 @@ def find_pairs(
     order = {first: number for number, first in enumerate(dict.fromkeys(i for i, _ in pairs))}
     # Pairs with a common first image follow each other: its features are in memory then.
     pairs = sorted(pairs, key=lambda pair: order[pair[0]])
-    known = [(*store.names[k], repr(i.calibration), _place(i)) for k, i in enumerate(store.images)]
-    names = [("pair", known[i], known[j]) for i, j in pairs]
+    seen = store.seen
+    names = [("pair", seen[i], seen[j]) for i, j in pairs]
     found = run(lambda pair: _pair(store, pair[0], pair[1], settings), pairs, names)
     return [PairMatches(i, j, features, tried) for (i, j), (features, tried) in zip(pairs, found)]
-
-
-def digest_of(tracks: Tracks, *more: object) -> str:
-    """Digest of places that are to be refined, and of whatever else decides the result."""
-    digest = hashlib.sha256(repr(more).encode())
-    for values in (tracks.track, tracks.image, tracks.xy, tracks.scale, tracks.angle):
-        digest.update(np.ascontiguousarray(values).tobytes())
-    return digest.hexdigest()
 
 
 def _place(image: TieImage) -> str:

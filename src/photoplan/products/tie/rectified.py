@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,15 +102,10 @@ class MapView:
         """Width and height in pixels of the map."""
         return self.grid.width, self.grid.height
 
-    @property
-    def field(self) -> None:
-        """Maps are ideal."""
-        return None
-
-    @property
-    def breaks(self) -> None:
-        """Maps are smooth."""
-        return None
+    field: ClassVar[None] = None
+    """Maps are ideal."""
+    breaks: ClassVar[None] = None
+    """Maps are smooth."""
 
     @property
     def center(self) -> _Floats:

@@ -23,7 +23,7 @@ from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.io.result_log import ResultLog
-from photoplan.io.run_record import input_entry, run_times, write_run_record
+from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
 from photoplan.matching.features import FeatureSettings, opencv
 from photoplan.matching.grey import Grey, ReducedImage
 from photoplan.matching.loops import Loops, close_loops
@@ -36,7 +36,6 @@ from photoplan.products.tie.inputs import (
     FeatureStore,
     TieImage,
     chosen_pairs,
-    digest_of,
     find_features,
     find_pairs,
     like_pairs,
@@ -171,6 +170,8 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     log = ResultLog(output.with_suffix(".matches"), f"{_FORM} {settings} {verify}", lock_of(output))
     with log, steps(output.name, request.workers, events, log) as run:
         store = FeatureStore(tuple(images), settings, log)
+        decides = [names, store.seen, settings, verify, pairs, request.per_image, request.refine]
+        key = run_key("tie points", decides, ())
         events.begin("features", len(images), "images")
         features = find_features(store, run)
         pairs = like_pairs(store) if pairs is None else pairs
@@ -180,7 +181,6 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
         found = build_tracks(features, verified, same=1.5 * factor)
         sizes = [image.grey.size for image in images]
         spare = found.tracks.of_tracks(thin_tracks(found.tracks, sizes, round(_SPARE * request.per_image)))
-        key = digest_of(spare, store.names, factor, request.refine, request.per_image)
         events.begin("refining", unit="pairs")
         tracks, refined, loops = _refine(request, spare, images, factor, run.under(key))
     tracks = tracks.of_tracks(thin_tracks(tracks, sizes, request.per_image))
