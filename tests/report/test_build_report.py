@@ -4,6 +4,7 @@ import re
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from tools.sketched import drawn
 
 from photoplan.errors import ResourceError, UsageError
 from photoplan.kernels.collocation import correlation
+from photoplan.products.dtm.build import BuildReport
 from photoplan.report.dtm import covariance as dtm_covariance
 from photoplan.report.dtm import samples
 from photoplan.report.dtm.page import build_page, open_build_report
@@ -67,15 +69,29 @@ def built(measured):
 
 
 @pytest.fixture(scope="module")
-def facts(built, measured):
+def model(built, measured):
     findings = [Finding("crossing heights", f"{HOSTILE} meets {k}", 300_010.0, 5_000_010.0) for k in range(60)]
-    return samples.build_facts("model", built, measured, findings, (), 12.3)
+    figures = {"seconds": 12.3}
+    return BuildReport(
+        path=Path("model.gpkg"),
+        figures=figures,
+        gross=(),
+        suspects=(),
+        findings=findings,
+        built=built,
+        measured=measured,
+    )
 
 
 @pytest.fixture(scope="module")
-def document(facts):
+def facts(built, measured):
+    return samples.samples_of(built, measured)
+
+
+@pytest.fixture(scope="module")
+def document(model, facts):
     with drawn():
-        return build_page(facts)
+        return build_page(model, (), facts)
 
 
 def test_nothing_outside_the_document_is_asked_for(document):
@@ -119,12 +135,12 @@ def test_measured_minus_filtered_heights_are_the_noise(facts):
     assert abs(np.corrcoef(mass.xy[:, 0], mass.differences)[0, 1]) < 0.15
 
 
-def test_headline_figures(facts, document):
-    assert dict(facts.counts)["mass points"] == 700
-    assert facts.units == sum(n for _, n in facts.widths) >= 9
-    assert facts.whole.noise == pytest.approx(NOISE, rel=0.3)
-    assert 0.8 < facts.spread < 1.2
-    for words in ("700", "12.3 s", f"{facts.whole.noise:.3f} m", facts.whole.name):
+def test_headline_figures(facts, built, document):
+    whole, full = built.fit.whole, [f for f in built.figures if f.meshes > 0]
+    assert whole.noise == pytest.approx(NOISE, rel=0.3)
+    assert 0.8 < facts.spread < 1.2 and len(full) >= 9
+    empty = f"{len(built.figures) - len(full)} units are empty"
+    for words in ("mass points 700", str(len(full)), empty, "12.3 s", f"{whole.noise:.3f} m", whole.name):
         assert words in "".join(Page(document).words)
 
 
@@ -149,8 +165,8 @@ def test_many_findings_are_counted(document):
 
 @pytest.mark.slow
 @pytest.mark.drawn
-def test_the_same_model_has_the_same_report(facts, document):
-    assert build_page(facts) == document
+def test_the_same_model_has_the_same_report(model, facts, document):
+    assert build_page(model, (), facts) == document
 
 
 def test_every_plot_names_its_units(facts):
@@ -214,16 +230,16 @@ def test_neighbourhoods_that_a_breakline_parts_are_left_out(built):
     assert len(dtm_covariance._block(fit, far)[0]) > 1000
 
 
-def test_covariance_classes_use_all_pairs_once(facts):
+def test_covariance_classes_use_all_pairs_once(facts, built):
     c = facts.covariance
     assert (np.diff(c.classes[c.pairs > 0]) > 0).all()
-    whole = facts.whole
+    whole = built.fit.whole
     assert c.whole[0] == pytest.approx(whole.variance)
     assert c.whole[np.argmin(np.abs(c.distance - whole.length))] == pytest.approx(whole.variance / 2, rel=0.05)
     assert (c.low <= c.high).all()
 
 
-def test_covariances_that_differ_from_what_is_expected_are_told(facts):
+def test_covariances_that_differ_from_what_is_expected_are_told(model, facts):
     """Not by chance, not below the noise; in the page as in what the command prints."""
     good = facts.covariance
     assert 0.5 < good.ratio < 2 and good.warning == ""
@@ -232,18 +248,16 @@ def test_covariances_that_differ_from_what_is_expected_are_told(facts):
         assert bad.ratio == pytest.approx(1 / factor)
         assert f"{good.expected[0]:.3g} m²" in bad.warning and bad.warning.endswith(word)
         assert replace(bad, noise=1e3).warning == ""
-    page = Page(build_page(replace(facts, covariance=bad)))
+    page = Page(build_page(model, (), replace(facts, covariance=bad)))
     assert bad.warning in page.words
     nothing = replace(good, empirical=good.empirical * np.nan, pairs=0 * good.pairs)
     assert np.isnan(nothing.ratio) and nothing.warning == ""
 
 
-def test_settings_name_the_grid_that_is_built(facts, built):
-    widths = {width for width, _ in facts.widths}
-    assert min(widths) == built.plan.finest == built.plan.width / 2
-    assert dict(facts.settings)["grid width"].startswith(
-        f"{built.plan.width:g} m, {built.plan.finest:g} m where breaklines pass"
-    )
+def test_settings_name_the_grid_that_is_built(document, built):
+    finest = min(built.plan.layout.side / f.meshes for f in built.figures if f.meshes > 0)
+    assert finest == built.plan.finest == built.plan.width / 2
+    assert f"{built.plan.width:g} m, {finest:g} m where breaklines pass" in "".join(Page(document).words)
 
 
 def test_without_matplotlib_the_message_says_how_to_get_it(tmp_path, monkeypatch):
@@ -254,7 +268,6 @@ def test_without_matplotlib_the_message_says_how_to_get_it(tmp_path, monkeypatch
 
 def test_a_full_disk_leaves_the_old_report(document, tmp_path, monkeypatch):
     import errno
-    from pathlib import Path
 
     path = tmp_path / "model.report.html"
     path.write_text("old")
@@ -275,19 +288,18 @@ def test_work_is_bounded(built, measured, monkeypatch):
     monkeypatch.setattr(samples, "_RESIDUALS", 60)
     monkeypatch.setattr(samples, "_VERTICES", 20)
     monkeypatch.setattr(samples, "_SIDE", 64)
-    facts = samples.build_facts("model", built, measured, (), (), 1.0)
+    facts = samples.samples_of(built, measured)
     assert len(facts.effects[0].differences) <= 50 and facts.effects[0].count == 699
     assert len(facts.normalised) <= 60
     assert max(facts.map.heights.shape) <= 65
     assert sum(len(xy) for _, xy in facts.map.lines) <= 22
 
 
-def test_file_is_named_and_titled_after_the_model(built, measured, tmp_path):
+def test_file_is_named_and_titled_after_the_model(model, facts, tmp_path):
     path = tmp_path / "dam.report.html"
     source = tmp_path / "survey <1>.csv"
     source.write_text("x")
-    facts = samples.build_facts("dam", built, measured, (), (source,), 1.0)
-    ReportFile(path).write(build_page(facts))
+    ReportFile(path).write(build_page(replace(model, path=tmp_path / "dam.gpkg"), (source,), facts))
     page = path.read_text("utf-8")
     assert re.search("<h1>dam</h1>", page)
     assert "survey &lt;1&gt;.csv" in page

@@ -54,7 +54,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     from photoplan.io.naming import together
     from photoplan.products.dtm.build import describe_plan, dtm_build, load, plan_facts
     from photoplan.report.dtm.page import build_page, open_build_report
-    from photoplan.report.dtm.samples import build_facts
+    from photoplan.report.dtm.samples import samples_of
     from photoplan.terrain.build import plan_build
 
     wanted = options.pop("report")
@@ -78,9 +78,8 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
             built = dtm_build(request, events)
         report, warning = None, ""
         if page is not None:
-            title, seconds = request.output.stem, built.figures["seconds"]
-            facts = build_facts(title, built.built, built.measured, built.findings, request.inputs, seconds)
-            report, warning = page.write(build_page(facts)), facts.covariance.warning
+            samples = samples_of(built.built, built.measured)
+            report, warning = page.write(build_page(built, request.inputs, samples)), samples.covariance.warning
     if as_json:
         show_json(built, report=report)
         return

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from photoplan.geometry.crs import crs_label
 from photoplan.io.product import check_output
+from photoplan.products.dtm.build import BuildReport
 from photoplan.report.drawing import draw_normalised, has_matplotlib, load_matplotlib
 from photoplan.report.dtm.plots import (
     LINE_WORDS,
@@ -18,9 +21,12 @@ from photoplan.report.dtm.plots import (
     draw_heights,
     draw_sigmas,
 )
-from photoplan.report.dtm.samples import BuildFacts, PlottedError
+from photoplan.report.dtm.samples import WORDS, BuildSamples, PlottedError, ReportMap
 from photoplan.report.page import Cell, ReportFile, figure, headline, page, section, table, text
-from photoplan.terrain.calibration import ClassFigures
+from photoplan.surfaces.measured import MeasuredTerrain
+from photoplan.terrain.build import BuildPlan, Built
+from photoplan.terrain.calibration import ClassFigures, SigmaFactor
+from photoplan.terrain.clean.run import Finding
 
 #: Rows of a list at most: more are counted.
 MOST_ROWS = 2000
@@ -46,106 +52,115 @@ def open_build_report(output: Path, wanted: bool | None, overwrite: bool) -> Rep
     return ReportFile(path)
 
 
-def build_page(facts: BuildFacts) -> str:
+def build_page(model: BuildReport, inputs: Sequence[Path], samples: BuildSamples) -> str:
     """The report as one HTML document without links to anything outside it.
 
     Names and texts are escaped; what they contain is shown and never obeyed.
     """
     parts = [
-        headline(_headline(facts)),
-        section("The surface", _surface(facts)),
-        section("How well the model fits its points", _fit(facts)),
-        section("What the filter did", _effect(facts)),
-        section("Gross errors", _gross(facts)),
-        section("What was found in the measurements", _notes(facts)),
-        section("Inputs and settings", _record(facts)),
+        headline(_headline(model, samples)),
+        section("The surface", _surface(samples.map)),
+        section("How well the model fits its points", _fit(model.built, samples)),
+        section("What the filter did", _effect(samples)),
+        section("Gross errors", _gross(model.built.plan.settings.gross, samples)),
+        section("What was found in the measurements", _notes(model)),
+        section("Inputs and settings", _record(model.built.plan, inputs)),
     ]
-    return page(facts.title, facts.crs, parts)
+    return page(model.path.stem, _systems(model.measured), parts)
 
 
-def _headline(facts: BuildFacts) -> list[tuple[str, str, str]]:
+def _headline(model: BuildReport, samples: BuildSamples) -> list[tuple[str, str, str]]:
     """Figure, what it is, and what to compare it with."""
-    points = sum(count for kind, count in facts.counts if "point" in kind or "spot" in kind)
-    lines = sum(count for _, count in facts.counts) - points
-    widths = ", ".join(f"{width:g} m in {_number(count)}" for width, count in facts.widths)
+    built, whole = model.built, model.built.fit.whole
+    counts = _counts(model.measured)
+    points = sum(count for kind, count in counts if "point" in kind or "spot" in kind)
+    lines = sum(count for _, count in counts) - points
+    full = Counter(built.plan.layout.side / f.meshes for f in built.figures if f.meshes > 0)
+    widths = ", ".join(f"{width:g} m in {_number(count)}" for width, count in sorted(full.items()))
+    limit = built.plan.settings.gross
     return [
-        (_number(points), "points", "; ".join(f"{kind} {_number(n)}" for kind, n in facts.counts if n)),
+        (_number(points), "points", "; ".join(f"{kind} {_number(n)}" for kind, n in counts if n)),
         (_number(lines), "lines", "with their intersections with the grid"),
-        (_number(facts.units), "computing units", f"{widths}; {_number(facts.empty)} units are empty"),
-        (_metres(facts.sigma), "standard deviation of heights", "root mean square over the posts that data surround"),
-        (_metres(facts.whole.noise), "noise of mass points", "their filter value"),
         (
-            f"{np.sqrt(facts.whole.variance):.3g} m",
+            _number(full.total()),
+            "computing units",
+            f"{widths}; {_number(len(built.figures) - full.total())} units are empty",
+        ),
+        (_metres(built.sigma), "standard deviation of heights", "root mean square over the posts that data surround"),
+        (_metres(whole.noise), "noise of mass points", "their filter value"),
+        (
+            f"{np.sqrt(whole.variance):.3g} m",
             "standard deviation of the signal",
-            f"{facts.whole.name} covariance function, half its value at {facts.whole.length:.3g} m",
+            f"{whole.name} covariance function, half its value at {whole.length:.3g} m",
         ),
-        (_plain(facts.spread, 2), "spread of normalised residuals", "1 where the stochastic model fits"),
+        (_plain(samples.spread, 2), "spread of normalised residuals", "1 where the stochastic model fits"),
         (
-            _number(len(facts.gross)),
+            _number(len(samples.gross)),
             "gross errors",
-            "none were sought" if facts.limit == 0 else f"beyond {facts.limit:g} standard deviations, left out",
+            "none were sought" if limit == 0 else f"beyond {limit:g} standard deviations, left out",
         ),
-        (_time(facts.seconds), "to build the model", ""),
+        (_time(model.figures["seconds"]), "to build the model", ""),
     ]
 
 
-def _surface(facts: BuildFacts) -> list[str]:
-    kinds = [LINE_WORDS.get(kind, kind) for kind in sorted({kind for kind, _ in facts.map.lines})]
+def _surface(area: ReportMap) -> list[str]:
+    kinds = [LINE_WORDS.get(kind, kind) for kind in sorted({kind for kind, _ in area.lines})]
     return [
         figure(
-            draw_heights(facts.map),
+            draw_heights(area),
             "Map of heights",
             f"Heights, shaded as if lit from the north-west. {'Lines: ' + ', '.join(kinds) + '. ' if kinds else ''}"
             "White: no surface, outside the border lines or too far from data.",
         ),
         figure(
-            draw_sigmas(facts.map),
+            draw_sigmas(area),
             "Map of standard deviations",
             "Standard deviation of the predicted height. It grows where points are sparse and towards the edges.",
         ),
     ]
 
 
-def _fit(facts: BuildFacts) -> list[str]:
+def _fit(built: Built, samples: BuildSamples) -> list[str]:
     return [
         figure(
-            draw_normalised(facts.normalised, facts.limit, "points"),
+            draw_normalised(samples.normalised, built.plan.settings.gross, "points"),
             "Histogram of normalised residuals",
             "Difference of each point from what its neighbours predict, in its standard deviations, beside the normal "
             "curve. A narrower histogram means that standard deviations are too large, a wider one that they are too "
             "small. The model's standard deviations follow the spread around each place, and what held-out blocks say.",
         ),
         figure(
-            draw_covariance(facts.covariance),
+            draw_covariance(samples.covariance),
             "Covariance functions",
             "Left: the fitted function of the whole area, and the range of eight in ten units. Right: covariance of "
             "the heights above a plane through each neighbourhood (dots), and what the fitted functions let expect of "
             "it after the same plane is taken away (line).",
         ),
-        *([f"<p><strong>{text(facts.covariance.warning)}</strong></p>"] if facts.covariance.warning else []),
-        *_held_out(facts),
+        *([f"<p><strong>{text(samples.covariance.warning)}</strong></p>"] if samples.covariance.warning else []),
+        *_held_out(built.fit.calibration, built.fit.seen.spacing),
     ]
 
 
-def _held_out(facts: BuildFacts) -> list[str]:
+def _held_out(found: SigmaFactor, spacing: float) -> list[str]:
     """What blocks that were held out say of the standard deviations."""
-    if not facts.calibration:
+    classes, bent = ([c for c in each if c.count] for each in (found.classes, found.bends))
+    if not classes:
         return []
-    parts = [f"{100 * (c.furthest - c.nearest):.0f} %" for c in facts.bends]
+    parts = [f"{100 * (c.furthest - c.nearest):.0f} %" for c in bent]
     words = ("weakest", *("next" for _ in parts[2:]), "strongest")
-    bends = [(f"{word} {part}", c) for word, part, c in zip(words, parts, facts.bends)]
+    bends = [(f"{word} {part}", c) for word, part, c in zip(words, parts, bent)]
     return [
         "<p>Blocks of heights were held out and predicted from all others. Their errors, divided by the standard "
         "deviations, have this spread (1: standard deviations are right; more: they are too small):</p>",
-        _classes("distance to data", [(_distances(c), c) for c in facts.calibration]),
+        _classes("distance to data", [(_distances(c.nearest * spacing, c.furthest * spacing), c) for c in classes]),
         "<p>The same by curvature of the ground. Nothing is corrected by it: at edges and crests without lines, "
         "standard deviations may be too small.</p>",
         _classes("curvature", bends),
     ]
 
 
-def _distances(c: ClassFigures) -> str:
-    return f"{c.nearest:.3g} to {c.furthest:.3g} m" if np.isfinite(c.furthest) else f"over {c.nearest:.3g} m"
+def _distances(nearest: float, furthest: float) -> str:
+    return f"{nearest:.3g} to {furthest:.3g} m" if np.isfinite(furthest) else f"over {nearest:.3g} m"
 
 
 def _classes(what: str, named: Sequence[tuple[str, ClassFigures]]) -> str:
@@ -157,12 +172,12 @@ def _classes(what: str, named: Sequence[tuple[str, ClassFigures]]) -> str:
     return table([what, "heights", "blocks", "as predicted", "as stated in the model"], rows)
 
 
-def _effect(facts: BuildFacts) -> list[str]:
-    effects = [effect for effect in facts.effects if np.isfinite(effect.differences).any()]
+def _effect(samples: BuildSamples) -> list[str]:
+    effects = [effect for effect in samples.effects if np.isfinite(effect.differences).any()]
     if not effects:
         return ["<p>No point or line with heights lies on the surface.</p>"]
     rows = []
-    for effect in facts.effects:
+    for effect in samples.effects:
         d = effect.differences[np.isfinite(effect.differences)]
         figures = [_number(effect.count), _plain(effect.sigma)]
         if len(d):
@@ -183,7 +198,7 @@ def _effect(facts: BuildFacts) -> list[str]:
             f"Measured minus filtered heights by class; gross errors are not among them.{sample}",
         ),
         figure(
-            draw_filter_map(effects, facts.map),
+            draw_filter_map(effects, samples.map),
             "Map of measured minus filtered heights",
             "Places of one colour that hang together are features that the filter took for noise, or errors of a whole "
             "series of measurements.",
@@ -191,13 +206,13 @@ def _effect(facts: BuildFacts) -> list[str]:
     ]
 
 
-def _gross(facts: BuildFacts) -> list[str]:
-    if not facts.gross and not facts.suspects:
-        return ["<p>None were sought.</p>" if facts.limit == 0 else "<p>None was found.</p>"]
-    order = sorted(facts.gross, key=lambda g: -abs(g.normalised))
+def _gross(limit: float, samples: BuildSamples) -> list[str]:
+    if not samples.gross and not samples.suspects:
+        return ["<p>None were sought.</p>" if limit == 0 else "<p>None was found.</p>"]
+    order = sorted(samples.gross, key=lambda g: -abs(g.normalised))
     parts = [
         figure(
-            draw_gross(order, facts.suspects, facts.map),
+            draw_gross(order, samples.suspects, samples.map),
             "Map of gross errors",
             "Where gross errors lie; the largest have the numbers of the list. Circles: suspects.",
         )
@@ -208,12 +223,12 @@ def _gross(facts: BuildFacts) -> list[str]:
             "off all round. They were not used.</p>",
             *_errors(order),
         ]
-    if facts.suspects:
+    if samples.suspects:
         parts += [
             "<p>Suspects: small groups of points whose border breaks off in part, or that lie at the edge of the data. "
             "They were used; normalised residuals are those that each group has without itself. Is there a rock, a "
             "roof, a heap? Else take them out.</p>",
-            *_errors(facts.suspects),
+            *_errors(samples.suspects),
         ]
     return parts
 
@@ -235,12 +250,13 @@ def _errors(order: Sequence[PlottedError]) -> list[str]:
     return parts
 
 
-def _notes(facts: BuildFacts) -> list[str]:
-    if not facts.notes:
+def _notes(model: BuildReport) -> list[str]:
+    notes = (*(Finding("while reading", note) for note in model.measured.notes), *model.findings)
+    if not notes:
         return ["<p>Nothing: lines meet in common points, no two points coincide.</p>"]
     rows: list[Sequence[str | Cell]] = []
-    for kind in dict.fromkeys(note.kind for note in facts.notes):
-        some = [note for note in facts.notes if note.kind == kind]
+    for kind in dict.fromkeys(note.kind for note in notes):
+        some = [note for note in notes if note.kind == kind]
         for k, note in enumerate(some[:MOST_NOTES]):
             place = f"{note.X:.2f}, {note.Y:.2f}" if np.isfinite([note.X, note.Y]).all() else ""
             rows.append([kind if k == 0 else "", note.text, Cell(place, number=True)])
@@ -249,10 +265,50 @@ def _notes(facts: BuildFacts) -> list[str]:
     return [table(["kind", "finding", "X, Y m"], rows)]
 
 
-def _record(facts: BuildFacts) -> list[str]:
+def _record(plan: BuildPlan, inputs: Sequence[Path]) -> list[str]:
     return [
-        table(["input", ""], [list(row) for row in facts.inputs]),
-        table(["setting", "value"], [list(row) for row in facts.settings]),
+        table(["input", ""], [[path.name, _size(path)] for path in inputs]),
+        table(["setting", "value"], _settings(plan)),
+    ]
+
+
+def _systems(measured: MeasuredTerrain) -> str:
+    plan = "CRS not stated" if measured.crs is None else crs_label(measured.crs)
+    return f"{plan}; heights: {measured.height_system or 'system not stated'}"
+
+
+def _counts(measured: MeasuredTerrain) -> tuple[tuple[str, int], ...]:
+    points: Counter[str] = Counter()
+    for group in measured.points:
+        points[group.kind] += len(group.xyz)
+    lines = Counter(line.kind for line in measured.lines)
+    return tuple((word, points.get(kind, 0) + lines.get(kind, 0)) for kind, word in WORDS.items())  # type: ignore[call-overload]
+
+
+def _size(path: Path) -> str:
+    """Size and folder of a file."""
+    try:
+        size = f"{path.stat().st_size / 1e6:.3g} MB, in "
+    except OSError:
+        size = "in "
+    return f"{size}{path.absolute().parent}"
+
+
+def _settings(plan: BuildPlan) -> list[list[str | Cell]]:
+    settings = plan.settings
+    given = settings.filters
+    finer = f", {plan.finest:g} m where breaklines pass" if plan.finest < plan.width else ""
+    own = "" if settings.grid_width else " (from the spacing of the points)"
+    adapt = "a quarter of each unit's standard deviation" if settings.adapt is None else f"{settings.adapt:g} m"
+    return [
+        ["grid width", f"{plan.width:g} m{finer}{own}"],
+        ["computing units", f"{plan.layout.side:g} m along a side: {settings.unit_meshes} grid widths"],
+        ["grids widened within", "no, all have the finest width" if settings.adapt == 0 else adapt],
+        ["covariance family", f"{settings.family}" + (" (the likeliest)" if settings.family == "auto" else "")],
+        ["filter values", ", ".join(f"{WORDS[k]} {v:g} m" for k, v in given.items()) or "estimated from the data"],
+        ["gross errors", f"beyond {settings.gross:g} standard deviations" if settings.gross else "not sought"],
+        ["gaps bridged up to", f"{2 * plan.reach:.4g} m"],
+        ["spacing of the points", f"{plan.seen.spacing:.3g} m"],
     ]
 
 

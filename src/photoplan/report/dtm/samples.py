@@ -1,17 +1,13 @@
-"""What the report of a built terrain model shows: figures, maps and samples, computed from the model in memory."""
+"""What the report of a built terrain model shows: maps and samples, computed from the model in memory."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.geometry.crs import crs_label
 from photoplan.geometry.grid import MapGrid
 from photoplan.report.dtm.covariance import CovarianceTest, covariance_test
 from photoplan.surfaces.hybrid import HybridSurface
@@ -19,9 +15,6 @@ from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.surfaces.units import MemoryUnits
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import Built
-from photoplan.terrain.calibration import ClassFigures
-from photoplan.terrain.clean.run import Finding
-from photoplan.terrain.covariance import Covariance
 
 T = TypeVar("T", bound=np.generic)
 #: Longer side of the map, pixels.
@@ -31,7 +24,8 @@ _SAMPLE, _RESIDUALS = 100_000, 1_000_000
 #: Vertices of all lines in the map at most.
 _VERTICES = 400_000
 
-_WORDS = {
+#: Kinds of points and lines.
+WORDS = {
     "mass": "mass points",
     "spot": "spot heights",
     "breakline": "breaklines",
@@ -97,104 +91,36 @@ class PlottedError:
 
 
 @dataclass(frozen=True, eq=False)
-class BuildFacts:
-    """All that the report shows."""
+class BuildSamples:
+    """What the report shows beside the model's own figures: a map, and samples where there is much."""
 
-    title: str
-    crs: str
-    """Name of the CRS and the height system."""
-    counts: tuple[tuple[str, int], ...]
-    """Classes of points and lines with their numbers."""
-    units: int
-    """Computing units that have a surface."""
-    empty: int
-    """Units that have none."""
-    widths: tuple[tuple[float, int], ...]
-    """Grid widths, metres, and the number of units that have each."""
-    whole: Covariance
-    """Function and filter value of the whole area."""
-    sigma: float
-    """Root mean square of the standard deviations of posts that data surround, metres."""
-    spread: float
-    """Spread of the normalised residuals; NaN: too few points."""
-    seconds: float
     map: ReportMap
     normalised: NDArray[np.float64]
     """Normalised residuals of points that were used, or a sample of them."""
+    spread: float
+    """Of all of them; NaN: too few points."""
     covariance: CovarianceTest
-    calibration: tuple[ClassFigures, ...]
-    """What standard deviations are worth by distance to data; distances in metres."""
-    bends: tuple[ClassFigures, ...]
-    """The same by how much the ground bends."""
     effects: tuple[FilterEffect, ...]
     gross: tuple[PlottedError, ...]
-    suspects: tuple[PlottedError, ...] = ()
+    suspects: tuple[PlottedError, ...]
     """Points that are used, but look like parts of gross errors."""
-    notes: tuple[Finding, ...] = ()
-    """What cleaning found."""
-    settings: tuple[tuple[str, str], ...] = ()
-    inputs: tuple[tuple[str, str], ...] = ()
-    """Files, and what there is to say of each."""
-    limit: float = field(default=float("nan"))
-    """Normalised residual beyond which a point was a gross error."""
 
 
-def build_facts(
-    title: str,
-    built: Built,
-    measured: MeasuredTerrain,
-    findings: Sequence[Finding],
-    inputs: Sequence[Path],
-    seconds: float,
-) -> BuildFacts:
-    """What the report shows, from samples where there is much: the same for the same model."""
-    fit, figures = built.fit, built.figures
+def samples_of(built: Built, measured: MeasuredTerrain) -> BuildSamples:
+    """Computed from the model in memory: the same for the same model."""
+    fit = built.fit
     surface = HybridSurface(MemoryUnits(built.plan.layout, built.units))
     z = fit.residuals[:, 2]
     used = z[(fit.noise[: fit.seen.points] >= 0) & np.isfinite(z)]
-    full = [f for f in figures if f.meshes > 0]
-    widths = Counter(built.plan.layout.side / f.meshes for f in full)
-    return BuildFacts(
-        title=title,
-        crs=_systems(measured),
-        counts=_counts(measured),
-        units=len(full),
-        empty=len(figures) - len(full),
-        widths=tuple(sorted(widths.items())),
-        whole=fit.whole,
-        sigma=built.sigma,
-        spread=float(used.std()) if len(used) >= 20 else np.nan,
-        seconds=seconds,
+    return BuildSamples(
         map=_map(built, surface),
         normalised=_thin(used, _RESIDUALS),
+        spread=float(used.std()) if len(used) >= 20 else np.nan,
         covariance=covariance_test(fit),
-        calibration=tuple(
-            replace(c, nearest=c.nearest * fit.seen.spacing, furthest=c.furthest * fit.seen.spacing)
-            for c in fit.calibration.classes
-            if c.count
-        ),
-        bends=tuple(c for c in fit.calibration.bends if c.count),
         effects=_effects(built, measured, surface),
         gross=_errors(built, measured, surface, fit.gross, fit.residuals[fit.gross]),
         suspects=_errors(built, measured, surface, fit.suspects[:, 0].astype(np.int64), fit.suspects[:, 2:]),
-        notes=(*(Finding("while reading", note) for note in measured.notes), *findings),
-        settings=_settings(built),
-        inputs=tuple((path.name, _size(path)) for path in inputs),
-        limit=built.plan.settings.gross,
     )
-
-
-def _systems(measured: MeasuredTerrain) -> str:
-    plan = "CRS not stated" if measured.crs is None else crs_label(measured.crs)
-    return f"{plan}; heights: {measured.height_system or 'system not stated'}"
-
-
-def _counts(measured: MeasuredTerrain) -> tuple[tuple[str, int], ...]:
-    points: Counter[str] = Counter()
-    for group in measured.points:
-        points[group.kind] += len(group.xyz)
-    lines = Counter(line.kind for line in measured.lines)
-    return tuple((word, points.get(kind, 0) + lines.get(kind, 0)) for kind, word in _WORDS.items())  # type: ignore[call-overload]
 
 
 def _map(built: Built, surface: HybridSurface) -> ReportMap:
@@ -255,7 +181,7 @@ def _effects(built: Built, measured: MeasuredTerrain, surface: HybridSurface) ->
         xyz = seen.xyz[shown] + seen.origin
         d = xyz[:, 2] - surface.heights(xyz[:, :2])
         found.append(
-            FilterEffect(name=_WORDS[kind], count=len(some), sigma=_one(sigma[some]), xy=xyz[:, :2], differences=d)
+            FilterEffect(name=WORDS[kind], count=len(some), sigma=_one(sigma[some]), xy=xyz[:, :2], differences=d)
         )
     return (*found, *_line_effects(built))
 
@@ -278,7 +204,7 @@ def _line_effects(built: Built) -> list[FilterEffect]:
     for kind in parts:
         xy, d = (np.concatenate(values) for values in zip(*parts[kind]))
         step = max(1, -(-len(d) // _SAMPLE))
-        name = f"vertices of {_WORDS[kind]}"
+        name = f"vertices of {WORDS[kind]}"
         found.append(
             FilterEffect(name=name, count=len(d), sigma=known.get(kind, np.nan), xy=xy[::step], differences=d[::step])
         )
@@ -325,31 +251,4 @@ def _errors(
     return tuple(
         PlottedError(name=name, X=float(X), Y=float(Y), height=float(Z), difference=float(d), normalised=float(z))
         for name, (X, Y, Z), d, z in zip(names, xyz, difference, residuals[:, 2])
-    )
-
-
-def _size(path: Path) -> str:
-    """Size and folder of a file."""
-    try:
-        size = f"{path.stat().st_size / 1e6:.3g} MB, in "
-    except OSError:
-        size = "in "
-    return f"{size}{path.absolute().parent}"
-
-
-def _settings(built: Built) -> tuple[tuple[str, str], ...]:
-    plan, settings = built.plan, built.plan.settings
-    given = settings.filters
-    finer = f", {plan.finest:g} m where breaklines pass" if plan.finest < plan.width else ""
-    own = "" if settings.grid_width else " (from the spacing of the points)"
-    adapt = "a quarter of each unit's standard deviation" if settings.adapt is None else f"{settings.adapt:g} m"
-    return (
-        ("grid width", f"{plan.width:g} m{finer}{own}"),
-        ("computing units", f"{plan.layout.side:g} m along a side: {settings.unit_meshes} grid widths"),
-        ("grids widened within", "no, all have the finest width" if settings.adapt == 0 else adapt),
-        ("covariance family", f"{settings.family}" + (" (the likeliest)" if settings.family == "auto" else "")),
-        ("filter values", ", ".join(f"{_WORDS[k]} {v:g} m" for k, v in given.items()) or "estimated from the data"),
-        ("gross errors", f"beyond {settings.gross:g} standard deviations" if settings.gross else "not sought"),
-        ("gaps bridged up to", f"{2 * plan.reach:.4g} m"),
-        ("spacing of the points", f"{plan.seen.spacing:.3g} m"),
     )
