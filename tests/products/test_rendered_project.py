@@ -28,7 +28,7 @@ from tools.town import House
 from photoplan.cameras.base import project
 from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.project.file import load_project
-from photoplan.products.simulate.scene import ProjectScene
+from photoplan.project.rendered import ProjectScene
 from photoplan.quality.formation.rendered import RenderedScene, SolidTexture
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.objects import ObjectSurface

@@ -13,7 +13,7 @@ from tools.rendered_city import City, delft, zurich
 
 from photoplan.cameras.base import project
 from photoplan.io.project.file import load_project
-from photoplan.products.simulate.scene import ProjectScene
+from photoplan.project.rendered import ProjectScene
 from photoplan.surfaces.objects import ObjectSurface
 
 PIXEL = 0.2

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from photoplan.cameras.base import project as project_points
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.project.file import load_project
-from photoplan.products.simulate.scene import ProjectScene
+from photoplan.project.rendered import ProjectScene
 from photoplan.surfaces.objects import ObjectSurface
 from tools.command import inside
 

@@ -149,6 +149,11 @@ class Placement:
         return self.transform or (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
     @property
+    def linear(self) -> NDArray[np.float64]:
+        """What a step to the next column and to the next row is in the plane, (2, 2)."""
+        return np.array(self.coefficients).reshape(2, 3)[:, :2]
+
+    @property
     def affine(self) -> Any:
         """`affine.Affine`: with `crs` all that rasterio, xarray or GeoPandas want to know."""
         from affine import Affine  # noqa: PLC0415  (not needed to write a product)

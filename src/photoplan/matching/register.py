@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import Placement, Window
 from photoplan.kernels.correlation import correlate
 from photoplan.kernels.patch_match import sample_spline, spline_coefficients
 from photoplan.matching.grey import Grey, patches_at
@@ -50,10 +50,34 @@ class PixelTransfer:
     shift: tuple[float, float] = (0.0, 0.0)
     """t, pixels of the second image."""
 
+    @classmethod
+    def between(cls, first: Placement, second: Placement) -> PixelTransfer:
+        """By where both lie on one map; pixels that are meant to coincide do so to the last digits of a file."""
+        (A, at), (B, bt) = ((place.linear, place.to_plane((0.0, 0.0))) for place in (first, second))
+        L, t = np.linalg.solve(B, A), np.linalg.solve(B, at - bt)
+        L = np.where(np.abs(L - np.rint(L)) < 1e-9, np.rint(L), L)
+        t = np.where(np.abs(t - np.rint(t)) < 1e-6, np.rint(t), t)
+        a, b, c, d = L.reshape(-1).tolist()
+        return cls((a, b, c, d), (float(t[0]), float(t[1])))
+
     @property
     def L(self) -> _Floats:
         """(2, 2)."""
         return np.array(self.linear).reshape(2, 2)
+
+    @property
+    def scale(self) -> float:
+        """How many times as large as those of the second image pixels of the first one are."""
+        return float(np.sqrt(abs(np.linalg.det(self.L))))
+
+    def common(self, first: tuple[int, int], second: tuple[int, int]) -> Window | None:
+        """Pixels of the first image that may have a partner, both of known width and height; None: there are none."""
+        width, height = second
+        corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)
+        back = (corners - np.array(self.shift)) @ np.linalg.inv(self.L).T
+        low = np.maximum(np.floor(np.clip(back.min(axis=0), -1, 1e9)), 0).astype(int)
+        high = np.minimum(np.ceil(np.clip(back.max(axis=0), -1, 1e9)) + 1, first).astype(int)
+        return None if (high <= low).any() else Window(int(low[0]), int(low[1]), *(high - low).tolist())
 
     def __call__(self, xy: ArrayLike) -> _Floats:
         """Points (..., 2) of the second image."""

@@ -302,11 +302,8 @@ def _write(request: RegisterRequest, pair: Pair, found: PatchDisplacements) -> N
     )
     at = found.at.astype(float)
     ends = np.stack([at, at + np.nan_to_num(found.moved)], axis=1)
-    if pair.to_map is not None:
-        x0, xx, xy, y0, yx, yy = pair.to_map
-        matrix, offset = np.array([[xx, xy], [yx, yy]]), np.array([x0, y0])
-        ends = ends @ matrix.T + offset
-        moved = found.moved @ matrix.T
+    if pair.place is not None:
+        ends, moved = pair.place.to_plane(ends), found.moved @ pair.place.linear.T
         values |= {"map_dx": moved[:, 0], "map_dy": moved[:, 1]}
     else:
         ends = ends * np.array([1.0, -1.0])

@@ -18,10 +18,14 @@ from photoplan.io.project.model import Project
 from photoplan.io.run_record import record_path, recorded_result
 from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions
+from photoplan.products.orthophoto.look import two_figures
 from photoplan.products.simulate.form import Forming, SimulateReport, check_fit, stated_model
-from photoplan.products.simulate.scene import ProjectScene, TruthRaster, image_truth, true_orthophoto, usual_grain
+from photoplan.products.simulate.scene import TruthRaster, image_truth, true_orthophoto
 from photoplan.project.cameras import camera_without_pixels
+from photoplan.project.rendered import ProjectScene, ground_pixel
 
+#: Shortest wavelength of the pattern, ground pixels.
+_GRAIN = 8.0
 _ORTHO = "true_orthophoto.tif"
 
 
@@ -97,7 +101,7 @@ def simulate_project(request: SceneRequest, events: Events = SILENT) -> SceneRep
     names = project.select(request.images or None)
     if request.bounds is not None and request.resolution is None:
         raise UsageError("`bounds` are those of the true orthophoto; give its `resolution`, too")
-    grain = usual_grain(project) if request.grain is None else request.grain
+    grain = two_figures(_GRAIN * ground_pixel(project)) if request.grain is None else request.grain
     if not 0 < grain < float("inf"):
         raise UsageError(f"grain {grain}; a positive number of metres is needed")
     works = list(_works(request, project, names, grain, events))

@@ -270,12 +270,7 @@ def fit_profile(
 
 
 def _best_prior(
-    basis: ProfileBasis,
-    normal: NDArray[np.float64],
-    right: NDArray[np.float64],
-    square: float,
-    number: int,
-    trend: int,
+    basis: ProfileBasis, normal: NDArray[np.float64], right: NDArray[np.float64], square: float, number: int, trend: int
 ) -> tuple[NDArray[np.float64], float, float]:
     """Covariance root, scale and noise: smoothness of the best restricted likelihood, scale as large as it allows.
 

@@ -144,6 +144,20 @@ class RenderedScene:
             out[:, part] = self.texture(self.hits(xy)).reshape(self.bands, -1, len(x))
         return out
 
+    def means(self, window: Window) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Means of the cells of pixels, shape (bands, height, width), and those that show something everywhere."""
+        k = self.oversampling
+        cells = self.cells(window).reshape(self.bands, window.height, k, window.width, k)
+        valid = np.asarray((cells > 0).all(axis=(0, 2, 4)))
+        return np.rint(cells.mean(axis=(2, 4)) * valid).astype(np.uint8), valid
+
+    def places(self, window: Window, origin: _Array) -> NDArray[np.float32]:
+        """X, Y, Z from an origin (3,) and object at the middles of pixels, shape (4, height, width); NaN: nothing."""
+        y, x = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].astype(float)
+        hits = self.hits(np.stack([x, y], axis=-1).reshape(-1, 2))
+        owner = np.where(np.isfinite(hits.along), hits.owner, np.nan)
+        return np.column_stack([hits.XYZ - origin, owner]).T.reshape(4, *x.shape).astype(np.float32)
+
     def hits(self, xy: ArrayLike) -> Hits:
         """What the rays of image points (n, 2) meet first."""
         return self.surface.first_hit(ray_paths(self.camera, xy, self.heights))
