@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -14,19 +12,18 @@ import rasterio.crs
 import rasterio.transform
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
+from photoplan.errors import InputError, PhotoplanError, UsageError
 from photoplan.geometry.grid import Placement, Window
-from photoplan.io.disk import disk_error, free_megabytes
-from photoplan.io.gdal import GDAL_ERRORS, first_cause, open_raster
+from photoplan.io.gdal import GDAL_ERRORS, open_raster
 from photoplan.io.image_form import ImageForm, dress
 from photoplan.io.kept_tiles import KeptTiles
-from photoplan.io.lock import FileLock, lock_of
-from photoplan.io.naming import give_name, is_unfinished, standing, when_named
+from photoplan.io.naming import is_unfinished, standing, when_named
 from photoplan.io.plain_tiff import write_plain_tiff
 from photoplan.io.product_check import check_product
 from photoplan.io.run_record import record_path, refuse_foreign_record
 from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, CogOptions, Nodata, nodata_for, write_cog, write_picture
 from photoplan.io.tile_log import TileLog, log_of
+from photoplan.io.unfinished import Unfinished
 
 #: The tag in which a product describes itself, where its place does not.
 DESCRIPTION = "PHOTOPLAN_VIEW"
@@ -145,7 +142,6 @@ class ProductFile:
     """Of an image whose copy the product is: its names and colours of bands and its metadata are taken over."""
     tiles: KeptTiles | None = None
     """What decides each tile: those of the file that is replaced are taken over where it is the same."""
-    _log: TileLog | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         self.path = Path(self.path)
@@ -170,32 +166,25 @@ class ProductFile:
         value = nodata_for(self.dtype, self.nodata, self.compress)
         self._coder = BlockCoder(self.tile, self.bands, self.dtype, value, lossy=self.compress == "jpeg")
         self._windows = tuple(self.placement.window.tiles(self.tile))
-        self._lock = FileLock(lock_of(self.path))
-        self._state = threading.Lock()
+        self._file = Unfinished(
+            path=self.path,
+            log_path=self.log_path,
+            what="tiles",
+            check=lambda: check_output(self.path, self.inputs, overwrite=self.overwrite),
+            hidden=(self._part("plain").stem, self._part("part").stem),
+            faults=GDAL_ERRORS,
+        )
 
     def __enter__(self) -> ProductFile:
-        check_output(self.path, self.inputs, overwrite=self.overwrite)
-        self._lock.acquire()
-        try:
-            # The run before may have finished between the check and the lock.
-            check_output(self.path, self.inputs, overwrite=self.overwrite)
-            self._remove_parts()
-            key = f"{self.run_key} {self.placement} {self._coder}"
-            self._log = TileLog(self.log_path, key)
+        def begin(log: TileLog) -> None:
             if self.tiles is not None and self.path.is_file():
-                self.tiles.take_over(self.path, self._windows, self._coder, self._log)
-        except BaseException:
-            self._lock.release()
-            raise
+                self.tiles.take_over(self.path, self._windows, self._coder, log)
+
+        self._file.enter(f"{self.run_key} {self.placement} {self._coder}", begin)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._log is not None:
-            self._log.leave()
-            self._log = None
-        self._lock.release()
+    def __exit__(self, *error: object) -> None:
+        self._file.leave()
 
     @property
     def windows(self) -> tuple[Window, ...]:
@@ -210,7 +199,7 @@ class ProductFile:
     @property
     def finished(self) -> frozenset[int]:
         """Indices of the tiles that need not be computed any more."""
-        return self._open_log().finished
+        return self._file.log.finished
 
     @property
     def nodata_value(self) -> float | None:
@@ -219,7 +208,7 @@ class ProductFile:
 
     def record(self, index: int) -> dict[str, Any]:
         """The figures that were kept with a finished tile."""
-        return self._open_log().figures(index)
+        return self._file.log.figures(index)
 
     def append(
         self,
@@ -254,54 +243,27 @@ class ProductFile:
             self.append_empty(index, record)
             return
         payload, moved = self._coder.encode(pixels, None if count == window.size else valid)
-        self._open_log().append(index, payload, (moved, count), record)
+        self._file.log.append(index, payload, (moved, count), record)
 
     def append_empty(self, index: int, record: Mapping[str, Any] | None = None) -> None:
         """Add a tile without any valid pixel."""
         if not 0 <= index < len(self._windows):
             raise UsageError(f"{self.path}: tile {index}; the product has tiles 0 to {len(self._windows) - 1}")
-        self._open_log().append(index, figures=record)
+        self._file.log.append(index, figures=record)
 
     def complete(self, tags: dict[str, str] | None = None) -> ProductFacts:
         """Make the product, with these tags, and give it its name; all tiles must have been delivered."""
-        log = self._open_log()
+        log = self._file.log
         missing = sorted(set(range(len(self._windows))) - log.finished)
         if missing:
             raise PhotoplanError(f"{self.path}: {len(missing)} tiles are missing, the first is {missing[0]}")
-        try:
-            try:
-                part = self._assemble(log, tags or {})
-                self._check(log, part)
-                # The last look before the name is taken: another program may have made the file meanwhile.
-                check_output(self.path, self.inputs, overwrite=self.overwrite)
-                give_name(part, self.path)
-            finally:
-                self._remove_parts()
-        except OSError as error:
-            raise disk_error(self.path, error) from error
-        except (*GDAL_ERRORS, MemoryError) as error:
-            raise self._unwritten(first_cause(error)) from error
-        except UsageError:
-            raise
-        except PhotoplanError as error:
-            raise self._unwritten(str(error)) from error
+        self._file.give(lambda: self._checked(log, self._assemble(log, tags or {})))
         facts = self._facts(log)
         when_named(log.remove)
         return facts
 
-    def _open_log(self) -> TileLog:
-        if self._log is None:
-            raise UsageError(f"{self.path}: the product is not open; use it in a `with` block")
-        return self._log
-
     def _part(self, kind: str) -> Path:
         return self.path.with_name(f".{self.path.name}.{kind}.tif")
-
-    def _remove_parts(self) -> None:
-        """Remove what this product's runs may have left: GDAL makes files beside its output."""
-        for kind in ("plain", "part"):
-            for left in self.path.parent.glob(f"{_escaped(self._part(kind).stem)}*"):
-                left.unlink(missing_ok=True)
 
     def _profile(self) -> dict[str, Any]:
         """What GDAL is told about the product."""
@@ -357,8 +319,8 @@ class ProductFile:
             write_cog(plain, part, self._options, self.dtype)
         return part
 
-    def _check(self, log: TileLog, part: Path) -> None:
-        """Compare the assembled file with the log at some tiles."""
+    def _checked(self, log: TileLog, part: Path) -> Path:
+        """The assembled file, compared with the log at some tiles."""
         stored = [i for i in sorted(log.finished) if log.place(i)[1] > 0]
         step = max(1, -(-len(stored) // _SAMPLES))
         samples = {self._windows[i]: i for i in stored[::step]}
@@ -375,6 +337,7 @@ class ProductFile:
             overviews=self.overviews and self.driver == "COG" and max(self.placement.size) > self.tile,
             driver=self.driver,
         )
+        return part
 
     def _facts(self, log: TileLog) -> ProductFacts:
         notes = [log.notes(i) for i in log.finished]
@@ -387,14 +350,3 @@ class ProductFile:
             moved_values=sum(moved for moved, _ in notes),
             kept="" if self.tiles is None else self.tiles.told(log),
         )
-
-    def _unwritten(self, cause: str) -> ResourceError:
-        return ResourceError(
-            f"{self.path}: could not be written ({cause}; {free_megabytes(self.path)} MB are free there); free some "
-            "space and run the same command again: finished tiles are kept"
-        )
-
-
-def _escaped(name: str) -> str:
-    """A name for `glob`, with its special characters taken literally."""
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)

@@ -9,9 +9,8 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -19,11 +18,9 @@ import pyogrio.errors
 import shapely
 
 from photoplan import __version__
-from photoplan.errors import PhotoplanError, ResourceError, UsageError
-from photoplan.io.disk import disk_error, free_megabytes
-from photoplan.io.gdal import GDAL_ERRORS, first_cause
-from photoplan.io.lock import FileLock, lock_of
-from photoplan.io.naming import give_name, standing, when_named
+from photoplan.errors import PhotoplanError, UsageError
+from photoplan.io.gdal import GDAL_ERRORS
+from photoplan.io.naming import standing, when_named
 from photoplan.io.product import check_output
 from photoplan.io.terrain.model_blob import check_unit, inflate, pack_line, pack_unit, unit_of
 from photoplan.io.terrain.model_layers import write_border, write_gross, write_heights, write_lines, write_units
@@ -38,7 +35,7 @@ from photoplan.io.terrain.model_tables import (
     check_layout,
     header_to_json,
 )
-from photoplan.io.tile_log import TileLog
+from photoplan.io.unfinished import Unfinished
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
 _FIGURES = struct.Struct("<3q2d2q5dq")
@@ -50,7 +47,6 @@ _GPKG_ERRORS = (
     pyogrio.errors.DataLayerError,
     pyogrio.errors.FeatureError,
     sqlite3.Error,
-    MemoryError,
 )
 
 
@@ -99,41 +95,32 @@ class ModelWriter:
     """Replace a file that exists."""
     inputs: Sequence[Path | str] = ()
     """Files that must not be overwritten."""
-    _log: TileLog | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         self.path = Path(self.path)
         if self.path.suffix.lower() != ".gpkg":
             raise UsageError(f"{self.path}: a terrain model is a GeoPackage; give it a name that ends with .gpkg")
         check_layout(self.layout, str(self.path))
-        self._lock = FileLock(lock_of(self.path))
+        self._file = Unfinished(
+            path=self.path,
+            log_path=self.path.with_name(f".{self.path.name}.units"),
+            what="units",
+            check=lambda: check_output(self.path, self.inputs, overwrite=self.overwrite),
+            hidden=(self._part.name,),
+            faults=_GPKG_ERRORS,
+        )
 
     def __enter__(self) -> ModelWriter:
-        check_output(self.path, self.inputs, overwrite=self.overwrite)
-        self._lock.acquire()
-        try:
-            # The run before may have finished between the check and the lock.
-            check_output(self.path, self.inputs, overwrite=self.overwrite)
-            self._remove_parts()
-            key = f"{self.run_key} {self.layout} {FORMAT} {__version__}"
-            self._log = TileLog(self.path.with_name(f".{self.path.name}.units"), key)
-        except BaseException:
-            self._lock.release()
-            raise
+        self._file.enter(f"{self.run_key} {self.layout} {FORMAT} {__version__}")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._log is not None:
-            self._log.leave()
-            self._log = None
-        self._lock.release()
+    def __exit__(self, *error: object) -> None:
+        self._file.leave()
 
     def done(self) -> frozenset[tuple[int, int]]:
         """Column and row of the units that need not be computed any more."""
         columns = self.layout.columns
-        return frozenset((number % columns, number // columns) for number in self._open_log().finished)
+        return frozenset((number % columns, number // columns) for number in self._file.log.finished)
 
     def add(self, unit: Unit | None, figures: UnitFigures) -> None:
         """Add a finished unit, or None with the figures of an empty one; at once safe on the disk."""
@@ -152,11 +139,11 @@ class ModelWriter:
             if span is not None:
                 content = _STORED.pack(size, *span, unit.meshes) + packed
         payload = _FIGURES.pack(*astuple(figures)) + content
-        self._open_log().append(row * self.layout.columns + column, payload)
+        self._file.log.append(row * self.layout.columns + column, payload)
 
     def figures(self) -> Iterator[UnitFigures]:
         """Figures of all finished units, row by row."""
-        log = self._open_log()
+        log = self._file.log
         for number in sorted(log.finished):
             yield UnitFigures(*_FIGURES.unpack_from(log.read(number)))
 
@@ -183,32 +170,19 @@ class ModelWriter:
         PhotoplanError
             Units are missing.
         """
-        log = self._open_log()
+        log = self._file.log
         missing = self.layout.columns * self.layout.rows - len(log.finished)
         if missing:
             raise PhotoplanError(f"{self.path}: {missing} units were not delivered; empty ones are added as None")
         if parts.header.layout != self.layout:
             raise UsageError(f"{self.path}: the header's layout is {parts.header.layout}, the units' {self.layout}")
-        part = self.path.with_name(f".{self.path.name}.part.gpkg")
-        try:
-            try:
-                identity = self._assemble(part, parts)
-                self._check(part, identity)
-                # The last look before the name is taken: another program may have made the file meanwhile.
-                check_output(self.path, self.inputs, overwrite=self.overwrite)
-                give_name(part, self.path)
-            finally:
-                self._remove_parts()
-        except OSError as error:
-            raise disk_error(self.path, error) from error
-        except _GPKG_ERRORS as error:
-            raise self._unwritten(first_cause(error)) from error
+        self._file.give(lambda: self._assemble(parts))
         when_named(log.remove)
         return ModelReader(standing(self.path))
 
-    def _assemble(self, part: Path, parts: ModelParts) -> str:
-        """Make the file under a temporary name; returns its identity."""
-        crs = parts.header.crs
+    def _assemble(self, parts: ModelParts) -> Path:
+        """Make the file under a temporary name, and compare it with the log."""
+        part, crs = self._part, parts.header.crs
         write_units(part, self.layout, self.figures(), crs)
         write_lines(part, parts.lines, crs)
         write_gross(part, "gross_errors", parts.gross, crs)
@@ -233,12 +207,13 @@ class ModelWriter:
                 text = header_to_json(replace(header, identity=digest.hexdigest()))
                 domain = None if parts.domain is None else shapely.to_wkb(parts.domain)
                 db.execute(f"INSERT INTO {HEADER} VALUES (1, ?, ?, ?)", (FORMAT, text, domain))
-        return digest.hexdigest()
+        self._check(part, digest.hexdigest())
+        return part
 
     def _base_meshes(self) -> int:
         """Meshes along a side that most units have; 0: all are empty."""
         counts: Counter[int] = Counter()
-        for number in self._open_log().finished:
+        for number in self._file.log.finished:
             stored = self._stored(number)
             if stored is not None:
                 counts[stored.meshes] += 1
@@ -246,7 +221,7 @@ class ModelWriter:
 
     def _unit_rows(self, digest: Any) -> Iterator[tuple[Any, ...]]:
         """Rows of the table of units, in order."""
-        for number in sorted(self._open_log().finished):
+        for number in sorted(self._file.log.finished):
             stored = self._stored(number)
             if stored is None:
                 continue
@@ -257,7 +232,7 @@ class ModelWriter:
             yield number, column, row, stored.meshes, low, high, size, checksum, stored.packed
 
     def _stored(self, number: int) -> _Stored | None:
-        content = self._open_log().read(number)[_FIGURES.size :]
+        content = self._file.log.read(number)[_FIGURES.size :]
         if not content:
             return None
         size, low, high, meshes = _STORED.unpack_from(content)
@@ -273,25 +248,11 @@ class ModelWriter:
             good = good and written is not None and kept is not None
             good = good and np.array_equal(written.heights, kept.heights, equal_nan=True)  # type: ignore[union-attr]
         if not good:
-            raise self._unwritten("it does not hold what was written")
+            raise PhotoplanError("it does not hold what was written")
 
-    def _remove_parts(self) -> None:
-        """Remove what this model's runs may have left: SQLite and GDAL make files beside their output."""
-        name = f".{self.path.name}.part.gpkg"
-        for left in self.path.parent.iterdir() if self.path.parent.is_dir() else ():
-            if left.name.startswith(name):
-                left.unlink(missing_ok=True)
-
-    def _open_log(self) -> TileLog:
-        if self._log is None:
-            raise UsageError(f"{self.path}: the model is not open; use it in a `with` block, and finish it once")
-        return self._log
-
-    def _unwritten(self, cause: str) -> ResourceError:
-        return ResourceError(
-            f"{self.path}: could not be written ({cause}; {free_megabytes(self.path)} MB are free there); free some "
-            "space and run the same command again: finished units are kept"
-        )
+    @property
+    def _part(self) -> Path:
+        return self.path.with_name(f".{self.path.name}.part.gpkg")
 
 
 @dataclass(frozen=True)
