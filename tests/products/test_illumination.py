@@ -16,7 +16,7 @@ from tools.command import Here
 from tools.small_block import write_image
 
 from photoplan.errors import GeometryError
-from photoplan.radiometry.illumination import LitGround, estimate
+from photoplan.radiometry.illumination import LitGround, estimate_light
 
 SUN = (135.0, 38.0)
 SIZE, PIXEL = 180, 10.0
@@ -155,7 +155,7 @@ def test_fault_16_pixels_of_one_part_alone_are_refused() -> None:
     n = 600
     ground = LitGround(np.linspace(0.2, 1, n), np.ones(n), np.linspace(0.0, 100, n), np.zeros(n, bool))
     with pytest.raises(GeometryError, match="without one part of the picture 0 pixels"):
-        estimate(np.ones((1, n)), ground, np.zeros(n, int), ["haze-by-height"], 0.7)
+        estimate_light(np.ones((1, n)), ground, np.zeros(n, int), ["haze-by-height"], 0.7)
 
 
 def test_slopes_have_no_steps_at_coarse_posts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -158,8 +158,10 @@ def test_every_public_name_is_there_and_hides_no_module() -> None:
     import importlib
     import pkgutil
 
-    names = ("cameras", "orientation", "quality", "surfaces", "targets", "terrain")
+    names = ("cameras", "matching", "orientation", "quality", "radiometry", "surfaces", "targets", "terrain")
     packages = [photoplan, *(getattr(photoplan, name) for name in names)]
+    verbs = {"plan_surface", "make_surface", "plan_view", "find_ties", "register", "balance_project", "make_seams"}
+    assert verbs <= set(dir(photoplan))
     for package in packages:
         modules = {m.name for m in pkgutil.iter_modules(package.__path__)}
         assert set(dir(package)) >= set(package.__all__)

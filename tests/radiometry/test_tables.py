@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from tools.overlaps import block_of
 
 from photoplan.radiometry import adjust
-from photoplan.radiometry.balance import balance, even_images, pairs_of, parts_of, shoulder
+from photoplan.radiometry.balance import balanced, even_images, pairs_of, parts_of, shoulder
 from photoplan.radiometry.cells import LEVELS, PIXELS, SIDE, Cells, cells_of
 from photoplan.radiometry.ratio import factors
 
@@ -30,7 +30,7 @@ def seen(*images: NDArray[np.float64]) -> tuple[Cells, NDArray[np.int64]]:
 
 
 def rms(cells: Cells, sizes: NDArray[np.int64], **options: int) -> tuple[float, float]:
-    made = balance(cells, sizes, LIMITS, degree=0, **options)
+    made = balanced(cells, sizes, LIMITS, degree=0, **options)
     pairs = pairs_of(cells.shared, dict(zip(made.images.tolist(), made.tones)), sizes)
     return float(pairs.before.mean()), float(pairs.after.mean())
 
@@ -63,7 +63,7 @@ def test_the_image_of_even_histogram_joins_its_original() -> None:
 def test_a_lost_contrast_is_found_again_to_a_grey_value() -> None:
     image = ground()
     cells, sizes = seen(image, 0.6 * image + 60, image)
-    made = balance(cells, sizes, LIMITS, degree=0)
+    made = balanced(cells, sizes, LIMITS, degree=0)
     grey = np.array([80.0, 100, 128, 160, 180])
     of = [tone[0].table(grey if k != 1 else 0.6 * grey + 60) for k, tone in enumerate(made.tones)]
     assert np.abs(of[1] - of[0]).max() < 0.5 and np.abs(of[2] - of[0]).max() < 0.1
@@ -74,7 +74,7 @@ def test_a_lost_contrast_is_found_again_to_a_grey_value() -> None:
 def test_the_reference_image_stays_as_it_is() -> None:
     image = ground()
     cells, sizes = seen(image, 255 * (np.maximum(image, 0) / 255) ** 1.5)
-    made = balance(cells, sizes, LIMITS, fixed=0)
+    made = balanced(cells, sizes, LIMITS, fixed=0)
     tone = made.tones[0][0]
     np.testing.assert_allclose(tone.becomes, tone.grey, atol=0.1)
     assert all(c == pytest.approx(0, abs=1e-4) for _, _, c in tone.terms)
@@ -86,14 +86,14 @@ def test_change_in_a_tenth_of_the_ground_moves_tables_by_less_than_a_grey_value(
     image, changed = ground(), ground()
     changed[:32, :80] = 220
     cells, sizes = seen(image, changed, image + 5)
-    made = balance(cells, sizes, LIMITS, degree=0, fixed=0)
+    made = balanced(cells, sizes, LIMITS, degree=0, fixed=0)
     assert np.abs(made.tones[1][0].table([90, 128, 170]) - [90, 128, 170]).max() < 1.0
 
 
 def test_overlaps_alone_bring_images_together_as_far_as_noise_lets_them() -> None:
     """What the truth leaves is noise; tables and trends that are found leave no more."""
     scene, truth = block_of(2, 3, seed=3)
-    made = balance(scene.cells, scene.sizes, LIMITS)
+    made = balanced(scene.cells, scene.sizes, LIMITS)
     shared = scene.cells.shared
     pairs = pairs_of(shared, dict(zip(made.images.tolist(), made.tones)), scene.sizes)
     best = pairs_of(shared, truth.tones(), scene.sizes)
@@ -112,7 +112,7 @@ def test_with_a_reference_all_is_found_again(rows: int, columns: int, seeds: tup
     normal: list[tuple[float, float]] = []
     for seed in seeds:
         scene, truth = block_of(rows, columns, seed=seed, change=0.1, noise=2.0, reference=True)
-        (found,) = balance(scene.cells, scene.sizes, LIMITS).bands
+        (found,) = balanced(scene.cells, scene.sizes, LIMITS).bands
         table = found.state.tables - truth.tables(nodes)
         assert np.sqrt((table[:, seen] ** 2).mean(axis=1)).max() < 1.0
         assert truth.trend_errors(found).max() < 0.015
@@ -127,9 +127,9 @@ def test_with_a_reference_all_is_found_again(rows: int, columns: int, seeds: tup
 
 def test_equations_of_some_cells_at_a_time_are_those_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, _ = block_of(2, 2, seed=3, change=0.1, noise=2.0)
-    (whole,) = balance(scene.cells, scene.sizes, LIMITS).bands
+    (whole,) = balanced(scene.cells, scene.sizes, LIMITS).bands
     monkeypatch.setattr(adjust, "_AT_ONCE", 700)
-    (parts,) = balance(scene.cells, scene.sizes, LIMITS).bands
+    (parts,) = balanced(scene.cells, scene.sizes, LIMITS).bands
     assert len(whole.state.ground) > 3 * 700 / 4
     np.testing.assert_allclose(parts.state.tables, whole.state.tables, atol=1e-6)
     np.testing.assert_allclose(parts.state.ground, whole.state.ground, atol=1e-6)
@@ -158,8 +158,8 @@ def test_a_shoulder_keeps_bright_values_apart_and_inside() -> None:
 
 def test_contrast_beyond_the_range_is_bent_not_clipped() -> None:
     image = np.clip(ground(), 40, 215)
-    assert not balance(*seen(image, 0.5 * image + 60), LIMITS, degree=0).shoulder
-    made = balance(*seen(0.9 * image, np.minimum(1.8 * image - 100, 250)), LIMITS, degree=0, fixed=1)
+    assert not balanced(*seen(image, 0.5 * image + 60), LIMITS, degree=0).shoulder
+    made = balanced(*seen(0.9 * image, np.minimum(1.8 * image - 100, 250)), LIMITS, degree=0, fixed=1)
     assert made.shoulder
     assert all(tone[0].becomes[0] >= 0 and tone[0].becomes[-1] <= 255 for tone in made.tones)
 
@@ -172,7 +172,7 @@ def test_the_factor_is_the_mean_ratio_of_means() -> None:
     cells, sizes = seen(image, other)
     expected = (120 / 100 + 90 / 60 + 200 / 160) / 3
     assert factors(cells, 2, np.zeros(2, np.int64), fixed=1)[0, 0] == pytest.approx(expected, rel=1e-9)
-    made = balance(cells, sizes, LIMITS, factor=True, fixed=1)
+    made = balanced(cells, sizes, LIMITS, factor=True, fixed=1)
     assert made.tones[0][0].table(100) == pytest.approx(100 * expected)
     assert made.tones[1][0].table(100) == pytest.approx(100)
     turned, sizes = seen(other, image)

@@ -25,7 +25,7 @@ from photoplan.plan.visibility import hidden_pixels
 from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.project.restored import kept_nodata
-from photoplan.radiometry.illumination import LightModel, LitGround, estimate
+from photoplan.radiometry.illumination import LightModel, LitGround, estimate_light
 from photoplan.radiometry.tone import fitted
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.shading import Lighting, surface_slopes
@@ -137,7 +137,7 @@ def correct_illumination(request: IlluminationRequest, events: Events = SILENT) 
     place = _open(request)
     cos_z = place.light.level
     values, ground, part = _sample(place, events)
-    model = estimate(values, ground, part, request.correct, cos_z)
+    model = estimate_light(values, ground, part, request.correct, cos_z)
     report = IlluminationReport(
         path=request.output, model=model, sample=ground, before=values, after=model.corrected(values, ground)
     )

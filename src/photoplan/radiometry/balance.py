@@ -86,7 +86,7 @@ def parts_of(cells: Cells, images: int) -> NDArray[np.int64]:
     return np.asarray(connected_components(seen @ seen.T, directed=False)[1], np.int64)
 
 
-def balance(
+def balanced(
     cells: Cells,
     sizes: NDArray[np.int64],
     limits: tuple[float, float],

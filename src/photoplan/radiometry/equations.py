@@ -74,12 +74,7 @@ class Band:
 
     @classmethod
     def of(
-        cls,
-        cells: Cells,
-        band: int,
-        sizes: NDArray[np.int64],
-        powers: tuple[tuple[int, int], ...],
-        nodes: _Floats,
+        cls, cells: Cells, band: int, sizes: NDArray[np.int64], powers: tuple[tuple[int, int], ...], nodes: _Floats
     ) -> Band:
         """Observations of shared cells; `sizes` (images, 2): width and height."""
         many = cells.levels.shape[2]

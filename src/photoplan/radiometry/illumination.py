@@ -120,7 +120,7 @@ class LightModel:
         return np.stack(out)
 
 
-def estimate(
+def estimate_light(
     values: _Floats, ground: LitGround, part: NDArray[np.int64], corrections: Sequence[str], cos_z: float
 ) -> LightModel:
     """Parameters of the corrections that are named.

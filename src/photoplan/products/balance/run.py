@@ -31,7 +31,7 @@ from photoplan.products.balance.sample import Survey, sample, survey
 from photoplan.products.one_colour import one_colour_told
 from photoplan.products.run import BASE_MEMORY, refuse_inputs
 from photoplan.project.scene import input_files
-from photoplan.radiometry.balance import Balanced, Pairs, balance, even_images, pairs_of
+from photoplan.radiometry.balance import Balanced, Pairs, balanced, even_images, pairs_of
 from photoplan.radiometry.cells import SIDE, Cells
 
 
@@ -191,7 +191,7 @@ def _adjusted(
     number = None if fixed is None else found.names.index(fixed) if fixed in found.names else -1
     _refuse_useless(usable, found, number, notes)
     events.begin("adjusting", cells.bands, "bands")
-    made = balance(
+    made = balanced(
         usable, found.sizes, limits, degree=request.degree, fixed=number, factor=request.factor, done=events.done
     )
     _note(made, found, even, notes)
