@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,15 +37,10 @@ class StraightFlight:
         """Width and height of the image in pixels."""
         return self.look.columns, self.lines
 
-    @property
-    def field(self) -> None:
-        """All is in the first factor."""
-        return None
-
-    @property
-    def breaks(self) -> None:
-        """It is smooth."""
-        return None
+    field: ClassVar[None] = None
+    """All is in the first factor."""
+    breaks: ClassVar[None] = None
+    """It is smooth."""
 
     def seen(self, P: _Floats) -> _Floats:
         """Positions (n, 2) of points (n, 3) in the axes of the body; NaN behind the camera. Rows may be any."""

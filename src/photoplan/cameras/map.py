@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,15 +24,10 @@ class MapProjection:
     carry: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     """Takes X, Y of the product's CRS (..., 2) to the raster's; None if they are the same."""
 
-    @property
-    def field(self) -> None:
-        """Nothing happens in the raster."""
-        return None
-
-    @property
-    def breaks(self) -> None:
-        """Maps are smooth."""
-        return None
+    field: ClassVar[None] = None
+    """Nothing happens in the raster."""
+    breaks: ClassVar[None] = None
+    """Maps are smooth."""
 
     @property
     def size(self) -> tuple[int, int]:

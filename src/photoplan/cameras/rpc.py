@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -250,15 +251,10 @@ class RpcCamera:
     """From the polynomials' positions to those in the image (Fraser & Hanley 2003, eq. 4): a shift, a drift along the
     lines, or all six parameters; None: there is none."""
 
-    @property
-    def field(self) -> None:
-        """All is in the first factor."""
-        return None
-
-    @property
-    def breaks(self) -> None:
-        """Polynomials are smooth."""
-        return None
+    field: ClassVar[None] = None
+    """All is in the first factor."""
+    breaks: ClassVar[None] = None
+    """Polynomials are smooth."""
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """Ground (..., 3) to (x, y, 1); NaN where the polynomials do not hold."""

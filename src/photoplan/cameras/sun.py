@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,15 +25,10 @@ class SunProjection:
         """Larger than any map."""
         return _SIDE, _SIDE
 
-    @property
-    def field(self) -> None:
-        """Rays are straight."""
-        return None
-
-    @property
-    def breaks(self) -> None:
-        """They have no breaks."""
-        return None
+    field: ClassVar[None] = None
+    """Rays are straight."""
+    breaks: ClassVar[None] = None
+    """They have no breaks."""
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """Ground (..., 3) to (x, y, 1)."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from types import TracebackType
 
 import click
 
@@ -49,9 +48,7 @@ class Telling:
     def __enter__(self) -> Telling:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._clear()
 
     def begin(self, phase: str, units: int = 0, unit: str = "tiles") -> None:

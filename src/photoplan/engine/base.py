@@ -10,27 +10,12 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.base import Projection
 from photoplan.geometry.grid import Window
-from photoplan.geometry.levels import Pixels
+from photoplan.geometry.levels import FullSize, Pixels
 
 
 @runtime_checkable
-class Reader(Protocol):
-    """A source image that is read by windows; safe to call from several threads."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
-        ...
-
-    @property
-    def bands(self) -> int:
-        """Number of bands, without alpha."""
-        ...
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the pixels: uint8, uint16, int16 or float32."""
-        ...
+class Reader(FullSize, Protocol):
+    """A source image of uint8, uint16, int16 or float32, alpha not counted; safe to call from several threads."""
 
     def read(self, window: Window, level: int = 0) -> Pixels:
         """Pixels of a window inside the image, shape (bands, height, width), and their validity.

@@ -133,11 +133,7 @@ def _row_weights(rule: tuple[Any, ...], at: Any, wide: float, weights: NDArray[n
 
 @inner
 def _whole_mean(
-    image: tuple[Any, ...],
-    lines: tuple[Any, ...],
-    spot: tuple[Any, ...],
-    rule: tuple[Any, ...],
-    work: tuple[Any, ...],
+    image: tuple[Any, ...], lines: tuple[Any, ...], spot: tuple[Any, ...], rule: tuple[Any, ...], work: tuple[Any, ...]
 ) -> bool:
     """Mean as of `_mean_of_rows`, where all pixels are inside and usable; False where that is not so.
 
@@ -187,11 +183,7 @@ def _whole_mean(
 
 @inner
 def _find_taps(
-    lines: tuple[Any, ...],
-    spot: tuple[Any, ...],
-    image: tuple[Any, ...],
-    taps: int,
-    found: tuple[Any, ...],
+    lines: tuple[Any, ...], spot: tuple[Any, ...], image: tuple[Any, ...], taps: int, found: tuple[Any, ...]
 ) -> bool:
     """First element and fraction of the taps in each row; False if some may be outside or invalid.
 

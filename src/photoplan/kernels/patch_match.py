@@ -266,13 +266,7 @@ def match_patches(
         In: x, y, a11, a12, a21, a22 of the start, x and y in pixels of the window. Out: see `RESULTS`. The covariance
         is σ0² N⁻¹ with σ0² = eᵀe / (used pixels − 8), square pixels. NaN beyond the status where it is not CONVERGED.
     """
-    work = (
-        np.empty((_UNKNOWNS, _UNKNOWNS)),
-        np.empty(_UNKNOWNS),
-        np.empty((4, 4)),
-        np.empty(3),
-        np.empty(_UNKNOWNS),
-    )
+    work = (np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS), np.empty((4, 4)), np.empty(3), np.empty(_UNKNOWNS))
     for i in range(templates.shape[0]):
         results[i, _UNKNOWNS:] = np.nan
         status = _match(templates[i], weights[i], windows[i], limits, results[i], work)

@@ -16,16 +16,7 @@ from numpy.typing import NDArray
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.normals import _hit_normal
 from photoplan.kernels.pyramid import Pyramid
-from photoplan.kernels.raycast import (
-    ASK,
-    MISS,
-    OVER,
-    SURFACE,
-    Faces,
-    _block,
-    _span,
-    _through_mesh,
-)
+from photoplan.kernels.raycast import ASK, MISS, OVER, SURFACE, Faces, _block, _span, _through_mesh
 
 #: Of pixels that are left out: rays have to tell what they show.
 LEFT = -2

@@ -47,10 +47,7 @@ class Feather:
         return Window(window.col - r, window.row - r, window.width + 2 * r, window.height + 2 * r)
 
     def weights(
-        self,
-        share: Share,
-        wide: Window,
-        window: Window,
+        self, share: Share, wide: Window, window: Window
     ) -> dict[int, tuple[NDArray[np.float32], NDArray[np.bool_]]]:
         """Weights of the images that share pixels of a window, by row of the table of sources, shape (bands, height,
         width); all 0 where one alone paints. With each the pixels of `wide` that it sees or owns.

@@ -197,11 +197,7 @@ def follow(parts: TerrainParts, paths: ArrayLike, bend: float = 0.0, cache: Cach
 
 
 def carried_hits(
-    parts: TerrainParts,
-    paths: NDArray[np.float64],
-    carry: Carry | None,
-    bend: float,
-    cache: Cache | None = None,
+    parts: TerrainParts, paths: NDArray[np.float64], carry: Carry | None, bend: float, cache: Cache | None = None
 ) -> Hits:
     """First hits of rays over parts that lie in another CRS, to which `carry` takes map points; None: in the same."""
     if carry is None:

@@ -28,7 +28,7 @@ from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGrou
 
 _CODES = ("kind", "class", "code")
 _NAMES = ("name", "id", "nr", "label")
-_POINT, _LINE, _RING, _POLYGON = 0, 1, 2, 3
+_POINT, _LINE, _POLYGON = 0, 1, 3
 
 
 @dataclass(frozen=True, eq=False)

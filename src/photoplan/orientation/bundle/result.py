@@ -123,27 +123,17 @@ def solution_of(
     rows, found = linearise(model, state, np.sqrt(weight))
     reduced = reduce_normals(rows, len(model.point_names))
     e = whitened(model, found)
-    if not covariance:
-        none = np.full(len(e), np.nan)
-        return Solution(
-            model=model,
-            state=state,
-            reduced=reduced,
-            found=found,
-            e=e,
-            weight=weight,
-            inverse=None,
-            redundancies=none,
-            point_cofactors=np.full((len(model.point_names), 3, 3), np.nan),
-        )
-    try:
-        inverse = Inverse(reduced)
-    except GeometryError:
-        check_rank(model, state, reduced)
-        raise
-    points, variance = inverse.variances()
-    redundancies = np.clip(1.0 - variance, 0.0, 1.0)
-    if effects is not None:
+    inverse = None
+    redundancies, points = np.full(len(e), np.nan), np.full((len(model.point_names), 3, 3), np.nan)
+    if covariance:
+        try:
+            inverse = Inverse(reduced)
+        except GeometryError:
+            check_rank(model, state, reduced)
+            raise
+        points, variance = inverse.variances()
+        redundancies = np.clip(1.0 - variance, 0.0, 1.0)
+    if covariance and effects is not None:
         common, _ = linearise(model, state, np.sqrt(weight / effects))
         own = reduced.V_inverse
         reduced = reduce_normals(common, len(model.point_names))

@@ -78,12 +78,7 @@ def residuals_of_all(model: Model, state: State) -> _Floats:
     point = np.array([points.get(n, -1) for n in seen.points], np.int64)[seen.point]
     there = np.flatnonzero((image >= 0) & (point >= 0))
     every = replace(
-        model,
-        observation=there,
-        image=image[there],
-        point=point[there],
-        xy=seen.xy[there],
-        sigma=seen.sigma[there],
+        model, observation=there, image=image[there], point=point[there], xy=seen.xy[there], sigma=seen.sigma[there]
     )
     out = np.full((len(seen), 2), np.nan)
     out[there] = residuals_of(every, state).image
@@ -311,10 +306,7 @@ def _project(model: Model, state: State, derivatives: bool) -> _Rays:
     b = model.plane[model.image]
     x, y = plane[:, 0], plane[:, 1]
     px = np.stack(
-        [
-            b[:, 0] * x + (b[:, 1] + b[:, 2] * x) * y + b[:, 3],
-            b[:, 4] * x + (b[:, 5] + b[:, 6] * x) * y + b[:, 7],
-        ],
+        [b[:, 0] * x + (b[:, 1] + b[:, 2] * x) * y + b[:, 3], b[:, 4] * x + (b[:, 5] + b[:, 6] * x) * y + b[:, 7]],
         axis=-1,
     )
     outer = np.empty((len(t), 2, 2))

@@ -116,7 +116,7 @@ def _find(scan: Scan, layout: MarkLayout, known: FiducialSearch, wide: bool = Tr
         notes.append(better)
     if len(measured.found) < 3:
         raise MarksNotFound(_too_few(layout, measured, better), _sought(measured))
-    measured, dropped = _without_false(layout, measured, chosen.turn)
+    measured, dropped = _without_false(layout, measured)
     turn, fit, names, said = _decide(layout, measured, ties, chosen, known)
     return _result(layout, measured, turn, fit, names, (*notes, *said, *dropped))
 
@@ -225,7 +225,7 @@ def _typical_sigma(measured: Measured) -> float:
     return float(np.median([max(at.sigma_x, at.sigma_y) for at in measured.found.values()]))
 
 
-def _without_false(layout: MarkLayout, measured: Measured, turn: ScanTurn) -> tuple[Measured, list[str]]:
+def _without_false(layout: MarkLayout, measured: Measured) -> tuple[Measured, list[str]]:
     """Leave out one mark that contradicts at least four others that agree; with four marks none can be told."""
     notes: list[str] = []
     names = list(measured.found)

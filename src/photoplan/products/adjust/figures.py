@@ -233,10 +233,7 @@ def _field(result: MapResult, name: str, at: _Floats, residuals: _Floats) -> Res
     mean = np.stack([np.bincount(cell, residuals[:, k], rows * columns) for k in (0, 1)], axis=1)
     shown = np.flatnonzero(count >= _LEAST)
     middles = np.stack(
-        [
-            frame[0] + (shown % columns + 0.5) * width / columns,
-            frame[1] + (shown // columns + 0.5) * height / rows,
-        ],
+        [frame[0] + (shown % columns + 0.5) * width / columns, frame[1] + (shown // columns + 0.5) * height / rows],
         axis=1,
     )
     camera = result.prepared.inputs.project.cameras[name]

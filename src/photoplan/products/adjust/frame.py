@@ -86,11 +86,7 @@ def nadir_heights(project: Project, XY: _Floats, otherwise: float) -> _Floats:
 
 
 def make_bend(
-    project: Project,
-    frame: BlockFrame,
-    images: tuple[BlockImage, ...],
-    cameras: dict[str, BlockCamera],
-    nadir: _Floats,
+    project: Project, frame: BlockFrame, images: tuple[BlockImage, ...], cameras: dict[str, BlockCamera], nadir: _Floats
 ) -> Bend | None:
     """What earth curvature (as a correction) and refraction add to the central projection; None if nothing.
 

@@ -69,7 +69,7 @@ def look_at(project: Project, names: Sequence[str], force: bool, events: Events)
     return looked, blind
 
 
-def with_resolution(project: Project, settings: OrthoSettings, looked: Sequence[Looked], force: bool) -> OrthoSettings:
+def with_resolution(settings: OrthoSettings, looked: Sequence[Looked], force: bool) -> OrthoSettings:
     """Settings with a resolution: the images' own if none is chosen."""
     own = two_figures(float(np.mean([one.look.gsd for one in looked]))) if looked else 1.0
     resolution = settings.resolution or own

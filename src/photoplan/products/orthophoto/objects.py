@@ -80,7 +80,7 @@ def plan_objects(
     events.begin("planning", len(names), "images")
     looked, blind = look_at(project, names, force, events)
     refuse_mixed(looked)
-    chosen = with_resolution(project, chosen, looked, force)
+    chosen = with_resolution(chosen, looked, force)
     refuse_blind(chosen, looked, blind)
     looked = with_blur(looked, grid_of(project, chosen, [one.look.footprint for one in looked]), chosen, events)
     surface = looked[0].scene.surface

@@ -155,7 +155,7 @@ def plan_orthophotos(
     # Each image is looked at twice: where it lies, and which tiles it needs.
     events.begin("planning", 2 * len(names), "steps")
     looked, blind = look_at(project, names, force, events)
-    chosen = with_resolution(project, chosen, looked, force)
+    chosen = with_resolution(chosen, looked, force)
     products = []
     for one in looked:
         grid = grid_of(project, chosen, [one.look.footprint])

@@ -211,12 +211,7 @@ def _control(path: Path) -> tuple[list[str], _Floats, _Floats]:
 
 
 def _matched(
-    request: PhotoSkylineRequest,
-    reader: RasterReader,
-    control: Any,
-    target: ViewTarget,
-    line: Seen,
-    search: int,
+    request: PhotoSkylineRequest, reader: RasterReader, control: Any, target: ViewTarget, line: Seen, search: int
 ) -> PhotoMatch:
     edge = _edge(request, reader, line, search)
     residuals = edge[line.uvh[:, 0].astype(int)] - line.uvh[:, 1]

@@ -99,9 +99,7 @@ def plan_sequence(request: SequenceRequest) -> list[ViewPlan]:
     heights = (min(lows), max(highs))
     return [
         replace(
-            plan,
-            address=replace(plan.address, heights=heights),
-            key=run_key("view sequence", [plan.key, heights], []),
+            plan, address=replace(plan.address, heights=heights), key=run_key("view sequence", [plan.key, heights], [])
         )
         for plan in plans
     ]

@@ -15,15 +15,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
-from photoplan.geometry.motion import (
-    EvenTable,
-    between,
-    conjugate,
-    continuous,
-    cubic,
-    rotations,
-    times,
-)
+from photoplan.geometry.motion import EvenTable, between, conjugate, continuous, cubic, rotations, times
 from photoplan.io.camera.isd import FORM, FRAME_MODEL, Isd
 from photoplan.io.camera.line.csm_lens import look
 from photoplan.io.camera.line.model import StatedLine
@@ -71,10 +63,7 @@ def _track(isd: Isd) -> LineTrack:
         raise InputError("instrument_pointing holds a single moment; a trajectory has two at least")
     q = times(isd.turns("body_rotation", when), conjugate(isd.turns("instrument_pointing", when)))
     even = np.linspace(when[0], when[-1], len(when))
-    courses = [
-        EvenTable.over(t, fixed),
-        EvenTable.over(even, continuous(between(when, q, even))),
-    ]
+    courses = [EvenTable.over(t, fixed), EvenTable.over(even, continuous(between(when, q, even)))]
     courses = [replace(each, start=each.start - isd.numbers("center_ephemeris_time", ())) for each in courses]
     known = max(each.start for each in courses), min(each.end for each in courses)
     # Of attitudes there are two tables; where one has ended nothing is known (of a single value: it holds always).
