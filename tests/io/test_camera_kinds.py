@@ -33,7 +33,6 @@ ALLOWED = {
     "cameras/line_chips.py": "a kind of several of a kind",
     "cameras/line_correctable.py": "corrections of a kind",
     "cameras/line_measured.py": "compares measured points with a kind",
-    "cameras/line_tremor.py": "what of a kind changes from line to line",
     "io/camera/line/model.py": "makes a kind of what files state",
     "__init__.py": "public names",
     "cameras/__init__.py": "public names",
