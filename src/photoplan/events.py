@@ -2,11 +2,16 @@
 
 Whoever works calls it; a command shows it on a terminal or writes a line now and then, a test keeps it, most callers
 want nothing of it (`SILENT`).
+
+What takes minutes inside of one part of a work says how far it is by `tell`, wherever it is called from, and knows
+neither whose part it is nor who listens.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, Protocol
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
@@ -30,8 +35,20 @@ class Events(Protocol):
         """
         ...
 
-    def done(self, units: int = 1, pixels: int = 0) -> None:
-        """So many more parts of the phase are done, with so many more pixels; 0 is a sign of life."""
+    def done(self, units: int = 1, pixels: int = 0, begun: float = 0.0, what: str = "") -> None:
+        """So many more parts of the phase are done, with so many more pixels; 0 is a sign of life.
+
+        Parameters
+        ----------
+        begun : float
+            How many parts those add up to that are done now of parts that have begun.
+        what : str
+            What is done in one of these, such as "level 2 of 5".
+        """
+        ...
+
+    def kept(self, units: int) -> None:
+        """So many more parts of the phase are done, which took no time: an earlier run had made them."""
         ...
 
     def talk(self, text: str) -> None:
@@ -49,7 +66,10 @@ class Silent:
     def begin(self, phase: str, units: int = 0, unit: str = "tiles") -> None:
         """Nothing."""
 
-    def done(self, units: int = 1, pixels: int = 0) -> None:
+    def done(self, units: int = 1, pixels: int = 0, begun: float = 0.0, what: str = "") -> None:
+        """Nothing."""
+
+    def kept(self, units: int) -> None:
         """Nothing."""
 
     def talk(self, text: str) -> None:
@@ -60,3 +80,41 @@ class Silent:
 
 
 SILENT = Silent()
+
+_LISTENER: ContextVar[Callable[[float, str], None] | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def listening(told: Callable[[float, str], None]) -> Iterator[None]:
+    """Inside, whatever this thread tells is told to a function: how much is done, 0 to 1, and what is done now."""
+    before = _LISTENER.set(told)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(before)
+
+
+def tell(share: float, what: str = "") -> None:
+    """Say how much is done of the part of a work that this thread is at, 0 to 1, and perhaps what is done now.
+
+    Whoever listens may end the part by an error.
+    """
+    listener = _LISTENER.get()
+    if listener is not None:
+        listener(share, what)
+
+
+@contextmanager
+def stretch(begin: float, end: float, what: str = "") -> Iterator[None]:
+    """Inside, whatever is told is a part of the work around it, from one share of that to another."""
+    tell(begin, what)
+    outer = _LISTENER.get()
+    if outer is None:
+        yield
+        return
+
+    def told(share: float, inner: str) -> None:
+        outer(begin + share * (end - begin), ", ".join(filter(None, (what, inner))))
+
+    with listening(told):
+        yield

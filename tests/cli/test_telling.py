@@ -41,6 +41,30 @@ def test_slow_rates_are_told_in_pixels() -> None:
         assert events.line(clock.now + 45.0) == "tiles: 1/4 tiles 1092 px/s 0:03:00 left"
 
 
+def test_parts_of_tiles_under_way_count_and_are_told() -> None:
+    clock = Clock()
+    with Telling(False, terminal=False, clock=clock) as events:
+        events.begin("tiles", 2)
+        clock.now += 60
+        events.done(0, 0, 0.5, "level 3 of 5")
+        assert events.line(clock.now) == "tiles: 0/2 tiles (25%, level 3 of 5) 0:03:00 left"
+        events.done(1, 0, 0.2)
+        assert events.line(clock.now) == "tiles: 1/2 tiles (60%) 0:00:40 left"
+        events.done()
+        assert events.line(clock.now) == "tiles: 2/2 tiles for 0:01:00"
+
+
+def test_what_an_earlier_run_has_done_tells_nothing_of_the_pace() -> None:
+    clock = Clock()
+    with Telling(False, terminal=False, clock=clock) as events:
+        events.begin("tiles", 100)
+        events.kept(50)
+        clock.now += 30
+        assert events.line(clock.now) == "tiles: 50/100 tiles for 0:00:30"
+        events.done()
+        assert events.line(clock.now) == "tiles: 51/100 tiles 0:24:30 left"
+
+
 def test_on_a_terminal_a_line_that_moves_and_gives_way(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     with Telling(False, print, terminal=True, clock=clock) as events:

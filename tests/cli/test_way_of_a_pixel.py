@@ -53,7 +53,7 @@ def test_eleven_frames_and_never_up(
     monkeypatch.setattr(executors.ThreadPoolExecutor, "submit", submitted)
     words = ["ortho", pristine.project, *OPTIONS, "--images", "one", "--output", tmp_path, "--workers", workers]
     assert photoplan(*words).code == 0
-    way = ways[0] if workers == 1 else handed[0] + ways[0]
+    way = handed[0] + ways[0]
     way = [*way[[name for _, name in way].index("command") :], ("kernels/rectify", "rectify_tile")]
     assert len(way) <= MOST, way
     layers = [LAYERS.index(path.split("/")[0]) for path, _ in way]

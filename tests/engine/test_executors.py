@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from photoplan.engine import executors
-from photoplan.engine.executors import RETRIES, Outcome, SerialExecutor, Workers, executor_factory, run_tiles
+from photoplan.engine.executors import RETRIES, Outcome, Workers, executor_factory, run_tiles
 from photoplan.errors import InputError, UsageError
 
 
@@ -83,7 +83,7 @@ def test_the_executor_stays_for_the_next_call() -> None:
     made: list[Executor] = []
 
     def make() -> Executor:
-        made.append(SerialExecutor())
+        made.append(ThreadPoolExecutor(1))
         return made[-1]
 
     with Workers(make) as workers:
@@ -93,8 +93,8 @@ def test_the_executor_stays_for_the_next_call() -> None:
     assert len(made) == 1
 
 
-@pytest.mark.parametrize("kind", ["threads", "serial"])
-def test_an_error_is_tried_again_and_then_told(kind: str) -> None:
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_is_tried_again_and_then_told(workers: int) -> None:
     """An unforeseen error may pass (a network drive); one that stays costs its own tile only."""
     calls: Counter[int] = Counter()
 
@@ -104,7 +104,7 @@ def test_an_error_is_tried_again_and_then_told(kind: str) -> None:
             raise RuntimeError("the drive is gone")
         return task
 
-    done = {o.task: o for o in outcomes(range(8), work, executor_factory("threads", 2 if kind == "threads" else 1))}
+    done = {o.task: o for o in outcomes(range(8), work, executor_factory("threads", workers))}
     assert calls == {**dict.fromkeys(range(8), 1), 3: RETRIES + 1, 5: RETRIES + 1}
     assert done[3] == Outcome(3, None, "RuntimeError: the drive is gone")
     assert [t for t, o in done.items() if o.error is not None] == [3]

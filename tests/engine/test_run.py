@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import pickle
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError
 from typing import Any
 
 import numpy as np
 import pytest
 from tools.events import Told
 
+from photoplan.engine import executors
 from photoplan.engine.executors import Workers, executor_factory
 from photoplan.engine.run import Kept, Made, Runner, Tally, Work, tiles_in_flight
+from photoplan.engine.shares import Shared
 from photoplan.errors import InputError, UsageError
+from photoplan.events import stretch, tell
 from photoplan.geometry.grid import Window
 from photoplan.plan.tiles import Tile
 
@@ -175,3 +180,74 @@ def test_memory_bounds_tiles_in_flight() -> None:
     assert tiles_in_flight(8, 10**6, 100, 10) == 8
     with pytest.raises(UsageError, match="`memory` 1 MiB; at least 3 MiB"):
         tiles_in_flight(8, 1 << 20, 1 << 20, 2 << 20)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_tile_tells_how_far_it_is_while_others_wait(monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
+    """In the thread that began the work, also where there is one worker."""
+    monkeypatch.setattr(executors, "PULSE", 0.01)
+    heard = threading.Event()
+
+    class Hearing(Told):
+        def done(self, units: int = 1, pixels: int = 0, begun: float = 0.0, what: str = "") -> None:
+            assert threading.current_thread() is threading.main_thread()
+            super().done(units, pixels, begun, what)
+            if begun == 0.375:
+                heard.set()
+
+    def slow(tile: Tile) -> Made:
+        if tile.index == 1:
+            with stretch(0.25, 0.5, "level 2 of 3"):
+                tell(0.5, "half")
+                assert heard.wait(60)
+        return made(tile)
+
+    told = Hearing()
+    told.begin("tiles")
+    with Workers(executor_factory("threads", workers)) as pool:
+        Runner(pool, workers, told).run([work("a", [Memory()], slow)])
+    assert told.units["tiles"] == 5 and (0.375, "level 2 of 3, half") in told.begun
+    # What is done counts as a whole, and no longer as a part.
+    assert max(begun for begun, _ in told.begun) == 0.375
+
+
+def test_what_nobody_waits_for_ends_where_it_tells_how_far_it_is() -> None:
+    ended, told = threading.Event(), threading.Event()
+
+    def long(tile: Tile) -> Made:
+        if tile.index == 1:
+            assert told.wait(60)
+            raise InputError("this ends the run")
+        try:
+            while True:
+                tell(0.5)
+                told.set()
+        except CancelledError:
+            ended.set()
+            raise
+
+    with pytest.raises(InputError, match="this ends the run"):
+        run(work("a", [Memory()], long), workers=2)
+    assert ended.wait(60)
+
+
+def test_shares_of_a_tile() -> None:
+    """Parts of parts; without anybody who listens nothing is told, and another process gets the job itself."""
+    found = []
+
+    def job(tile: Tile) -> Made:
+        for k in range(2):
+            with stretch(k / 2, (k + 1) / 2, f"part {k + 1}"):
+                for share in (0.0, 0.5):
+                    tell(share, "level")
+                    found.append(shared.under_way())
+        return made(tile)
+
+    shared = Shared(job)
+    assert job(TILES[0]) and found == [(0.0, "")] * 4
+    found.clear()
+    shared(TILES[0])
+    assert found == [(0.0, "part 1, level"), (0.25, "part 1, level"), (0.5, "part 2, level"), (0.75, "part 2, level")]
+    shared.ended(TILES[0])
+    assert shared.under_way() == (0.0, "")
+    assert pickle.loads(pickle.dumps(Shared(made))) is made

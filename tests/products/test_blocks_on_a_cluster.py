@@ -1,7 +1,8 @@
-"""`balance` and `seams` with other workers than threads: a Dask cluster by its address, processes."""
+"""`balance`, `seams` and `surface` with other workers than threads: a Dask cluster by its address, processes."""
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,10 @@ import pyogrio
 import pytest
 import shapely
 from tools.command import Here
-from tools.small_block import Block
+from tools.facet_scene import GROUND, write_scene
+from tools.small_block import X0, Y0, Block
+
+from photoplan.products.surface import run as surfaces
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +62,25 @@ def test_fault_26_the_same_tables_and_regions(small: Block, capsys: pytest.Captu
         found[name] = both(photoplan, small, folder / name, executor)
     assert len(found["threads"][0]) == 3 and len(found["threads"][1]) > 1
     assert same(found["threads"], found["cluster"]) and same(found["threads"], found["processes"])
+
+
+@pytest.mark.slow
+def test_fault_26_the_same_bytes_of_a_surface(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Heights, grey values and all that is beside them, in two tiles."""
+    monkeypatch.setattr(surfaces, "TILE", 128)
+    scene, made = write_scene(tmp_path, 3), {}
+    words = ("surface", scene.path, "--resolution", 0.5, "--bounds", X0 - 18, Y0 - 34, X0 + 18, Y0 + 34)
+    words += ("--start", GROUND, "--residuals", "--workers", 2, "--no-quicklook", "-q", "--points", "points.ply")
+    for name, executor in (("threads", "threads"), ("cluster", address), ("processes", "processes")):
+        out = tmp_path / name
+        said = Here(capsys)(*words[:-1], out / "points.ply", "--executor", executor, "-o", out)
+        assert said.code == 0, said.err
+        made[name] = {path.name: path.read_bytes() for path in out.iterdir() if path.suffix != ".json"}
+        assert json.loads((out / "surface.run.json").read_text())["product"]["tiles"] == 2
+    assert len(made["threads"]) == 8
+    assert made["threads"] == made["cluster"] and made["threads"] == made["processes"]
 
 
 @pytest.mark.slow

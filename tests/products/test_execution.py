@@ -16,6 +16,7 @@ from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Block, make_project, tex
 from tools.town import write_town
 
 from photoplan.engine import execute as engine_execute
+from photoplan.engine.executors import threads
 from photoplan.errors import InputError, ResourceError, TilesFailed, UsageError
 from photoplan.io.product import ProductFile
 from photoplan.io.project.file import load_project
@@ -220,11 +221,11 @@ def test_an_input_that_changes_after_planning_is_refused(small: Block) -> None:
 class TestFault06Memory:
     @pytest.mark.parametrize(("workers", "most"), [(1, 1), (2, 4), (8, 16)])
     def test_tiles_in_flight(self, workers: int, most: int) -> None:
-        assert Run(workers).in_flight() == most
-        assert Run(workers, memory=10**12).in_flight() == most
+        assert Run().in_flight(threads(workers)) == most
+        assert Run(memory=10**12).in_flight(threads(workers)) == most
 
     def test_less_memory_means_fewer_tiles(self) -> None:
-        counts = [Run(8, memory=m * 2**20).in_flight() for m in (500, 700, 1000, 2000)]
+        counts = [Run(memory=m * 2**20).in_flight(threads(8)) for m in (500, 700, 1000, 2000)]
         assert counts == sorted(counts)
         assert counts[0] == 1
         assert counts[-1] > 8

@@ -13,6 +13,8 @@ class Told:
         self.phases: list[tuple[str, int, str]] = []
         self.units: Counter[str] = Counter()
         """Units done, by phase."""
+        self.begun: list[tuple[float, str]] = []
+        """What parts under way added up to, and what was done there, whenever that was told."""
         self.pixels = 0
         self.talked: list[str] = []
         self.results: list[Any] = []
@@ -20,9 +22,14 @@ class Told:
     def begin(self, phase: str, units: int = 0, unit: str = "tiles") -> None:
         self.phases.append((phase, units, unit))
 
-    def done(self, units: int = 1, pixels: int = 0) -> None:
+    def done(self, units: int = 1, pixels: int = 0, begun: float = 0.0, what: str = "") -> None:
         self.units[self.phases[-1][0]] += units
         self.pixels += pixels
+        if begun or what:
+            self.begun.append((begun, what))
+
+    def kept(self, units: int) -> None:
+        self.units[self.phases[-1][0]] += units
 
     def talk(self, text: str) -> None:
         self.talked.append(text)

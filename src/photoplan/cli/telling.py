@@ -54,14 +54,20 @@ class Telling:
     def begin(self, phase: str, units: int = 0, unit: str = "tiles") -> None:
         """A phase begins."""
         self._phase, self._units, self._unit = phase, units, unit
-        self._finished = self._pixels = 0
+        self._finished = self._pixels = self._kept = 0
         self._began = self._clock()
         self.done(0)
 
-    def done(self, units: int = 1, pixels: int = 0) -> None:
+    def kept(self, units: int) -> None:
+        """Count what an earlier run has done; it tells nothing of the pace of this one."""
+        self._kept += units
+        self.done(units)
+
+    def done(self, units: int = 1, pixels: int = 0, begun: float = 0.0, what: str = "") -> None:
         """Count what is done; tell it if that is due."""
         self._finished += units
         self._pixels += pixels
+        self._begun, self._what = begun, what
         now = self._clock()
         if self._quiet or not self._phase or now - self._last < (OFTEN if self._terminal else SELDOM):
             return
@@ -76,19 +82,21 @@ class Telling:
     def line(self, now: float) -> str:
         """What there is to say at a time: phase, units done, rate, time left."""
         took = max(now - self._began, 1e-6)
-        words = [f"{self._phase}:"]
+        words, finished = [f"{self._phase}:"], self._finished + self._begun
         if self._units:
-            share = min(1.0, self._finished / self._units)
+            share = min(1.0, finished / self._units)
             if self._terminal:
                 words.append("▇" * round(_BAR * share) + "·" * (_BAR - round(_BAR * share)))
             words.append(f"{self._finished}/{self._units} {self._unit}")
+            if self._begun:
+                words.append(f"({', '.join([f'{share:.0%}', *filter(None, [self._what])])})")
         elif self._finished:
             words.append(f"{self._finished} {self._unit}")
         if self._pixels:
             rate = self._pixels / took
             words.append(f"{rate / 1e6:.3g} Mpx/s" if rate >= _SLOW else f"{rate:.0f} px/s")
-        if 0 < self._finished < self._units:
-            words.append(f"{_time(took / self._finished * (self._units - self._finished))} left")
+        if self._kept < finished < self._units:
+            words.append(f"{_time(took / (finished - self._kept) * (self._units - finished))} left")
         else:
             words.append(f"for {_time(took)}")
         return " ".join(words)

@@ -42,19 +42,6 @@ RETRIES = 2
 PULSE = 1.0
 
 
-class SerialExecutor(Executor):
-    """Runs each task in the caller's thread when it is submitted."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run `fn` now; the future that is returned is done."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What became of one task."""
@@ -85,7 +72,8 @@ def executor_factory(kind: str, workers: int) -> Callable[[], Executor]:
     if workers < 1:
         raise UsageError(f"{workers} workers; at least one is needed")
     if kind == "threads":
-        return (lambda: SerialExecutor()) if workers == 1 else (lambda: ThreadPoolExecutor(workers, "photoplan"))
+        # One worker is a thread as well: whoever waits for it can say so.
+        return lambda: ThreadPoolExecutor(workers, "photoplan")
     if kind == "processes":
         return lambda: _ProcessExecutor(workers)
     if "://" in kind:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from photoplan.engine.cluster import opened
 from photoplan.engine.executors import PULSE, Workers, run_tiles
+from photoplan.engine.shares import Shared
 from photoplan.errors import PhotoplanError, TilesFailed, UsageError
 from photoplan.events import Events
 
@@ -196,7 +197,7 @@ class Runner(Generic[T]):
     ) -> None:
         self.results: list[T] = []
         """In the order of the products; complete when the context ends."""
-        self._workers, self._in_flight, self._events = workers, in_flight or workers.in_flight, events
+        self.workers, self._in_flight, self._events = workers, in_flight or workers.in_flight, events
         self._excuse = excuse
         self._completing: deque[tuple[Work[T] | Kept[T], Future[T]]] = deque()
         self._pool = ThreadPoolExecutor(1, "photoplan-complete")
@@ -233,7 +234,7 @@ class Runner(Generic[T]):
                     kept: Future[T] = Future()
                     kept.set_result(work.result)
                     self._completing.append((work, kept))
-                    self._events.done(work.tiles)
+                    self._events.kept(work.tiles)
                     self._settle_done()
                     continue
                 with ExitStack() as stack:
@@ -262,7 +263,7 @@ class Runner(Generic[T]):
                 tally.add(work.sinks[0].record(tile.index))
         if tally.resumed:
             self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
-            self._events.done(tally.resumed)
+            self._events.kept(tally.resumed)
         if work.count:
             empty = np.ones(work.count, bool)
             for tile in work.tiles:
@@ -272,24 +273,25 @@ class Runner(Generic[T]):
                     for sink in work.sinks:
                         sink.append_empty(index)
         waiting = (tile for tile in work.tiles if tile.index not in finished)
-        job = self._workers.prepared(work.job, work.scratch)
-        for outcome in run_tiles(waiting, job, self._workers, self._in_flight, self._pulse):
-            tile = outcome.task
-            if outcome.error is None:
-                made: Made = opened(outcome.result)
-                _store(work.sinks, tile.index, made)
-                tally.add(made.record)
-            else:
-                tally.failed.append(tile.index)
-                tally.reasons.append(f"tile {tile.index}: {outcome.error}")
-            self._events.done(1, tile.pixels)
-            self._settle_done()
+        with Shared(self.workers.prepared(work.job, work.scratch)) as job:
+            for outcome in run_tiles(waiting, job, self.workers, self._in_flight, lambda: self._pulse(job)):
+                tile = outcome.task
+                if outcome.error is None:
+                    made: Made = opened(outcome.result)
+                    _store(work.sinks, tile.index, made)
+                    tally.add(made.record)
+                else:
+                    tally.failed.append(tile.index)
+                    tally.reasons.append(f"tile {tile.index}: {outcome.error}")
+                job.ended(tile)
+                self._events.done(1, tile.pixels, *job.under_way())
+                self._settle_done()
         if work.scratch is not None:
             shutil.rmtree(work.scratch, ignore_errors=True)
         return tally
 
-    def _pulse(self) -> None:
-        self._events.done(0)
+    def _pulse(self, job: Shared) -> None:
+        self._events.done(0, 0, *job.under_way())
         self._settle_done()
 
     def _settle_done(self) -> None:

@@ -154,7 +154,7 @@ class Steps:
         at = [first ^ k for k in range(len(values))] if names is None else [store.index(name) for name in names]
         finished = store.finished
         tasks = [Item(k, value, pixels(value)) for k, value in zip(at, values, strict=True) if k not in finished]
-        self._events.done(len(values) - len(tasks))
+        self._events.kept(len(values) - len(tasks))
         # What was kept before is no task.
         work: Work[None] = Work(
             name=self._name,

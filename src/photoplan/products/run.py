@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from photoplan.engine.cluster import Question
 from photoplan.engine.execute import MOST_SOURCE_BYTES
-from photoplan.engine.executors import Workers, executor_factory
-from photoplan.engine.run import tiles_in_flight
+from photoplan.engine.executors import Workers, executor_factory, open_workers
+from photoplan.engine.run import Runner, tiles_in_flight
 from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.run_record import run_times, versions
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 320 * 2**20
+#: And of a tile: its source window as read and as packed for the kernel, relief, anchors and result.
+_EACH = 3 * MOST_SOURCE_BYTES
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Run:
     events: Events = SILENT
     """Told of tiles that are done, and of each product's result, also if some of its tiles failed."""
 
-    def check(self) -> None:
+    def check(self, each: int = _EACH) -> None:
         """Refuse what cannot work, before any work.
 
         Raises
@@ -44,26 +47,23 @@ class Run:
         UsageError
             An unknown executor, less than one worker, or too little memory for one tile.
         """
-        executor_factory(self.executor, self.workers)
-        self.in_flight()
+        self.in_flight(Workers(executor_factory(self.executor, self.workers), self.workers), each)
 
-    def in_flight(self, threads: int | None = None) -> int:
-        """Tiles that may be under way at once.
+    def in_flight(self, workers: Workers, each: int = _EACH) -> int:
+        """Tiles that may be under way at once, each of which takes so many bytes; raises as `check`."""
+        return tiles_in_flight(workers.in_flight, self.memory, BASE_MEMORY, each)
 
-        Parameters
-        ----------
-        threads : int, optional
-            Those of a cluster; the workers of this machine if it is None.
+    @contextmanager
+    def runner(self, inputs: Iterable[Path], folder: Path, each: int = _EACH) -> Iterator[Runner[Any]]:
+        """What makes products whose tiles take `each` bytes; workers of a cluster must see the inputs, and may see the
+        folder of the products. For errors see `open_workers`."""
+        with open_workers(self.executor, self.workers, question(inputs, folder), self.events) as workers:
+            yield Runner(workers, self.in_flight(workers, each), self.events)
 
-        Raises
-        ------
-        UsageError
-            `memory` does not suffice for one tile.
-        """
-        workers = threads or self.workers
-        wanted = workers if workers == 1 else 2 * workers
-        # A tile holds its source window as read and as packed for the kernel, relief, anchors and result.
-        return tiles_in_flight(wanted, self.memory, BASE_MEMORY, 3 * MOST_SOURCE_BYTES)
+    def clock(self, workers: Workers) -> Callable[[], dict[str, Any]]:
+        """Gives what a record says of the run when a product is complete: times from now on, and who worked."""
+        times, how = run_times(), {"workers": self.workers, "executor": self.executor, "memory": self.memory}
+        return lambda: {**how, **times(), "workers_versions": workers.versions}
 
 
 def refuse_inputs(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
@@ -92,9 +92,3 @@ def _identity(path: Path) -> object:
 def question(files: Iterable[Path], folder: Path) -> Question:
     """What workers of a cluster are asked: whether they see the files, and the folder of the product."""
     return Question(versions, tuple(str(path.resolve()) for path in files), str(folder.resolve()))
-
-
-def clock(workers: Workers) -> Callable[[], dict[str, Any]]:
-    """Gives times and the workers' versions when a product is complete."""
-    times = run_times()
-    return lambda: {**times(), "workers_versions": workers.versions}

@@ -88,6 +88,12 @@ def facets_of(grid: MapGrid, window: Window, level: int, ratio: int, margin: int
     return Facets(left=float(left), top=float(top), pitch=grid.resolution * step, shape=(rows, columns), ratio=ratio)
 
 
+def levels_done(coarsest: int, level: int, part: float) -> float:
+    """How much of all levels is done when so much of one is: each has four times as many facets as the one before."""
+    before, now = 0.25**coarsest, 0.25**level
+    return ((now - before) / 3 + part * now) / ((1 - before) / 3 + 1)
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """An image that takes part."""

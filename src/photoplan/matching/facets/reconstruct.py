@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.events import stretch, tell
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.block import FacetBlock
 from photoplan.matching.facets.curvature import Roughness
@@ -21,7 +22,7 @@ from photoplan.matching.facets.judged import (
     misfit_variances,
     residual_pictures,
 )
-from photoplan.matching.facets.observe import MARGIN, Facets, Sight, View, facets_of, look
+from photoplan.matching.facets.observe import MARGIN, Facets, Sight, View, facets_of, levels_done, look
 from photoplan.matching.facets.radiometry import Transfer, first_guess
 from photoplan.matching.facets.search import Search, Searched, search
 
@@ -52,6 +53,9 @@ _BESIDE = 5
 _MISFIT = 2.0
 #: Standard deviation of grey values until it is estimated, part of their contrast.
 _NOISE = 0.1
+#: What a search costs, part of all; and of a level what is done when it is opened, before each estimate of roughness,
+#: and before its statistics.
+_SEARCHED, _OPENED, _ADJUSTED, _SETTLED = 0.35, 0.1, (0.35, 0.65), 0.85
 
 
 @dataclass(frozen=True)
@@ -129,12 +133,14 @@ def reconstruct(
     found: Searched | None = None
     reach = scheme.reach
     if scheme.search is not None:
-        found = search(views, grid, window, scheme.search, start, scheme.reach)
+        with stretch(0.0, _SEARCHED, "search"):
+            found = search(views, grid, window, scheme.search, start, scheme.reach)
         if found is None:
             return None
         start, reach = found, scheme.search.room
     moves = [0.0] * (scheme.coarsest + 1)
     for level in range(scheme.coarsest, -1, -1):
+        _tell(scheme, level, 0.0)
         facets = facets_of(grid, window, level, scheme.ratio)
         heights = _start_heights(start, facets) if block is None else _finer(block, facets, start)
         if heights is None:
@@ -142,6 +148,7 @@ def reconstruct(
         block = _opened(views, level + scheme.base, facets, heights, block, reach) or block
         if block is None or block.facets is not facets:
             continue
+        _tell(scheme, level, _OPENED)
         block.limits, block.reach = _limits(start, facets, reach), reach
         if level == scheme.coarsest:
             if found is None:
@@ -151,6 +158,7 @@ def reconstruct(
                 block.trusted = found.sure if found.sure.mean() > _TRUSTED else None
         block.adjust(_FIRST[level < scheme.coarsest], True)
         for k, (estimates, iterations) in enumerate(_THEN[level > 0]):
+            _tell(scheme, level, _ADJUSTED[k])
             if level == 0:
                 block.trusted = _telling(block, found)
             block.roughen(estimates)
@@ -159,8 +167,16 @@ def reconstruct(
         moves[level] = block.moves[-1]
     if block is None or block.facets.pitch != grid.resolution:
         return None
+    _tell(scheme, 0, _SETTLED)
     made = _found(block, views, window, tuple(moves), residuals)
     return made if found is None else _doubting(made, found, window, scheme)
+
+
+def _tell(scheme: Scheme, level: int, part: float) -> None:
+    """Say that so much of a level is done."""
+    begun = 0.0 if scheme.search is None else _SEARCHED
+    share = begun + (1 - begun) * levels_done(scheme.coarsest, level, part)
+    tell(share, f"level {scheme.coarsest - level + 1} of {scheme.coarsest + 1}")
 
 
 def _telling(block: FacetBlock, found: Searched | None) -> NDArray[np.bool_] | None:

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.cameras.base import project
+from photoplan.events import stretch, tell
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.semi_global import choose, scatter, sum_paths
 from photoplan.kernels.sweep import HALF_COLUMNS, HALF_ROWS, MOST_PAIRS, add_costs, describe, sample_plane
-from photoplan.matching.facets.observe import Facets, View, facets_of, pixels_between
+from photoplan.matching.facets.observe import Facets, View, facets_of, levels_done, pixels_between
 
 _Doubles = NDArray[np.float64]
 _Integers = NDArray[np.int64]
@@ -155,7 +156,9 @@ def search(
         if found is not None:
             near = _near(found, facets)
             low, high = np.clip(near[0], low, high), np.clip(near[1], low, high)
-        before, found = found, _level(views, level, how.base, facets, planes, low, high + 1) or found
+        begin, end = (levels_done(how.coarsest, level, part) for part in (0.0, 1.0))
+        with stretch(begin, end, f"level {how.coarsest - level + 1} of {how.coarsest + 1}"):
+            before, found = found, _level(views, level, how.base, facets, planes, low, high + 1) or found
         if before is not None and found is not None and found is not before:
             found = replace(found, variance=found.variance + _nearest(before.facets, before.variance, facets))
     if found is None or found.facets.pitch != grid.resolution:
@@ -226,6 +229,7 @@ def _level(
         active = (low <= k) & (k < high)
         if not active.any():
             continue
+        tell((k - int(low.min())) / int(high.max() - low.min()))
         cells = _cells(active, m, shape[1:], (half, half))
         around = ndimage.maximum_filter(cells, (2 * HALF_ROWS + 1, 2 * HALF_COLUMNS + 1))
         for n, (_, _, raw) in enumerate(seen):

@@ -13,8 +13,8 @@ import numpy as np
 from photoplan import __version__
 from photoplan.cameras.base import tremor_told
 from photoplan.engine.execute import OutputName, RenderJob
-from photoplan.engine.executors import Workers, open_workers
-from photoplan.engine.run import Kept, Runner, Tally, Work
+from photoplan.engine.executors import Workers
+from photoplan.engine.run import Kept, Tally, Work
 from photoplan.errors import PhotoplanError, TilesFailed
 from photoplan.events import Events
 from photoplan.io.disk import make_folder
@@ -42,7 +42,7 @@ from photoplan.products.orthophoto.keys import known_errors, tile_keys
 from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, painting
 from photoplan.products.orthophoto.stack import stack_index, write_stack
-from photoplan.products.run import Run, clock, question, refuse_inputs
+from photoplan.products.run import Run, refuse_inputs
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files, open_scene
 from photoplan.project.scenes import Scenes, ScenesAddress
@@ -104,10 +104,9 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     if plan.settings.choice is not None:
         _tell_of_one_colour([p for p in plan.products if p.plan.name not in kept], plan.project, run.events)
     run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))
-    asked = question(_pixel_files(plan), folder)
-    with open_workers(run.executor, run.workers, asked, run.events) as workers:
-        works = (_work(plan, p, folder, run, kept.get(p.plan.name), workers) for p in plan.products)
-        results = Runner[ProductResult](workers, run.in_flight(workers.threads), run.events).run(works)
+    with run.runner(_pixel_files(plan), folder) as runner:
+        works = (_work(plan, p, folder, run, kept.get(p.plan.name), runner.workers) for p in plan.products)
+        results: list[ProductResult] = runner.run(works)
     if picture is not None:
         write_overview([r.path for r in results if not r.failed], picture)
     for path in index:
@@ -189,7 +188,7 @@ def _work(
         tiles=product.plan.tiles,
         count=product.plan.tiles.total,
         sinks=tuple(files.values()),
-        complete=partial(_complete, plan, product, address, run, files, clock(workers)),
+        complete=partial(_complete, plan, product, address, files, run.clock(workers)),
         scratch=paths["picture"].with_name(f".{paths['picture'].name}.parcels"),
     )
 
@@ -204,7 +203,6 @@ def _complete(
     plan: OrthoPlan,
     product: OrthoProduct,
     address: ScenesAddress,
-    run: Run,
     files: Mapping[OutputName, ProductFile],
     times: Callable[[], dict[str, Any]],
     tally: Tally,
@@ -246,7 +244,7 @@ def _complete(
                 result.path,
                 key=product.key,
                 inputs=[input_entry(path, digest) for path, digest in address.digests],
-                run={"workers": run.workers, "executor": run.executor, "memory": run.memory, **ran},
+                run=ran,
                 values_moved_off_nodata=facts.moved_values,
                 bytes=facts.bytes,
                 **_record(plan, product, address.open(), result),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from photoplan.products.surface.plan import HARDLY, SurfacePlan
@@ -40,7 +42,17 @@ def findings(
         Of the heights: see `SurfaceResult`; the last correction of the finest level; the part of the posts that has
         none since it went too far from the start.
     """
-    lines = [plan.apart_text] if plan.apart_text else []
+    return (
+        *filter(None, [plan.apart_text]),
+        *_of_images(plan, sigma0, contrast),
+        *_of_fits(plan, misfit_share, astray),
+        *_of_moves(plan, correction, sigma_px),
+        *_of_noise(plan, sigma_px, misfit_share),
+    )
+
+
+def _of_images(plan: SurfacePlan, sigma0: dict[str, float | None], contrast: float) -> Iterator[str]:
+    """What standard deviations of grey values tell."""
     known = {name: value for name, value in sigma0.items() if value is not None}
     others = {
         name: float(np.median([v for other, v in known.items() if other != name])) for name in known if len(known) > 2
@@ -50,7 +62,7 @@ def findings(
     alone = [name for name in judged if known[name] > _ALONE * others[name]]
     usual = float(np.median([*known.values()])) if known else 0.0
     if not known:
-        lines.append(
+        yield (
             "there is no height: within `reach` of the start (`start`) no two images see the same, or the start has no "
             "heights there. `photoplan check` tells where each image lies"
         )
@@ -59,33 +71,41 @@ def findings(
         whose, them = "its orientation is wrong, or it shows something else", "it"
         if len(alone) > 1:
             whose, them = "their orientations are wrong, or they show something else", "them"
-        lines.append(
+        yield (
             f"sigma0 of {listed} is far above that of the other images (in brackets): {whose}. `photoplan tie` and "
             f"`photoplan adjust` orient anew; `images` leaves {them} out"
         )
     elif contrast > 0 and usual > _NOISY * contrast:
         coarse = ", the relief is finer than `resolution`" if plan.scheme.base else ""
-        lines.append(
+        yield (
             f"sigma0 is {usual / contrast:.0%} of the contrast of the ground: images do not show the same, or no "
             f"texture. Orientations are wrong (`photoplan tie`, `photoplan adjust`){coarse}, or the start was too far "
             "away (`start`, `reach`)"
         )
+
+
+def _of_fits(plan: SurfacePlan, misfit_share: float, astray: float) -> Iterator[str]:
+    """What heights tell that fit badly, or went too far."""
     if misfit_share > _MISFITS:
         searched = plan.scheme.search is not None
         helps = "`search`, or a better `start` with a smaller `reach`"
         if searched:
             reach = f"a larger `reach` where things stand more than {plan.scheme.reach:.3g} m above or below the start"
             helps = f"{reach}, `target` where walls are seen"
-        lines.append(
+        yield (
             f"{misfit_share:.1%} of the heights fit badly: see {plan.settings.name}_fit.tif. They lie at edges and "
             "moving things, or in regions that went wrong; their standard deviations are as large as what heights do "
             f"around them, so mask by these ({plan.settings.name}_sigma.tif). What helps: a finer `resolution`, {helps}"
         )
     if astray > _ASTRAY:
-        lines.append(
+        yield (
             f"{astray:.1%} of the posts have no height since it would lie farther from the start than 1.5 times "
             "`reach`: give a larger one if the start is that wrong; if not, the images contradict the start there"
         )
+
+
+def _of_moves(plan: SurfacePlan, correction: float, sigma_px: float | None) -> Iterator[str]:
+    """What the last corrections tell."""
     # Reduced images are all that a coarse surface sees: their pixels count.
     pixel = 2**plan.scheme.base
     if correction > _MOVING * pixel:
@@ -96,19 +116,23 @@ def findings(
             if noisy
             else "finer `resolution` helps, as relief is finer than"
         )
-        lines.append(f"the last corrections were {correction:.2g} px: heights had not settled; a {helps} them")
-    vague = sigma_px is not None and sigma_px > _VAGUE * pixel
-    part = 0.0 if sigma_px is None else sigma_px * plan.height_error / plan.scheme.reach
-    if vague and part > _LOST:
-        lines.append(
+        yield f"the last corrections were {correction:.2g} px: heights had not settled; a {helps} them"
+
+
+def _of_noise(plan: SurfacePlan, sigma_px: float | None, misfit_share: float) -> Iterator[str]:
+    """What the median standard deviation of the heights tells."""
+    if sigma_px is None or not sigma_px > _VAGUE * 2**plan.scheme.base:
+        return
+    part = sigma_px * plan.height_error / plan.scheme.reach
+    if part > _LOST:
+        yield (
             f"the median standard deviation is {sigma_px:.2g} px of parallax, {part:.0%} of the reach: images agree on "
             "no height there. The start is farther away (`start`, `reach`), there is hardly any texture, or "
             "orientations are wrong (`photoplan tie`, `photoplan adjust`)"
         )
-    elif vague and misfit_share < _MOST_MISFIT:
-        lines.append(
+    elif misfit_share < _MOST_MISFIT:
+        yield (
             f"the median standard deviation is {sigma_px:.2g} px of parallax: hardly any texture tells heights. What "
             "images do not determine follows its surroundings; mask it by the standard deviations, or choose a coarser "
             "`resolution`"
         )
-    return tuple(lines)

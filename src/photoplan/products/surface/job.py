@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.framed import FramedCamera
 from photoplan.engine.run import Made, Output
+from photoplan.events import stretch
 from photoplan.geometry.frames import Frame
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.observe import View
@@ -19,6 +20,7 @@ from photoplan.matching.facets.pyramid import Pyramid
 from photoplan.matching.facets.reconstruct import MARGIN, Scheme, reconstruct
 from photoplan.matching.grey import GreyImage
 from photoplan.plan.tiles import Tile
+from photoplan.products.surface.settings import Bounds
 from photoplan.products.surface.spread import counted
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.scene import SceneAddress
@@ -66,8 +68,7 @@ class SurfaceJob:
     def __call__(self, tile: Tile) -> Made:
         """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""
         kept = _KEPT // len(self.address.scenes)
-        target = self.frame, self.grid.bounds
-        views = [_view(scene, kept, target, self.bands) for scene in self.address.scenes]
+        views = [_view(scene, kept, self.frame, self.grid.bounds, self.bands) for scene in self.address.scenes]
         start = _start(self.address, self.start, self.grid.crs)
         window, m = tile.window, self.scheme.ratio
         shape, finest = (window.height, window.width), (m * window.height, m * window.width)
@@ -76,8 +77,11 @@ class SurfaceJob:
         grey, grey_sigmas = (np.full((1, *finest), np.nan, np.float32) for _ in range(2))
         residuals = np.full((len(views) if self.residuals else 0, *finest), np.nan, np.float32)
         sums, moves, parts, astray = np.zeros((len(views), 2)), np.zeros(self.scheme.coarsest + 1), 0, 0
-        for part in window.tiles(self.part):
-            found = reconstruct(views, self.grid, part, self.scheme, start, self.residuals)
+        every = tuple(window.tiles(self.part))
+        for k, part in enumerate(every):
+            name = f"part {k + 1} of {len(every)}" if len(every) > 1 else ""
+            with stretch(k / len(every), (k + 1) / len(every), name):
+                found = reconstruct(views, self.grid, part, self.scheme, start, self.residuals)
             if found is None:
                 continue
             at = (0, *part.slices(window))
@@ -109,15 +113,9 @@ class SurfaceJob:
 
 
 @lru_cache(maxsize=256)
-def _view(
-    address: SceneAddress,
-    kept: int,
-    target: tuple[Frame | None, tuple[float, float, float, float]],
-    bands: tuple[int, ...],
-) -> View:
+def _view(address: SceneAddress, kept: int, frame: Frame | None, bounds: Bounds, bands: tuple[int, ...]) -> View:
     """An image and its pyramid, kept for the next tile."""
     scene = address.open()
-    frame, bounds = target
     camera = scene.camera if frame is None else FramedCamera(scene.camera, frame, bounds)
     return View(camera, Pyramid(GreyImage(scene.reader, bands=bands), kept=kept))
 

@@ -11,20 +11,18 @@ from typing import Any
 import numpy as np
 
 from photoplan import __version__
-from photoplan.engine.cluster import Question
-from photoplan.engine.executors import open_workers
-from photoplan.engine.run import Runner, Tally, Work, tiles_in_flight
+from photoplan.engine.run import Tally, Work
 from photoplan.errors import UsageError
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm
 from photoplan.io.naming import together
 from photoplan.io.point_cloud import write_cloud
 from photoplan.io.product import ProductFile, check_output
-from photoplan.io.run_record import input_entry, versions, write_run_record
+from photoplan.io.run_record import input_entry, write_run_record
 from photoplan.io.surface_file import TARGET
 from photoplan.plain import pick
 from photoplan.plan.tiles import Tiles
-from photoplan.products.run import BASE_MEMORY, Run, clock, refuse_inputs
+from photoplan.products.run import Run, refuse_inputs
 from photoplan.products.surface.findings import findings
 from photoplan.products.surface.job import SurfaceJob
 from photoplan.products.surface.plan import TILE, SurfacePlan
@@ -123,7 +121,16 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
     """
     run = run or Run()
     folder = Path(output)
-    run.check()
+    job = SurfaceJob(
+        address=plan.address,
+        grid=plan.grid,
+        scheme=plan.scheme,
+        start=plan.settings.start,
+        residuals=plan.settings.residuals,
+        frame=plan.frame,
+        bands=plan.settings.bands,
+    )
+    run.check(job.bytes)
     paths = outputs(folder, plan)
     written = [*paths.values(), *plan.settings.points]
     refuse_inputs(input_files(plan.project), written)
@@ -133,34 +140,21 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
         check_output(path, [], overwrite=run.overwrite)
     for place in (folder, *(path.parent for path in plan.settings.points)):
         make_folder(place)
-    address = plan.address
-    job = SurfaceJob(
-        address=address,
-        grid=plan.grid,
-        scheme=plan.scheme,
-        start=plan.settings.start,
-        residuals=plan.settings.residuals,
-        frame=plan.frame,
-        bands=plan.settings.bands,
-    )
-    inputs = tuple(str(Path(path).resolve()) for path, _ in address.digests)
-    question = Question(versions, inputs, str(folder.resolve()))
     tiles = Tiles.every(plan.grid.window, TILE)
     run.events.begin("tiles", len(tiles))
-    with open_workers(run.executor, run.workers, question, run.events) as workers:
+    with run.runner((Path(path) for path, _ in plan.address.digests), folder, job.bytes) as runner:
         files = _files(plan, paths, run)
-        wanted = workers.threads if workers.threads == 1 else 2 * workers.threads
-        most = tiles_in_flight(wanted, run.memory, BASE_MEMORY, job.bytes)
         work = Work(
             name=plan.settings.name,
             job=job,
             tiles=tiles,
             count=len(tiles),
             sinks=tuple(files.values()),
-            complete=partial(_complete, plan, run, files, clock(workers)),
+            complete=partial(_complete, plan, files, run.clock(runner.workers)),
             scratch=paths["heights"].with_name(f".{paths['heights'].name}.parcels"),
         )
-        (result,) = Runner[SurfaceResult](workers, most, run.events).run([work])
+        result: SurfaceResult
+        (result,) = runner.run([work])
     return result
 
 
@@ -188,7 +182,7 @@ def _files(plan: SurfacePlan, paths: dict[str, Path], run: Run) -> dict[str, Pro
 
 
 def _complete(
-    plan: SurfacePlan, run: Run, files: dict[str, ProductFile], times: Callable[[], dict[str, Any]], tally: Tally
+    plan: SurfacePlan, files: dict[str, ProductFile], times: Callable[[], dict[str, Any]], tally: Tally
 ) -> SurfaceResult:
     """Give the files their names, and write the record."""
     heights = files["heights"]
@@ -211,7 +205,7 @@ def _complete(
             heights.path,
             key=plan.key,
             inputs=[input_entry(path, digest) for path, digest in plan.address.digests],
-            run={"workers": run.workers, "executor": run.executor, "memory": run.memory, **ran},
+            run=ran,
             kind="surface",
             product=result,
             settings=plan.settings,

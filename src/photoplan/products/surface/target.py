@@ -90,7 +90,13 @@ def over_map(project: Project, names: Sequence[str], force: bool, events: Events
     looked, blind = look_at(project, names, force, events)
     prints = [(one, one.look.footprint) for one in looked]
     seen = [
-        SeenTarget(one.name, one.scene.camera, print_.bounds, print_.height_range, one.look.gsd)
+        SeenTarget(
+            name=one.name,
+            camera=one.scene.camera,
+            bounds=print_.bounds,
+            heights=print_.height_range,
+            gsd=one.look.gsd,
+        )
         for one, print_ in prints
         if print_.bounds is not None
     ]
@@ -126,7 +132,8 @@ def over_frame(
             continue
         low, high = uvh[inside, :2].min(axis=0).tolist(), uvh[inside, :2].max(axis=0).tolist()
         areas = np.abs(np.linalg.det(camera.derivatives(uvh[inside])[..., :2]))
-        seen[name] = SeenTarget(name, camera, (*low, *high), (height, height), float(np.mean(areas**-0.5)))
+        gsd = float(np.mean(areas**-0.5))
+        seen[name] = SeenTarget(name=name, camera=camera, bounds=(*low, *high), heights=(height, height), gsd=gsd)
     if behind == len(names):
         helps = "the azimuth of a wall is that of its outward normal, towards them"
         if isinstance(frame, CylinderFrame):

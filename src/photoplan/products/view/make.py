@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from photoplan import __version__
-from photoplan.engine.executors import Workers, open_workers
-from photoplan.engine.run import Runner, Tally, Work
+from photoplan.engine.executors import Workers
+from photoplan.engine.run import Tally, Work
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.grid import Placement
 from photoplan.io.disk import make_folder
@@ -26,7 +26,7 @@ from photoplan.io.run_record import input_entry, run_key, write_run_record
 from photoplan.io.storage import PICTURES
 from photoplan.plain import json_text, plain
 from photoplan.plan.tiles import Tiles
-from photoplan.products.run import Run, clock, question, refuse_inputs
+from photoplan.products.run import Run, refuse_inputs
 from photoplan.products.view.camera import CameraRequest, ViewCamera, view_camera
 from photoplan.products.view.content import open_layers
 from photoplan.products.view.first_look import FirstLook, first_look
@@ -274,11 +274,12 @@ def make_view(plan: ViewPlan, run: Run) -> ViewResult:
         Disk or memory ran out.
     """
     run.check()
-    asked = question((Path(each) for each, _ in plan.address.digests), _output(plan).parent)
-    with open_workers(run.executor, run.workers, asked, run.events) as workers, together():
-        work = view_work(plan, run, workers)
+    inputs = (Path(each) for each, _ in plan.address.digests)
+    with run.runner(inputs, _output(plan).parent) as runner, together():
+        work = view_work(plan, run, runner.workers)
         run.events.begin(work.name, work.count)
-        (result,) = Runner[ViewResult](workers, run.in_flight(workers.threads), run.events).run([work])
+        result: ViewResult
+        (result,) = runner.run([work])
     return result
 
 
@@ -320,7 +321,7 @@ def view_work(plan: ViewPlan, run: Run, workers: Workers) -> Work[ViewResult]:
         tiles=tiles,
         count=len(tiles),
         sinks=(file,),
-        complete=partial(_complete, plan, job.overlay, file, run, clock(workers)),
+        complete=partial(_complete, plan, job.overlay, file, run.clock(workers)),
         scratch=path.with_name(f".{path.name}.parcels"),
     )
 
@@ -353,7 +354,6 @@ def _complete(
     plan: ViewPlan,
     drawn: Overlay | None,
     file: ProductFile,
-    run: Run,
     times: Callable[[], dict[str, Any]],
     tally: Tally,
 ) -> ViewResult:
@@ -389,7 +389,7 @@ def _complete(
         file.path,
         key=plan.key,
         inputs=[input_entry(path, digest) for path, digest in plan.address.digests],
-        run={"workers": run.workers, "executor": run.executor, "memory": run.memory, **ran},
+        run=ran,
         kind=f"view {plan.request.kind}",
         product=result,
         settings={"look": plan.address.look, "farthest": plan.request.farthest},

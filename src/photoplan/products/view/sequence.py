@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from photoplan.engine.executors import Workers, open_workers
-from photoplan.engine.run import Kept, Runner, Work
+from photoplan.engine.executors import Workers
+from photoplan.engine.run import Kept, Work
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.io.naming import together
 from photoplan.io.product import check_output
 from photoplan.io.run_record import recorded_result, run_key
-from photoplan.products.run import Run, question
+from photoplan.products.run import Run
 from photoplan.products.view.camera import CameraRequest
 from photoplan.products.view.ground import open_view_ground
 from photoplan.products.view.make import ViewPlan, ViewRequest, plan_view, view_work
@@ -133,10 +133,9 @@ def make_sequence(request: SequenceRequest, plans: list[ViewPlan], run: Run) -> 
                 told: Any = replace(work, complete=_path_of(work))
                 yield told
 
-    asked = question(map(Path, inputs), request.output.resolve().parent)
     run.events.begin(request.output.name, sum(tiles))
-    with open_workers(run.executor, run.workers, asked, run.events) as workers, together():
-        frames = Runner[Path](workers, run.in_flight(workers.threads), run.events).run(works(workers))
+    with run.runner(map(Path, inputs), request.output.resolve().parent) as runner, together():
+        frames: list[Path] = runner.run(works(runner.workers))
     more = sorted({*request.output.glob("frame_*.png")} - {plan.request.output for plan in plans})
     if more:
         run.events.talk(
