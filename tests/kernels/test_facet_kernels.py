@@ -12,7 +12,7 @@ from photoplan.kernels.jit import COMPILED
 def carried(low, high, posts, out, wall=np.inf) -> None:
     steep = np.empty((-(-(len(posts) - 1) // facets_transfer.CELL), -(-(posts.shape[1] - 1) // facets_transfer.CELL)))
     facets_transfer.steepness(posts, steep)
-    ways = np.concatenate([low, (high - low) / 100.0, np.zeros_like(low)], axis=-1)
+    ways = np.concatenate([low, (high - low) / 100.0, *np.zeros((2, *low.shape))], axis=-1)
     bent = np.empty((2, *posts.shape))
     facets_transfer.bends(posts, bent)
     facets_transfer.transfer(ways, 1, 1, posts, bent, steep, wall, out)

@@ -36,23 +36,29 @@ def height_at(posts, u, v):
 
 
 @inner
-def _first_hit(posts, u, v, ku, kv, qu, qv, top, bottom, slope, reach):
-    """Height at which the way (u + z·ku + z²·qu, v + z·kv + z²·qv, z) first comes down to the surface; NaN: it does
-    not. `reach`: facets that it goes per metre at most."""
+def _above(posts, u, v, ku, kv, qu, qv, cu, cv, z):
+    """How far the way (u + z·ku + z²·qu + z³·cu, v + z·kv + z²·qv + z³·cv, z) is above the surface at z."""
+    return z - height_at(posts, u + z * (ku + z * (qu + z * cu)), v + z * (kv + z * (qv + z * cv)))
+
+
+@inner
+def _first_hit(posts, u, v, ku, kv, qu, qv, cu, cv, top, bottom, slope, reach):
+    """Height at which a way first comes down to the surface; NaN: it does not. `reach`: facets that it goes per metre
+    at most."""
     stride = _STRIDE / max(reach, 1e-12)
     z = top
     while z > bottom:
-        above = z - height_at(posts, u + z * (ku + z * qu), v + z * (kv + z * qv))
+        above = _above(posts, u, v, ku, kv, qu, qv, cu, cv, z)
         if above <= 0.0:
             return z
         # The surface cannot rise faster than its steepest facet.
         after = z - max(above / (1.0 + slope * reach), stride)
-        if after - height_at(posts, u + after * (ku + after * qu), v + after * (kv + after * qv)) > 0.0:
+        if _above(posts, u, v, ku, kv, qu, qv, cu, cv, after) > 0.0:
             z = after
             continue
         for _ in range(_HALVINGS):
             middle = 0.5 * (z + after)
-            if middle - height_at(posts, u + middle * (ku + middle * qu), v + middle * (kv + middle * qv)) > 0.0:
+            if _above(posts, u, v, ku, kv, qu, qv, cu, cv, middle) > 0.0:
                 z = middle
             else:
                 after = middle
@@ -71,18 +77,18 @@ def _rise(posts, u, v, ku, kv):
 
 
 @inner
-def _only_hit(posts, u, v, ku, kv, qu, qv, z):
-    """Height at which the same way meets a surface that it meets once, by Newton's way from z; NaN: not found."""
+def _only_hit(posts, u, v, ku, kv, qu, qv, cu, cv, z):
+    """Height at which a way meets a surface that it meets once, by Newton's way from z; NaN: not found."""
     rows, columns = posts.shape
     enough = _EXACT / (abs(ku) + abs(kv) + 1e-12)
     for _ in range(_STEPS):
-        x, y = u + z * (ku + z * qu), v + z * (kv + z * qv)
+        x, y = u + z * (ku + z * (qu + z * cu)), v + z * (kv + z * (qv + z * cv))
         x, y = min(max(x, 0.0), columns - 1.0), min(max(y, 0.0), rows - 1.0)
         i, j = min(int(x), columns - 2), min(int(y), rows - 2)
         a, b = x - i, y - j
         p00, p01, p10, p11 = posts[j, i], posts[j, i + 1], posts[j + 1, i], posts[j + 1, i + 1]
         upper, lower = p00 + a * (p01 - p00), p10 + a * (p11 - p10)
-        along, down = ku + 2.0 * z * qu, kv + 2.0 * z * qv
+        along, down = ku + z * (2.0 * qu + 3.0 * z * cu), kv + z * (2.0 * qv + 3.0 * z * cv)
         rise = ((1.0 - b) * (p01 - p00) + b * (p11 - p10)) * along + (lower - upper) * down
         step = (upper + b * (lower - upper) - z) / (1.0 - rise)
         z += step
@@ -153,21 +159,22 @@ def _bulge(bent, u, v):
 
 
 @inner
-def _hit(posts, steep, u, v, ku, kv, qu, qv, top, bottom, slope, z):
+def _hit(posts, steep, u, v, ku, kv, qu, qv, cu, cv, top, bottom, slope, z):
     """Where a ray first meets the surface: at once where all below the ray from above is gentle, else by a search from
     above; z: about there."""
-    reach = abs(ku) + abs(kv) + 2.0 * max(abs(top), abs(bottom)) * (abs(qu) + abs(qv))
-    found = _only_hit(posts, u, v, ku, kv, qu, qv, z)
+    far = max(abs(top), abs(bottom))
+    reach = abs(ku) + abs(kv) + far * (2.0 * (abs(qu) + abs(qv)) + 3.0 * far * (abs(cu) + abs(cv)))
+    found = _only_hit(posts, u, v, ku, kv, qu, qv, cu, cv, z)
     at, clear = found, not np.isnan(found)
     while clear:
-        i, j = int(u + at * (ku + at * qu)) // CELL, int(v + at * (kv + at * qv)) // CELL
+        i, j = int(u + at * (ku + at * (qu + at * cu))) // CELL, int(v + at * (kv + at * (qv + at * cv))) // CELL
         i, j = min(max(i, 0), steep.shape[1] - 1), min(max(j, 0), steep.shape[0] - 1)
         clear = steep[j, i] * reach < _GENTLE
         # What is around a cell goes as far as that.
         at += CELL / max(reach, 1e-12)
         if at > top:
             break
-    return found if clear else _first_hit(posts, u, v, ku, kv, qu, qv, top, bottom, slope, reach)
+    return found if clear else _first_hit(posts, u, v, ku, kv, qu, qv, cu, cv, top, bottom, slope, reach)
 
 
 @kernel
@@ -176,9 +183,9 @@ def transfer(ways, right, down, posts, bent, steep, wall, out):
 
     Parameters
     ----------
-    ways : ndarray, shape (rows, columns, 6)
-        Rays of a lattice of pixels: column and row of the posts at the height 0, what they change per metre of height
-        z there, and half of what that changes; NaN: there is no ray.
+    ways : ndarray, shape (rows, columns, 8)
+        Rays of a lattice of pixels: column and row of the posts at the height 0, and the coefficients of the height z,
+        of z² and of z³; NaN: there is no ray.
     right, down : int
         Pixels between neighbours of the lattice, whose first one is the window's first pixel.
     posts : ndarray, shape (m, n)
@@ -201,14 +208,14 @@ def transfer(ways, right, down, posts, bent, steep, wall, out):
         for i in range(steep.shape[1]):
             slope = max(slope, steep[j, i])
     top, bottom = top + 1e-3, bottom - 1e-3
-    first, way = np.zeros(6), np.zeros(6)
+    first, way = np.zeros(8), np.zeros(8)
     z = 0.5 * (top + bottom)
     for r in range(out.shape[0]):
         j = min(r // down, ways.shape[0] - 2)
         b = r / down - j
         for i in range(ways.shape[1] - 1):
             # Along a row rays change linearly from node to node.
-            for k in range(6):
+            for k in range(8):
                 first[k] = (1.0 - b) * ways[j, i, k] + b * ways[j + 1, i, k]
                 way[k] = ((1.0 - b) * ways[j, i + 1, k] + b * ways[j + 1, i + 1, k] - first[k]) / right
             last = out.shape[1] if i == ways.shape[1] - 2 else min(out.shape[1], (i + 1) * right)
@@ -217,14 +224,15 @@ def transfer(ways, right, down, posts, bent, steep, wall, out):
                 u0, v0 = first[0] + a * way[0], first[1] + a * way[1]
                 ku, kv = first[2] + a * way[2], first[3] + a * way[3]
                 qu, qv = first[4] + a * way[4], first[5] + a * way[5]
+                cu, cv = first[6] + a * way[6], first[7] + a * way[7]
                 for k in range(4):
                     out[r, c, k] = np.nan
-                if np.isnan(u0 + v0 + ku + kv + qu + qv):
+                if np.isnan(u0 + v0 + ku + kv + qu + qv + cu + cv):
                     continue
-                z = _hit(posts, steep, u0, v0, ku, kv, qu, qv, top, bottom, slope, z)
-                u, v = u0 + z * (ku + z * qu), v0 + z * (kv + z * qv)
+                z = _hit(posts, steep, u0, v0, ku, kv, qu, qv, cu, cv, top, bottom, slope, z)
+                u, v = u0 + z * (ku + z * (qu + z * cu)), v0 + z * (kv + z * (qv + z * cv))
                 if u >= 0.0 and v >= 0.0 and u <= columns - 1.0 and v <= rows - 1.0:
-                    ku, kv = ku + 2.0 * z * qu, kv + 2.0 * z * qv
+                    ku, kv = ku + z * (2.0 * qu + 3.0 * z * cu), kv + z * (2.0 * qv + 3.0 * z * cv)
                     towards = max(1.0 - _rise(posts, u, v, ku, kv), _GRAZING)
                     if towards > wall:
                         continue

@@ -109,7 +109,7 @@ class Sight:
     raw: _Floats
     """Grey values, shape (h, w); NaN where there are none."""
     ways: _Doubles
-    """Rays of every so many pixels, see `facets_transfer.transfer`; (m, n, 6)."""
+    """Rays of every so many pixels, see `facets_transfer.transfer`; (m, n, 8)."""
     steps: tuple[int, int]
     """How many pixels to the right and down."""
     level: float
@@ -207,12 +207,16 @@ def _followed(
         if (off <= _OFF).all():
             break
         right, down = (max(1, step // 2) if far > _OFF else step for step, far in zip((right, down), off))
-    half, mean = (levels[1] - levels[0]) / 2, (low + high) / 2
+    half, mean, way = (levels[1] - levels[0]) / 2, (low + high) / 2, (high - low) / 2
+    # With heights t from -1 to 1: mean + bend (t² - 1), and way t + twist (t³ - t).
+    bend, twist = np.zeros_like(mean), np.zeros_like(mean)
+    inner = [sum(levels) / 2 + part * half for part in (-0.5, 0.5)]
     some = tuple(slice(None, None, max(1, n // _POINTS)) for n in at.shape[:2])
-    middle = mean
-    if worst(cross(at[some], sum(levels) / 2), mean[some]) > _OFF:
-        middle = cross(at, sum(levels) / 2)
-    ways = np.concatenate([middle, (high - low) / (2 * half), (mean - middle) / half**2], axis=-1)
+    if worst(cross(at[some], inner[1]), (mean + way / 2)[some]) > _OFF:
+        below, above = (cross(at, z) for z in inner)
+        bend, twist = (4 * mean - 2 * (below + above)) / 3, (4 * (way - above + below)) / 3
+    coefficients = mean - bend, (way - twist) / half, bend / half**2, twist / half**3
+    ways = np.concatenate(coefficients, axis=-1)
     first_pixel = window.col, window.row
     return Sight(raw=raw, ways=ways, steps=(right, down), level=sum(levels) / 2, first=first_pixel)
 
