@@ -29,7 +29,7 @@ from photoplan.kernels.facets_height import add_heights, add_means
 from photoplan.kernels.facets_signs import signs_at
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
 from photoplan.matching.facets.curvature import Roughness, Smoother
-from photoplan.matching.facets.means import corners, smoothed
+from photoplan.matching.facets.means import away_from_border, corners, smoothed
 from photoplan.matching.facets.observe import Facets, Sight, View
 from photoplan.matching.facets.radiometry import Transfer, first_guess, levelled
 from photoplan.matching.facets.texture import GreyTexture
@@ -55,8 +55,9 @@ _MOST, _LEFT = 400, 0.01
 _COMMON = 0.5
 #: Posts of a part whose variances are computed at once, and around it.
 _SIDE, _MARGIN = 8, 8
-#: Posts along the border of a block from which nothing is learnt about its roughness.
-_BORDER = 6
+#: Posts along the border of a block, and of what two views see of it, from which nothing is learnt about its roughness,
+#: and the part of these that there has to be without the latter.
+_BORDER, _LEFT_OVER = 6, 0.25
 #: Times by which curvatures weigh more to see what they take away.
 _STIFFER = 1.2
 #: Least standard deviation of grey values, parts of the contrast: images without noise have residuals of rounding.
@@ -184,9 +185,9 @@ class FacetBlock:
             self._settle()
 
     def _smoother(self) -> Smoother:
-        inside = np.zeros(self.facets.shape, bool)
-        inner = (slice(_BORDER, -_BORDER),) * 2
-        inside[inner] = (self.counted > 1 if self.trusted is None else (self.counted > 1) & self.trusted)[inner]
+        inside = away_from_border(self.counted > 1, _BORDER, _LEFT_OVER)
+        if self.trusted is not None:
+            inside &= self.trusted
         return Smoother(lambda rights: self._solved(*rights), self.noise, inside, self._signs)
 
     @cached_property

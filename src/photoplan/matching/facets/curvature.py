@@ -120,7 +120,8 @@ class Roughness:
         known, rest = np.zeros_like(prior), np.ones_like(prior)
         for n, (a, b) in enumerate(((0, 0), (0, 1), (1, 1))):
             seen, drawn, noise = (bands[a][k] * bands[b][k] / usual for k in range(3))
-            known += (n + 1) * mean(seen - noise, _SHARED)
+            # Of noise that happens to be less than it is expected to be, nothing is left.
+            known += (n + 1) * np.maximum(mean(seen - noise, _SHARED), 0.0)
             rest -= (n + 1) * mean(drawn, _SHARED)
         times = mean(seen - noise, 1.0) / np.maximum(mean(drawn, 1.0), 1e-30)
         share = np.clip(known + np.maximum(times, 0.0) * np.maximum(rest, 0.0), 0.0, _MOST)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
@@ -34,3 +35,21 @@ def corners(facets: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Posts at the corners of any of these facets: shape (rows, columns) of (rows − 1, columns − 1)."""
     around = np.pad(facets, 1)
     return around[:-1, :-1] | around[:-1, 1:] | around[1:, :-1] | around[1:, 1:]
+
+
+def away_from_border(seen: NDArray[np.bool_], border: int, least: float) -> NDArray[np.bool_]:
+    """Of what is seen of a block, what is `border` values away from its border and from what is not seen along that.
+
+    Where less than the part `least` of what is seen would be left, the latter does not count. Holes do not, either:
+    heights hang together around them. All of shape (rows, columns).
+    """
+    inner = np.zeros_like(seen)
+    inner[border:-border, border:-border] = True
+    inner &= seen
+    if seen.all():
+        return inner
+    parts, _ = ndimage.label(~seen)
+    edge = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+    outside = np.isin(parts, edge[edge > 0])
+    away = inner & ~ndimage.maximum_filter(outside, 2 * border + 1)
+    return away if np.count_nonzero(away) >= least * np.count_nonzero(inner) else inner
