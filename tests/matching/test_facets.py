@@ -9,6 +9,7 @@ from tools.thinned import some
 from photoplan.geometry.grid import Window
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
 from photoplan.matching.facets.curvature import Roughness, Smoother, curvatures
+from photoplan.matching.facets.means import away_from_border
 from photoplan.matching.facets.pyramid import FILTERS, Pyramid, halved
 from photoplan.matching.facets.reconstruct import facets_of
 
@@ -137,3 +138,15 @@ def test_a_breakline_bends_more_than_its_hill_and_a_hill_is_none() -> None:
     assert ditch[0, 12:-12, 58:63:4].max() < 0.1 and np.median(ditch[inner]) > 0.8
     flat = roughness.around(5.0 * (u > 60))
     assert flat.factors[0, 30:90, 60].max() < 1e-3 and (flat.squares == roughness.squares).all()
+
+
+def test_nothing_is_learnt_beside_what_two_images_do_not_see() -> None:
+    seen = np.ones((60, 80), bool)
+    assert away_from_border(seen, 6, 0.25).sum() == 48 * 68
+    seen[:, :20] = False
+    seen[30:33, 50:53] = False  # what something hides
+    away = away_from_border(seen, 6, 0.25)
+    assert not away[:, :26].any() and away[6:-6, 26:-6].sum() == 48 * 48 - 9 and away[29, 49]
+    narrow = np.zeros((60, 80), bool)
+    narrow[:, 30:43] = True
+    assert away_from_border(narrow, 6, 0.25).sum() == 48 * 13

@@ -50,6 +50,6 @@ def away_from_border(seen: NDArray[np.bool_], border: int, least: float) -> NDAr
         return inner
     parts, _ = ndimage.label(~seen)
     edge = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
-    outside = np.isin(parts, edge[edge > 0])
-    away = inner & ~ndimage.maximum_filter(outside, 2 * border + 1)
+    beside = ndimage.maximum_filter(np.isin(parts, edge[edge > 0]), 2 * border + 1)
+    away: NDArray[np.bool_] = inner & ~beside
     return away if np.count_nonzero(away) >= least * np.count_nonzero(inner) else inner
