@@ -45,6 +45,29 @@ def test_levels_keep_places_and_means(span: int) -> None:
     assert np.isnan(pyramid.read(1, Window(-3, 0, 2, 2))).all()
 
 
+def test_coarse_levels_are_made_once() -> None:
+    """However many windows of fine levels are read in between; they are made of all of the image."""
+
+    class Counted(Pixels):
+        seen = 0
+
+        def read(self, window: Window) -> np.ndarray:
+            self.seen += window.size
+            return super().read(window)
+
+    image = Counted(np.zeros((2048, 2048)))
+    pyramid = Pyramid(image, kept=12 * 256**2 * 4)
+    coarse = pyramid.read(3, Window(0, 0, 256, 256))
+    before = image.seen
+    for row in range(0, 1024, 256):
+        for col in range(0, 1024, 256):
+            pyramid.read(1, Window(col, row, 256, 256))
+    assert image.seen > 1.5 * before
+    before = image.seen
+    np.testing.assert_array_equal(pyramid.read(3, Window(0, 0, 256, 256)), coarse)
+    assert image.seen == before
+
+
 def test_the_widest_filter_keeps_more_and_aliases_less() -> None:
     x = np.arange(2000.0)
     for length, least, most in ((6.0, 0.85, 1.1), (2.6, 0.0, 0.12)):

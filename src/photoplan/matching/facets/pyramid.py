@@ -72,7 +72,8 @@ class Pyramid:
         with self._lock:
             self._blocks[key] = made
             while len(self._blocks) * _SIDE**2 * 4 > max(self.kept, 4 * _SIDE**2):
-                self._blocks.popitem(last=False)
+                # The oldest of the finest level: a block is made of four times as many pixels as one of a level finer.
+                del self._blocks[min(self._blocks, key=lambda one: one[0])]
         return made
 
 
