@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.kernels import facets_grey, facets_height, facets_radiometry, facets_signs, facets_solve, facets_transfer
+from photoplan.kernels import (
+    facets_grey,
+    facets_height,
+    facets_radiometry,
+    facets_signs,
+    facets_solve,
+    facets_sums,
+    facets_transfer,
+)
 from photoplan.kernels.jit import COMPILED
 
 
@@ -84,7 +92,7 @@ def grey(values: np.ndarray, at: np.ndarray, ratio: int = 2) -> np.ndarray:
 
 
 def test_grey_facets_reproduce_a_plane() -> None:
-    v, u = np.mgrid[:9, :11].astype(np.float32) - facets_grey.PAD
+    v, u = np.mgrid[:9, :11].astype(np.float32) - facets_sums.PAD
     at = np.random.default_rng(0).uniform(0, 2, (50, 2))
     assert np.abs(grey(3 * u - 2 * v + 5, at) - (6 * at[:, 0] - 4 * at[:, 1] + 5)).max() < 1e-5
 
@@ -97,7 +105,7 @@ def grey_equations(seed: int = 0):
     places[..., 2:] = rng.normal(0, 0.1, (14, 16, 2))
     weights = rng.uniform(0.5, 1.5, (14, 16)).astype(np.float32)
     weights[3, 4] = 0.0
-    shape = (2 * 2 + 1 + 2 * facets_grey.PAD, 3 * 2 + 1 + 2 * facets_grey.PAD)
+    shape = (2 * 2 + 1 + 2 * facets_sums.PAD, 3 * 2 + 1 + 2 * facets_sums.PAD)
     A = np.zeros((14 * 16, *shape))
     for row, (u, v) in enumerate(places[..., :2].reshape(-1, 2).astype(float) * 2):
         A[row, int(v) + 1 : int(v) + 5, int(u) + 1 : int(u) + 5] = np.outer(spline(v - int(v)), spline(u - int(u)))
@@ -107,10 +115,20 @@ def grey_equations(seed: int = 0):
 def test_grey_values_are_those_of_least_squares() -> None:
     rng, places, weights, shape, A = grey_equations()
     seen = rng.normal(100, 20, (14, 16)).astype(np.float32)
-    sums, right = np.zeros((shape[0], shape[1] + 3, facets_grey.SUMS), np.float32), np.zeros(shape, np.float32)
-    facets_grey.add_grey(places, seen, weights, 2, sums, np.zeros(shape, np.float32))
-    system = np.empty((shape[0], facets_grey.OFFSETS, shape[1]), np.float32)
-    facets_grey.made_grey(sums, system, right)
+    counts = np.zeros((shape[0] - 2 * facets_sums.PAD, shape[1] - 2 * facets_sums.PAD), np.int32)
+    facets_sums.count_pixels(places, weights, 2, counts)
+    assert counts.sum() == 14 * 16 - 1
+    ends = np.cumsum(counts, dtype=np.int32).reshape(counts.shape) - counts
+    pixels = np.empty((int(counts.sum()), 4), np.float32)
+    for rows in (slice(0, 9), slice(9, 14)):
+        facets_sums.sort_pixels(places[rows], seen[rows], weights[rows], 2, ends, pixels)
+    system = np.zeros((shape[0], facets_sums.OFFSETS, shape[1]), np.float32)
+    right, density = np.zeros((2, *shape), np.float32)
+    facets_sums.add_grey(pixels, ends, system, right, density)
+    nearest = np.rint(places[..., :2].astype(float) * 2).astype(int) + facets_sums.PAD
+    expected = np.zeros(shape)
+    np.add.at(expected, (nearest[..., 1], nearest[..., 0]), weights)
+    assert np.abs(density - expected).max() < 1e-4
     system[:, 0] += np.float32(0.01)
     values = np.zeros(shape, np.float32)
     facets_grey.solve_grey(system, right, np.ones(shape, np.float32), values, 300, 1e-7)
@@ -140,27 +158,13 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
     values = rng.normal(0, 10, shape).astype(np.float32)
     seen = rng.normal(0, 10, (14, 16)).astype(np.float32)
     means = rng.normal(0, 0.05, (2, 3, 2))
-    system, right = np.zeros((7, 3, 4)), np.zeros((3, 4))
-    noise = np.zeros((3, 4))
     residuals, factors, sums = np.empty((14, 16), np.float32), np.ones((14, 16), np.float32), np.zeros(3)
-    facets_height.add_heights(
-        (0, 0),
-        places,
-        seen,
-        weights,
-        values,
-        2,
-        means,
-        8.0,
-        2.0,
-        np.arange(4) < np.full((3, 1), 2),
-        system,
-        right,
-        noise,
-        residuals,
-        factors,
-        sums,
-    )
+    moments, trusted = np.zeros((2, 3, facets_height.MOMENTS)), np.arange(4) < np.full((3, 1), 2)
+    pixels = facets_height.Pixels(first=(0, 0), places=places, grey=seen, weights=weights)
+    ground = facets_height.Ground(values=values, ratio=2, means=means, trusted=trusted)
+    facets_height.add_heights(pixels, ground, 8.0, 2.0, moments, residuals, factors, sums)
+    system, (right, noise) = np.zeros((7, 3, 4)), np.zeros((2, 3, 4))
+    facets_height.made_heights(moments, system, right, noise)
     misfit = (A @ values.reshape(-1)).reshape(14, 16) - seen
     used = weights > 0
     assert np.abs(residuals - misfit)[used].max() < 1e-3 and np.isnan(residuals[3, 4])
@@ -168,8 +172,8 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
     told = used & (places[..., 0] < 1.5)
     assert 0 < sums[2] == told.sum() < used.sum()
     assert sums[1] == pytest.approx((factors * (misfit / 8) ** 2)[told].sum(), rel=1e-4)
-    whole, squares = np.zeros((2, 3)), np.zeros((2, 3))
-    facets_height.add_sensitivities(places, weights, values, 2, means, whole)
+    whole, squares = np.zeros((2, 2, 3)), np.zeros((2, 3))
+    facets_height.add_sensitivities(places, weights, ground, np.float32(2.0) * values, whole)
     N, b = np.zeros((12, 12)), np.zeros(12)
     step = np.array([(1e-4, 0), (-1e-4, 0), (0, 1e-4), (0, -1e-4)])
     for (u, v, ku, kv), p, m in zip(places.reshape(-1, 4).astype(float), weights.reshape(-1), misfit.reshape(-1)):
@@ -183,7 +187,7 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
         N += p * a * a * np.outer(phi, phi)
         b -= p * a * m * phi.reshape(-1)
     assert np.abs(right.reshape(-1) - b).max() < 1e-3 * np.abs(b).max()
-    assert np.abs(whole - squares).max() < 1e-3 * squares.max()
+    assert np.abs(whole - np.array([1, 4])[:, None, None] * squares).max() < 4e-3 * squares.max()
     # Errors of one standard deviation have the variances of the equations.
     assert 0.4 < np.mean(noise**2 / system[0]) < 2.0
     assert np.abs(dense(system, np.zeros((3, 3, 4))) - N).max() < 1e-4 * np.abs(N).max()

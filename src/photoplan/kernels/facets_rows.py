@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from photoplan.kernels import numba_parts
 from photoplan.kernels.jit import inner
 
 
@@ -24,20 +21,25 @@ def add_both(a, b, d, out, other):
 
 
 @inner
-def add_few_loops(share, a, count_tag, out, at):
-    """out[at : at + n] += share · a of one-dimensional float32, with n the length of `count_tag`, part of its type."""
-    for k in range(len(count_tag)):
-        out[at + k] += np.float32(share) * a[k]
-
-
-add_few = numba_parts.add_few if numba_parts.USABLE else add_few_loops
-
-
-@inner
 def add_share(share, a, out):
     """out += share · a."""
     for i in range(len(out)):
         out[i] += share * a[i]
+
+
+@inner
+def add_row(a, out):
+    """out += a."""
+    for i in range(len(out)):
+        out[i] += a[i]
+
+
+@inner
+def add_four(shares, a, b, c, d, out):
+    """out += four shares, each of its own row: `out` is read and written once for all of them."""
+    p, q, r, s = shares[0], shares[1], shares[2], shares[3]
+    for i in range(len(out)):
+        out[i] = out[i] + p * a[i] + q * b[i] + r * c[i] + s * d[i]
 
 
 @inner

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from photoplan.kernels.facets_rows import add_both, add_product, add_share, dot
+from photoplan.kernels.facets_rows import add_both, add_four, add_product, add_share, dot
 from photoplan.kernels.jit import inner, kernel, maker
 
 #: Rows and columns between the posts of an entry: see `facets_height.OFFSETS`.
@@ -47,20 +47,32 @@ def curvature(kind, k):
 
 
 @inner
-def _factor(band):
-    """Cholesky factor in place: L is the lower triangle, stored as the band is."""
-    size, width = band.shape
-    for n in range(size):
-        column = band[n]
-        if not column[0] > 0.0:
-            return False
-        column[0] = np.sqrt(column[0])
-        scale = 1.0 / column[0]
-        for k in range(1, width):
-            column[k] *= scale
-        for k in range(1, min(width, size - n)):
-            if column[k] != 0.0:
-                add_share(-column[k], column[k:], band[n + k, : width - k])
+def _factor(band, shares):
+    """Cholesky factor in place: L is the lower triangle, stored as the band is. Three columns of zeros follow the
+    band's own, as four rows are eliminated at once; `shares` is scratch of 4."""
+    size, width = band.shape[0], band.shape[1] - 3
+    for first in range(0, size, 4):
+        several = min(4, size - first)
+        for p in range(several):
+            row = band[first + p]
+            if not row[0] > 0.0:
+                return False
+            row[0] = np.sqrt(row[0])
+            scale = 1.0 / row[0]
+            for k in range(1, width):
+                row[k] *= scale
+            for q in range(p + 1, several):
+                add_share(-row[q - p], row[q - p : width], band[first + q, : width - q + p])
+        if several < 4:
+            break
+        a, b, c, d = band[first], band[first + 1], band[first + 2], band[first + 3]
+        for k in range(4, min(width + 3, size - first)):
+            count = width + 3 - k
+            shares[0], shares[1], shares[2], shares[3] = -a[k], -b[k - 1], -c[k - 2], -d[k - 3]
+            add_four(
+                shares, a[k : k + count], b[k - 1 : k - 1 + count], c[k - 2 : k - 2 + count], d[k - 3 : k - 3 + count],
+                band[first + k, :count],
+            )  # fmt: skip
     return True
 
 
@@ -177,18 +189,23 @@ def solve_heights(system, right, rounds, enough, out):
 
 
 @inner
-def _invert(band, inverse, column):
-    """Entries of the inverse inside the band (Takahashi 1973): row n holds columns n − w … n + w."""
-    size, w = band.shape[0], band.shape[1] - 1
-    inverse[:] = 0.0
+def _invert(band, inverse, column, shares):
+    """Entries of the inverse inside the band (Takahashi 1973): row n holds columns n − w … n + w. See `_factor`."""
+    size, w = band.shape[0], band.shape[1] - 4
     for n in range(size - 1, -1, -1):
         below = min(w, size - 1 - n)
-        column[:] = 0.0
-        for q in range(1, below + 1):
-            if band[n, q] != 0.0:
-                add_share(
-                    -band[n, q] / band[n, 0], inverse[n + q, w - q + 1 : w - q + 1 + below], column[1 : below + 1]
-                )
+        out, scale = column[1 : below + 1], -1.0 / band[n, 0]
+        out[:] = 0.0
+        for q in range(1, below - 2, 4):
+            for k in range(4):
+                shares[k] = scale * band[n, q + k]
+            i = w - q + 1
+            add_four(
+                shares, inverse[n + q, i : i + below], inverse[n + q + 1, i - 1 : i - 1 + below],
+                inverse[n + q + 2, i - 2 : i - 2 + below], inverse[n + q + 3, i - 3 : i - 3 + below], out,
+            )  # fmt: skip
+        for q in range(below // 4 * 4 + 1, below + 1):
+            add_share(scale * band[n, q], inverse[n + q, w - q + 1 : w - q + 1 + below], out)
         total = 1.0 / band[n, 0] ** 2
         for k in range(1, below + 1):
             inverse[n, w + k] = inverse[n + k, w - k] = column[k]
@@ -204,22 +221,27 @@ def variances(system, side, margin, out):
     See `solve_heights`; `out` has shape (rows, columns).
     """
     rows, columns = out.shape
-    column = np.empty(2 * (side + 2 * margin) + 1)
     length = _LONG * side
+    wide = min(columns, side + 2 * margin)
+    most = min(rows, length + 2 * margin) * wide
+    bands, inverses = np.empty(most * (2 * wide + 4)), np.empty(most * (4 * wide + 1))
+    column, shares = np.empty(2 * wide + 1), np.empty(4)
     for row in range(0, rows, length):
         for col in range(0, columns, side):
             j0, i0 = max(0, row - margin), max(0, col - margin)
             j1, i1 = min(rows, row + length + margin), min(columns, col + side + margin)
             n, m = j1 - j0, i1 - i0
-            band, inverse = np.zeros((n * m, 2 * m + 1)), np.empty((n * m, 4 * m + 1))
+            band = bands[: n * m * (2 * m + 4)].reshape(n * m, 2 * m + 4)
+            inverse = inverses[: n * m * (4 * m + 1)].reshape(n * m, 4 * m + 1)
+            band[:] = 0.0
             for j in range(n):
                 for i in range(m):
                     for k in range(7):
                         if j + _DOWN[k] < n and 0 <= i + _ALONG[k] < m:
                             band[j * m + i, _DOWN[k] * m + _ALONG[k]] = system[k, j0 + j, i0 + i]
-            done = _factor(band)
+            done = _factor(band, shares)
             if done:
-                _invert(band, inverse, column)
+                _invert(band, inverse, column, shares)
             for j in range(row, min(rows, row + length)):
                 for i in range(col, min(columns, col + side)):
                     out[j, i] = inverse[(j - j0) * m + i - i0, 2 * m] if done else np.nan

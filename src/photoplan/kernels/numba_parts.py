@@ -359,19 +359,3 @@ def add_block(typingctx: Any, source: Any, place: Any, wx: Any, wy: Any, base: A
         return context.get_dummy_value()
 
     return signature, codegen
-
-
-@intrinsic
-def add_few(typingctx: Any, share: Any, a: Any, count_tag: Any, out: Any, at: Any) -> Any:
-    """The vectors of `facets_rows.add_few_loops`."""
-    count = len(count_tag)
-    signature = types.void(types.float32, a, count_tag, out, types.int64)
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        values, sums = (context.make_array(signature.args[k])(context, builder, value=args[k]).data for k in (1, 3))
-        few = _load(builder, values, ir.IntType(64)(0), count)
-        found = _fused(builder, _splat(builder, args[0], count), few, _load(builder, sums, args[4], count))
-        builder.store(found, builder.bitcast(builder.gep(sums, [args[4]]), found.type.as_pointer()), align=1)
-        return context.get_dummy_value()
-
-    return signature, codegen

@@ -14,20 +14,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.facets_grey import (
-    OFFSETS,
-    PAD,
-    SUMS,
-    add_errors,
-    add_grey,
-    made_grey,
-    sample_grey,
-    sample_pixels,
-    solve_grey,
-)
-from photoplan.kernels.facets_height import add_heights, add_means
+from photoplan.kernels.facets_grey import add_errors, sample_grey, sample_pixels, solve_grey
+from photoplan.kernels.facets_height import MOMENTS, Ground, Pixels, add_heights, add_means, made_heights
 from photoplan.kernels.facets_signs import signs_at
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
+from photoplan.kernels.facets_sums import OFFSETS, PAD, add_grey, count_pixels, sort_pixels
 from photoplan.matching.facets.curvature import Roughness, Smoother
 from photoplan.matching.facets.means import away_from_border, corners, smoothed
 from photoplan.matching.facets.observe import Facets, Sight, View
@@ -46,6 +37,8 @@ _LIMIT, _TAKEN = 2.5, 0.978
 #: Conjugate gradients of grey values: rounds at most, and the part of their standard deviations that is exact enough.
 #: The same for errors that are drawn, whose slopes count.
 _ROUNDS, _FULLY = (25, 0.1), (60, 0.03)
+#: Rows of pixels that are sorted by facets in turn.
+_ROWS = 32
 #: Pixels beyond those that grey values need, part of all, without which a surface is not tried.
 _TELLING = 0.05
 _NONE = np.empty((0, 0), np.float32)
@@ -256,12 +249,20 @@ class FacetBlock:
     ) -> tuple[_Floats, _Floats | None]:
         """The grey values of the surface; returns the weights that lie on each, and perhaps errors of theirs."""
         shape, ratio, errors = self.values.shape, self.facets.ratio, None
-        sums, density = np.zeros((shape[0], shape[1] + 3, SUMS), np.float32), np.zeros(shape, np.float32)
-        for sight, g, w in zip(self.sights, grey, weights):
-            add_grey(sight.places, g, w, ratio, sums, density)
-        system, right = np.empty((shape[0], OFFSETS, shape[1]), np.float32), np.empty(shape, np.float32)
-        made_grey(sums, system, right)
-        del sums
+        counts = np.zeros((shape[0] - 2 * PAD, shape[1] - 2 * PAD), np.int32)
+        for sight, w in zip(self.sights, weights):
+            count_pixels(sight.places, w, ratio, counts)
+        ends = np.cumsum(counts, dtype=np.int32).reshape(counts.shape) - counts
+        pixels = np.empty((int(counts.sum()), 4), np.float32)
+        # Some rows of all views in turn: what lies together is then still near when the next view comes there.
+        for row in range(0, max(sight.raw.shape[0] for sight in self.sights), _ROWS):
+            part = slice(row, row + _ROWS)
+            for sight, g, w in zip(self.sights, grey, weights):
+                sort_pixels(sight.places[part], g[part], w[part], ratio, ends, pixels)
+        system = np.zeros((shape[0], OFFSETS, shape[1]), np.float32)
+        right, density = np.zeros((2, *shape), np.float32)
+        add_grey(pixels, ends, system, right, density)
+        del pixels
         self.values = _solved_exactly(system, right, density, self.values, *_ROUNDS)
         if drawn:
             right[:] = 0.0
@@ -295,24 +296,20 @@ class FacetBlock:
             counted += corners(own[..., 0] > 0)
             sums += own
         self.ways = sums[..., 1:] / np.maximum(sums[..., :1], 1e-30)
-        if errors is not None:
-            self.texture = GreyTexture.of(
-                self.sights, weights, self.values, errors, self.density, self.facets.ratio, self.ways
-            )
-        self.system, right = np.zeros((7, rows, columns)), np.zeros((rows, columns))
-        self.noise = np.zeros((rows, columns))
-        found = np.zeros((len(self.sights), 3))
-        self.residuals = [np.empty(g.shape, np.float32) for g in grey]
         trusted = np.ones((rows, columns), bool) if self.trusted is None else self.trusted
+        ground = Ground(values=self.values, ratio=self.facets.ratio, means=self.ways, trusted=trusted)
+        if errors is not None:
+            self.texture = GreyTexture.of(self.sights, weights, ground, errors, self.density)
+        found, moments = np.zeros((len(self.sights), 3)), np.zeros((rows - 1, columns - 1, MOMENTS))
+        self.residuals = [np.empty(g.shape, np.float32) for g in grey]
         for n, (sight, g, w) in enumerate(zip(self.sights, grey, weights)):
-            add_heights(
-                sight.first, sight.places, g, w, self.values, self.facets.ratio, self.ways,
-                self.sigmas[n], _LIMIT, trusted, self.system, right, self.noise, self.residuals[n], self._factors[n],
-                found[n],
-            )  # fmt: skip
+            pixels = Pixels(first=sight.first, places=sight.places, grey=g, weights=w)
+            add_heights(pixels, ground, self.sigmas[n], _LIMIT, moments, self.residuals[n], self._factors[n], found[n])
+        self.system, (right, self.noise) = np.zeros((7, rows, columns)), np.zeros((2, rows, columns))
+        made_heights(moments, self.system, right, self.noise)
         self.counted = counted
-        pixels = sum(float(np.count_nonzero(w)) for w in weights)
-        self._weigh(found, int((self.density > 0).sum()) * float(found[:, 2].sum()) / max(pixels, 1.0))
+        used = sum(float(np.count_nonzero(w)) for w in weights)
+        self._weigh(found, int((self.density > 0).sum()) * float(found[:, 2].sum()) / max(used, 1.0))
         return right
 
     def _weigh(self, found: _Doubles, unknowns: float) -> None:

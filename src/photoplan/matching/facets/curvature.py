@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.matching.facets.means import means_around
 from photoplan.matching.facets.observe import Facets
 
 _Doubles = NDArray[np.float64]
@@ -178,13 +179,4 @@ def _inside(shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 def _means(values: _Doubles) -> _Doubles:
     """Means around each post over squares of `_PATCH` posts, shape (rows, columns)."""
-    out = values
-    for axis in (0, 1):
-        count, half = values.shape[axis], _PATCH // 2
-        sums = np.insert(np.cumsum(out, axis=axis), 0, 0.0, axis=axis)
-        at = np.arange(count)
-        first, last = np.maximum(at - half, 0), np.minimum(at + half, count)
-        out = (sums.take(last, axis) - sums.take(first, axis)) / (last - first).reshape(
-            (-1, 1) if axis == 0 else (1, -1)
-        )
-    return out
+    return means_around(values, _PATCH)

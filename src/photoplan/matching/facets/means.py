@@ -6,21 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.kernels.box_means import box_means
+
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
 
 
 def means_around(values: NDArray[np.floating], patch: int) -> _Doubles:
-    """Means over patches of patch × patch values, fewer at the border."""
-    out = np.asarray(values, float)
-    half = patch // 2
-    for axis in (0, 1):
-        count = out.shape[axis]
-        sums = np.insert(np.cumsum(out, axis=axis), 0, 0.0, axis=axis)
-        k = np.arange(count)
-        first, last = np.maximum(k - half, 0), np.minimum(k + half + 1, count)
-        sizes = (last - first).reshape((-1, 1) if axis == 0 else (1, -1))
-        out = (sums.take(last, axis) - sums.take(first, axis)) / sizes
+    """Means over patches of patch × patch values, fewer at the border, shape (rows, columns); an even patch has one
+    more before than behind."""
+    out = np.empty(values.shape)
+    box_means(np.ascontiguousarray(values, float), patch // 2, patch - patch // 2, out)
     return out
 
 

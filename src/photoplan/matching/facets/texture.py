@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.facets_grey import sample_grey
-from photoplan.kernels.facets_height import add_sensitivities
+from photoplan.kernels.facets_height import Ground, add_sensitivities
 from photoplan.matching.facets.means import means_around
 from photoplan.matching.facets.observe import Sight
 
@@ -46,17 +46,14 @@ class GreyTexture:
         cls,
         sights: Sequence[Sight],
         weights: Sequence[_Floats],
-        values: _Floats,
+        ground: Ground,
         errors: _Floats,
         density: _Floats,
-        ratio: int,
-        ways: _Doubles,
     ) -> GreyTexture:
-        """From coefficients and errors of theirs: see `FacetBlock`."""
-        found = np.zeros((2, *ways.shape[:2]))
-        for coefficients, sums in zip((values, errors), found):
-            for sight, w in zip(sights, weights):
-                add_sensitivities(sight.places, w, coefficients, ratio, ways, sums)
+        """From the surface and errors of its coefficients: see `FacetBlock`."""
+        found = np.zeros((2, *ground.means.shape[:2]))
+        for sight, w in zip(sights, weights):
+            add_sensitivities(sight.places, w, ground, errors, found)
         seen, noise = (means_around(means_around(part, size), size) for part, size in zip(found, (_SEEN, _DRAWN)))
         return cls(errors, density, np.clip(1 - noise / np.maximum(seen, 1e-300), 0.0, 1.0))
 
