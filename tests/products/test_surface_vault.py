@@ -18,7 +18,7 @@ from photoplan.cameras.framed import FramedCamera
 from photoplan.geometry.cylinder import CylinderFrame
 from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.project.file import load_project
-from photoplan.matching.facets.observe import Facets, View, look
+from photoplan.matching.facets.observe import Facets, Relief, View, look
 from photoplan.matching.facets.pyramid import Pyramid
 from photoplan.project.cameras import central_without_pixels
 
@@ -129,7 +129,7 @@ def test_rays_bend_over_a_cylinder_as_they_do(tmp_path: Path, monkeypatch: pytes
         view = View(camera=FramedCamera(camera, frame, around), pyramid=Pyramid(image))
         sight = look(view, 0, facets, (heights.min() - 0.4, heights.max() + 0.3))
         assert sight is not None
-        places = sight.onto(heights).places[..., :2]
+        places = sight.onto(Relief.of(heights)).places[..., :2]
         col, row = np.meshgrid(*(first + np.arange(n) for first, n in zip(sight.first, places.shape[1::-1])))
         origin, way = camera.rays(np.stack([col, row], axis=-1).reshape(-1, 2).astype(float))
         true = facets.to_posts(np.stack(over(origin[0], way, frame), axis=-1)).reshape(places.shape)

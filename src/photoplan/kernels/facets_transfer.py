@@ -166,6 +166,8 @@ def _hit(posts, steep, u, v, ku, kv, qu, qv, cu, cv, top, bottom, slope, z):
     reach = abs(ku) + abs(kv) + far * (2.0 * (abs(qu) + abs(qv)) + 3.0 * far * (abs(cu) + abs(cv)))
     found = _only_hit(posts, u, v, ku, kv, qu, qv, cu, cv, z)
     at, clear = found, not np.isnan(found)
+    if clear and slope * reach < _GENTLE:
+        return found
     while clear:
         i, j = int(u + at * (ku + at * (qu + at * cu))) // CELL, int(v + at * (kv + at * (qv + at * cv))) // CELL
         i, j = min(max(i, 0), steep.shape[1] - 1), min(max(j, 0), steep.shape[0] - 1)

@@ -21,7 +21,7 @@ from photoplan.kernels.facets_solve import add_curvatures, solve_heights, varian
 from photoplan.kernels.facets_sums import OFFSETS, PAD, add_grey, count_pixels, sort_pixels
 from photoplan.matching.facets.curvature import Roughness, Smoother
 from photoplan.matching.facets.means import away_from_border, corners, smoothed
-from photoplan.matching.facets.observe import Facets, Sight, View
+from photoplan.matching.facets.observe import Facets, Relief, Sight, View
 from photoplan.matching.facets.radiometry import Transfer, first_guess, levelled
 from photoplan.matching.facets.texture import GreyTexture
 
@@ -113,7 +113,10 @@ class FacetBlock:
 
     def iterate(self, radiometry: bool = True, texture: bool = False) -> None:
         """One correction of everything; perhaps with texture told from noise from then on."""
-        self.sights = [sight.onto(self.heights) for sight in self.sights]
+        relief = Relief.of(self.heights)
+        # One by one, so that places of one alone are there twice.
+        for n, sight in enumerate(self.sights):
+            self.sights[n] = sight.onto(relief)
         grey, weights = self.observed()
         if not len(self.values):
             self._start(grey, weights)
@@ -144,7 +147,8 @@ class FacetBlock:
 
     def misfit(self, heights: _Doubles) -> float:
         """Variance of the grey values about a surface of these heights over their own; infinite if few pixels tell."""
-        trial = replace(self, heights=heights, sights=[s.onto(heights) for s in self.sights], values=_NONE, _factors=[])
+        relief = Relief.of(heights)
+        trial = replace(self, heights=heights, sights=[s.onto(relief) for s in self.sights], values=_NONE, _factors=[])
         trial.transfers = first_guess(trial.sights, self.facets)
         grey, weights = trial.observed()
         weights = [(w > 0).astype(np.float32) for w in weights]
@@ -262,7 +266,7 @@ class FacetBlock:
         system = np.zeros((shape[0], OFFSETS, shape[1]), np.float32)
         right, density = np.zeros((2, *shape), np.float32)
         add_grey(pixels, ends, system, right, density)
-        del pixels
+        del pixels, ends, counts
         self.values = _solved_exactly(system, right, density, self.values, *_ROUNDS)
         if drawn:
             right[:] = 0.0

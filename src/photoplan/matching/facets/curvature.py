@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.kernels.facets_pull import pull
 from photoplan.matching.facets.means import means_around
 from photoplan.matching.facets.observe import Facets
 
@@ -83,7 +84,9 @@ class Roughness:
 
     def gradient(self, heights: _Doubles) -> _Doubles:
         """Half the gradient of the weighted sum of their squares, shape (rows, columns)."""
-        return _transposed(self.weights * curvatures(heights))
+        out = np.empty(heights.shape)
+        pull(self.weights, heights, out)
+        return out
 
     def around(self, heights: _Doubles) -> Roughness:
         """The same variances, with the robust factors of heights (rows, columns)."""

@@ -103,6 +103,27 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
+class Relief:
+    """A surface that pixels are carried to."""
+
+    heights: _Doubles
+    """At the posts, shape (rows, columns), metres."""
+    bent: _Doubles
+    """See `facets_transfer.bends`."""
+    steep: _Doubles
+    """See `facets_transfer.steepness`."""
+
+    @classmethod
+    def of(cls, heights: _Doubles) -> Relief:
+        """From heights at the posts."""
+        rows, columns = heights.shape
+        bent, steep = np.empty((2, rows, columns)), np.empty((-(-(rows - 1) // CELL), -(-(columns - 1) // CELL)))
+        bends(heights, bent)
+        steepness(heights, steep)
+        return cls(heights, bent, steep)
+
+
+@dataclass(frozen=True, eq=False)
 class Sight:
     """What a view has of a block: pixels of a window of one of its levels, and how their rays run."""
 
@@ -121,17 +142,13 @@ class Sight:
     on: _Doubles | None = None
     """Heights of the surface that they were carried to."""
 
-    def onto(self, heights: _Doubles) -> Sight:
-        """The same pixels, carried to a surface of heights at the posts."""
-        if self.on is heights:
+    def onto(self, relief: Relief) -> Sight:
+        """The same pixels, carried to a surface."""
+        if self.on is relief.heights:
             return self
         places = np.empty((*self.raw.shape, 4), np.float32)
-        steep = np.empty((-(-(heights.shape[0] - 1) // CELL), -(-(heights.shape[1] - 1) // CELL)))
-        steepness(heights, steep)
-        bent = np.empty((2, *heights.shape))
-        bends(heights, bent)
-        transfer(self.ways, *self.steps, heights - self.level, bent, steep, _WALL, places)
-        return replace(self, places=places, on=heights)
+        transfer(self.ways, *self.steps, relief.heights - self.level, relief.bent, relief.steep, _WALL, places)
+        return replace(self, places=places, on=relief.heights)
 
 
 def look(view: View, level: int, facets: Facets, heights: tuple[float, float]) -> Sight | None:

@@ -22,7 +22,7 @@ from photoplan.matching.facets.judged import (
     misfit_variances,
     residual_pictures,
 )
-from photoplan.matching.facets.observe import MARGIN, Facets, Sight, View, facets_of, levels_done, look
+from photoplan.matching.facets.observe import MARGIN, Facets, Relief, Sight, View, facets_of, levels_done, look
 from photoplan.matching.facets.radiometry import Transfer, first_guess
 from photoplan.matching.facets.search import Search, Searched, search
 
@@ -197,7 +197,7 @@ def _opened(
     views: Sequence[View], level: int, facets: Facets, heights: _Doubles, before: FacetBlock | None, reach: float
 ) -> FacetBlock | None:
     """A block at the start of a level; None if fewer than two views see it."""
-    span = float(heights.min()), float(heights.max())
+    span, relief = (float(heights.min()), float(heights.max())), Relief.of(heights)
     sights: list[Sight] = []
     own: list[View] = []
     for view in views:
@@ -205,7 +205,7 @@ def _opened(
         sight = look(view, level, facets, (span[0] - room, span[1] + room))
         if sight is None:
             continue
-        sight = sight.onto(heights)
+        sight = sight.onto(relief)
         if np.count_nonzero(np.isfinite(sight.places[..., 0]) & np.isfinite(sight.raw)) >= _FEW:
             sights.append(sight)
             own.append(view)

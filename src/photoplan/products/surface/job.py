@@ -33,8 +33,8 @@ _Doubles = NDArray[np.float64]
 _PART, _KEPT = 1008, 256 << 20
 MISFIT = 2.0
 """Heights around which residuals are so many times larger than expected are told of: they may be wrong."""
-#: Bytes of a grey facet while it is adjusted: its equations twice, and what the pixels need.
-_EACH = 400
+#: Bytes of a grey facet while it is adjusted: its equations, and what its pixel of each image needs.
+_FACET, _PIXEL = 140, 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +52,8 @@ class SurfaceJob:
     """Of the target; None: the map."""
     bands: tuple[int, ...] = ()
     """See `SurfaceSettings.bands`."""
+    seen: int = 0
+    """Images that see most places; 0: all."""
 
     @property
     def part(self) -> int:
@@ -63,7 +65,8 @@ class SurfaceJob:
         """Memory that a tile takes."""
         m, part = self.scheme.ratio, self.part
         posts = (min(part, self.grid.width) + 2 * MARGIN) * (min(part, self.grid.height) + 2 * MARGIN)
-        return posts * m**2 * _EACH + 2 * _PART**2 * len(self.address.scenes)
+        each = _FACET + _PIXEL * (self.seen or len(self.address.scenes))
+        return posts * m**2 * each + 2 * _PART**2 * len(self.address.scenes)
 
     def __call__(self, tile: Tile) -> Made:
         """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -129,6 +130,7 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
         residuals=plan.settings.residuals,
         frame=plan.frame,
         bands=plan.settings.bands,
+        seen=min(len(plan.images), math.ceil(sum(plan.parts.values())) + 1),
     )
     run.check(job.bytes)
     paths = outputs(folder, plan)
