@@ -161,7 +161,7 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
     residuals, factors, sums = np.empty((14, 16), np.float32), np.ones((14, 16), np.float32), np.zeros(3)
     moments, trusted = np.zeros((2, 3, facets_height.MOMENTS)), np.arange(4) < np.full((3, 1), 2)
     pixels = facets_height.Pixels(first=(0, 0), places=places, grey=seen, weights=weights)
-    ground = facets_height.Ground(values=values, ratio=2, means=means, trusted=trusted)
+    ground = facets_height.GreyFacets(values=values, ratio=2, means=means, trusted=trusted)
     facets_height.add_heights(pixels, ground, 8.0, 2.0, moments, residuals, factors, sums)
     system, (right, noise) = np.zeros((7, 3, 4)), np.zeros((2, 3, 4))
     facets_height.made_heights(moments, system, right, noise)

@@ -37,7 +37,7 @@ class Pixels(NamedTuple):
     """Of the pixels, shape (h, w), float32; 0: not to be used."""
 
 
-class Ground(NamedTuple):
+class GreyFacets(NamedTuple):
     """A surface."""
 
     values: Any
@@ -74,7 +74,7 @@ def add_heights(pixels, ground, sigma, limit, moments, residuals, factors, sums)
     Parameters
     ----------
     pixels : Pixels
-    ground : Ground
+    ground : GreyFacets
     sigma, limit : float
         Standard deviation of the grey values, and the multiple of it from which weights fall (Huber 1964).
     moments : ndarray, shape (rows − 1, columns − 1, MOMENTS)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.facets_grey import add_errors, sample_grey, sample_pixels, solve_grey
-from photoplan.kernels.facets_height import MOMENTS, Ground, Pixels, add_heights, add_means, made_heights
+from photoplan.kernels.facets_height import MOMENTS, GreyFacets, Pixels, add_heights, add_means, made_heights
 from photoplan.kernels.facets_signs import signs_at
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
 from photoplan.kernels.facets_sums import OFFSETS, PAD, add_grey, count_pixels, sort_pixels
@@ -301,7 +301,7 @@ class FacetBlock:
             sums += own
         self.ways = sums[..., 1:] / np.maximum(sums[..., :1], 1e-30)
         trusted = np.ones((rows, columns), bool) if self.trusted is None else self.trusted
-        ground = Ground(values=self.values, ratio=self.facets.ratio, means=self.ways, trusted=trusted)
+        ground = GreyFacets(values=self.values, ratio=self.facets.ratio, means=self.ways, trusted=trusted)
         if errors is not None:
             self.texture = GreyTexture.of(self.sights, weights, ground, errors, self.density)
         found, moments = np.zeros((len(self.sights), 3)), np.zeros((rows - 1, columns - 1, MOMENTS))

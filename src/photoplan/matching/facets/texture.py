@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.facets_grey import sample_grey
-from photoplan.kernels.facets_height import Ground, add_sensitivities
+from photoplan.kernels.facets_height import GreyFacets, add_sensitivities
 from photoplan.matching.facets.means import means_around
 from photoplan.matching.facets.observe import Sight
 
@@ -46,7 +46,7 @@ class GreyTexture:
         cls,
         sights: Sequence[Sight],
         weights: Sequence[_Floats],
-        ground: Ground,
+        ground: GreyFacets,
         errors: _Floats,
         density: _Floats,
     ) -> GreyTexture:
