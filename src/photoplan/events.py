@@ -118,3 +118,4 @@ def stretch(begin: float, end: float, what: str = "") -> Iterator[None]:
 
     with listening(told):
         yield
+    outer(end, what)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import rasterio
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from tools.body_axes import over_its_body
 from tools.command import inside
@@ -18,8 +20,8 @@ from tools.line_strip import Strip, pattern
 from photoplan.cameras.base import project
 from photoplan.cameras.line import LineCamera
 from photoplan.cameras.rpc_fit import fit_rpc
-from photoplan.errors import InputError
-from photoplan.geometry.body import EARTH_RADII
+from photoplan.errors import HeightSystemError, InputError
+from photoplan.geometry.body import EARTH_RADII, BodyGround
 from photoplan.geometry.geodetic import GeodeticGround
 from photoplan.geometry.local import Ellipsoid
 from photoplan.io.camera.line import csm
@@ -191,12 +193,53 @@ class TestStrip:
         across, along = strip.columns * strip.pixel, strip.lines * strip.pixel
         assert np.ptp(seen.outline[:, :2], axis=0) == pytest.approx([along, across], rel=0.15)
 
+    def test_an_image_that_leaves_the_grid_of_its_heights_is_projected_where_that_holds(self) -> None:
+        strip = Strip()
+        whole = csm.read(strip.isd(), Path("strip.json")).camera(strip.crs, "ellipsoidal")
+        camera = LineCamera(whole.track, whole.look, Ending(strip.crs, "ellipsoidal", EARTH_RADII))
+        xy = np.stack(np.meshgrid([20.0, 380.0], [20.0, 100.0, 200.0, 400.0, 500.0, 580.0]), axis=-1).reshape(-1, 2)
+        ground = whole.rays(xy, 300.0)[0]
+        held = ground[:, 0] < Ending.east
+        assert 3 < held.sum() < 9
+        assert np.abs(project(camera, ground[held]) - xy[held]).max() < 1e-6
+        with pytest.raises(HeightSystemError, match="outside of the grid"):
+            project(camera, ground)
+        # What lies beyond is never taken for ground of another height: an outline that needs it is refused.
+        with pytest.raises(HeightSystemError, match="outside of the grid"):
+            footprint(camera, LevelSurface(300.0), None)
+
     def test_an_image_of_another_size_is_refused(self, tmp_path: Path) -> None:
         project_file = Strip(lines=60).write(tmp_path, 300.0)
         isd = Strip(lines=50).isd()
         (tmp_path / "strip.json").write_text(json.dumps(isd))
         said = inside("ortho", project_file, "--resolution", 0.3)
         assert said.code == 3 and "400 × 60 pixels" in said.err and "400 × 50" in said.err
+
+
+@dataclass(frozen=True)
+class Ending(BodyGround):
+    """The earth, with heights by a grid that ends in the east, and says so as grids do."""
+
+    east: ClassVar[float] = 600_000.0
+
+    @property
+    def bare(self) -> BodyGround:
+        return BodyGround(self.crs, self.heights, self.radii)
+
+    def held(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        XYZ = np.asarray(XYZ, float)
+        if (XYZ[..., 0] > self.east).any():
+            raise HeightSystemError("a point lies outside of the grid")
+        return XYZ
+
+    def __call__(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        return self.bare(self.held(XYZ))
+
+    def ellipsoidal(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        return self.held(XYZ)[..., 2]
+
+    def to_map(self, xyz: ArrayLike) -> NDArray[np.float64]:
+        return self.held(self.bare.to_map(xyz))
 
 
 @pytest.mark.parametrize(

@@ -18,10 +18,10 @@ def camera_of(strip: ShakenStrip, folder: Path, name: str = "nadir") -> LineCame
     return read_line(strip.strip_file(folder), name).camera(strip.crs, "ellipsoidal")
 
 
-def pace_of(camera: LineCamera, xy: np.ndarray, height: float) -> np.ndarray:
-    """By how many pixels along the flight (+X) the view moves on in a line."""
+def pace_of(camera: LineCamera, xy: np.ndarray, height: float, pixel: float) -> np.ndarray:
+    """By how many pixels of so many metres, the pace of the flight, the view moves on along it (+X) in a line."""
     later, earlier = (camera.rays(xy + np.array([0.0, step]), height)[0][:, 0] for step in (0.005, -0.005))
-    return np.abs(later - earlier) / (0.01 * 0.3)
+    return np.abs(later - earlier) / (0.01 * pixel)
 
 
 @pytest.mark.slow
@@ -35,7 +35,7 @@ def test_the_source_s_strip_is_its_own_inverse(tmp_path: Path) -> None:
     xy[:300, 1] = np.clip(rng.choice([0.3, 0.73], 300) * 24_000 + rng.normal(0.0, 60.0, 300), 0, 23_999)
     for height in (0.0, 900.0):
         ground = camera.rays(xy, height)[0]
-        pace = pace_of(camera, xy, height)
+        pace = pace_of(camera, xy, height, strip.pixel)
         moments = camera.moments(ground)
         nearest = np.full(len(xy), np.inf)
         np.minimum.at(nearest, moments.point, np.abs(moments.xy - xy[moments.point]).max(axis=1))
@@ -74,7 +74,7 @@ def test_every_moment_is_found_and_the_first_is_taken(shaken: tuple[ShakenStrip,
     near = np.abs(moments.xy - xy[moments.point]).max(axis=1) < 1e-5
     count = np.bincount(moments.point, minlength=len(xy))
     print("\npoints seen once, twice, …:", np.bincount(count)[1:])
-    pace = pace_of(camera, xy, 300.0)
+    pace = pace_of(camera, xy, 300.0, shaken[0].pixel)
     found = np.isin(np.arange(len(xy)), moments.point[near])
     assert found[pace > 0.4].all() and found.mean() > 0.99
     exact = np.full(len(xy), np.inf)

@@ -16,6 +16,10 @@ from tools.command import COMMAND, OPTIONS, Here, Undisturbed, inside, process
 from tools.small_block import CRS, NAMES, SIZE, Block, texture, write_image
 
 from photoplan.cli.main import VERBS
+from photoplan.io.project.file import load_project
+from photoplan.project.cameras import camera_without_pixels
+from photoplan.project.ground import ground_of
+from photoplan.surfaces.intersect import intersect
 
 
 def test_help_answers_at_once() -> None:
@@ -151,6 +155,24 @@ def test_check_prints_a_line_for_each_image(photoplan: Here, pristine: Block) ->
     assert [i["image"] for i in facts["images"]] == ["two"]
     assert facts["images"][0]["gsd"] == pytest.approx(1.5, rel=0.05)
     assert facts["height_systems"] == {"terrain": "same", "orientation": "same", "working": "same"}
+
+
+def test_check_tells_how_much_of_an_image_shows_terrain(photoplan: Here, small: Block) -> None:
+    """By rays all over it: the model has hills inside of the image, and none along its border or in its middle."""
+    with rasterio.open(small.terrain, "r+") as file:
+        heights, half = file.read(1), file.height // 2
+        island = np.zeros(heights.shape, bool)
+        island[half - 12 : half - 3, 20:45] = True
+        file.nodata = -9999.0
+        file.write(np.where(island, heights, -9999.0).astype(np.float32), 1)
+    said = json.loads(photoplan("check", small.project, "--json", "--images", "two").out)
+    (found,) = said["images"]
+    project = load_project(small.project)
+    camera, ground = camera_without_pixels(project, "two"), ground_of(project)
+    x, y = np.meshgrid(*(np.linspace(0, side - 1, 60) for side in camera.size))
+    range_ = ground.bare.height_range(ground.bounds)
+    true = np.isfinite(intersect(camera, np.stack([x, y], -1).reshape(-1, 2), ground.bare, range_)[:, 0]).mean()
+    assert 0.1 < true < 0.8 and found["on_terrain"] == pytest.approx(true, abs=0.06)
 
 
 def test_info_knows_rasters_projects_plans_and_records(

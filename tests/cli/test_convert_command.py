@@ -30,6 +30,16 @@ def test_paths_on_stdout_and_what_is_lost_on_stderr(photoplan, toml, tmp_path):
     assert quiet.err == ""
 
 
+def test_a_dry_run_says_what_it_would_write_and_refuses_as_the_run(photoplan, toml, tmp_path):
+    words = ("convert", toml, "--to", "bingo", "-o", tmp_path / "itera.dat")
+    said = photoplan(*words, "--dry-run")
+    assert (said.code, said.out) == (0, f"{tmp_path / 'itera.dat'}\n")
+    assert "bingo; nothing is written" in said.err and "bingo holds no cameras ('DMC')" in said.err
+    assert [p.name for p in tmp_path.iterdir()] == ["block.toml"]
+    assert photoplan(*words).code == 0
+    assert photoplan(*words, "--dry-run").code == 2
+
+
 def test_json(photoplan, toml, tmp_path):
     said = photoplan("convert", toml, "--to", "inpho", "-o", tmp_path / "o.prj", "--json")
     facts = json.loads(said.out)

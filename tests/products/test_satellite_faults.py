@@ -103,6 +103,8 @@ def test_fault_14_a_scale_that_is_a_thousand_times_too_small(tmp_path: Path) -> 
     (tmp_path / "rpc.txt").write_text("\n".join(lines))
     said = inside("check", project)
     assert said.code == 3 and "times longer than wide" in said.out
+    # They have none that could be read in another way.
+    assert "angles" not in said.err and "whether geometry and image belong together" in said.err
 
 
 def test_fault_14_a_tile_of_a_product_with_the_polynomials_of_the_whole(tmp_path: Path) -> None:

@@ -16,8 +16,12 @@ from tools.facet_scene import CONTRAST, GROUND, GSD, Scene, write_scene
 from tools.sketched import drawn
 from tools.small_block import X0, Y0
 
+from photoplan.events import listening
+from photoplan.geometry.grid import Window
 from photoplan.io.project.file import load_project
+from photoplan.plan.tiles import Tile
 from photoplan.products.surface.findings import findings
+from photoplan.products.surface.job import SurfaceJob
 from photoplan.products.surface.plan import plan_surface
 from photoplan.products.surface.settings import SurfaceSettings
 from photoplan.products.surface.spread import counted, median
@@ -114,6 +118,18 @@ def test_grey_values_are_as_fine_as_the_pixels_where_images_are_enough(scene: Sc
     # Pixels of 0.5 m: of five images four facets on 1.55 m have three each, of two images one.
     assert ratio(1.5) == ratio(1.45) == 3 and ratio(1.55) == ratio(2.0) == 4
     assert ratio(1.55, "i1", "i2") == 3 and ratio(1.8, "i1", "i2") == 4
+
+
+def test_a_tile_tells_its_levels_and_how_much_is_done(scene: Scene) -> None:
+    plan = plan_surface(load_project(scene.path), SurfaceSettings(3.0, bounds=BOUNDS, start=str(GROUND), reach=20.0))
+    job = SurfaceJob(address=plan.address, grid=plan.grid, scheme=plan.scheme, start=str(GROUND))
+    told: list[tuple[float, str]] = []
+    with listening(lambda share, what: told.append((share, what))):
+        job(Tile(0, Window(0, 0, 4, 4)))
+    shares, names = [share for share, _ in told], list(dict.fromkeys(what for _, what in told if what))
+    count = plan.scheme.coarsest + 1
+    assert count > 2 and names == [f"level {k + 1} of {count}" for k in range(count)]
+    assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == 1 and len(set(shares)) > 3 * count
 
 
 def test_residuals_of_a_surface_that_fits(made: Path) -> None:

@@ -33,5 +33,4 @@ def command(project: Path, images: tuple[str, ...], as_json: bool, quiet: bool) 
         if not found.implausible:
             faults = "another reading of the orientation fits better"
         first = f": {found.implausible[0]}" if found.implausible else ""
-        remedy = found.alternative or "no other reading of the angles fits; look at heights, axes and image names"
-        raise GeometryError(f"{project}: {faults}{first}\n{remedy}")
+        raise GeometryError(f"{project}: {faults}{first}\n{found.remedy}")

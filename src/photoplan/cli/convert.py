@@ -38,7 +38,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--list-readings", is_flag=True, help="Only list the readings of the file that fit measured points.")
 @click.option("--image-points", type=PATH, help="Measured image points, for --list-readings.")
 @click.option("--control", type=PATH, help="Their ground points, for --list-readings.")
-@ending()
+@ending("Say what would be written and what would be lost, and stop.")
 def command(
     orientation: Path,
     target: str | None,
@@ -66,7 +66,7 @@ def command(
     if target is None:
         raise click.UsageError("say the format to write with --to FORMAT")
     if target == "rpc":
-        _polynomials(orientation, request.output, request.overwrite, as_json, quiet)
+        _polynomials(request, as_json, quiet)
         return
     if image_points is not None or control is not None:
         raise click.UsageError("--image-points and --control go with --list-readings")
@@ -79,24 +79,30 @@ def _convert(request: Any, as_json: bool, quiet: bool) -> None:
 
     with recording("convert", request, [request.orientation, request.camera]) as record:
         done = convert_orientation(request)
-        record(done.files, done)
+        record(() if request.dry_run else done.files, done)
     if as_json:
         show_json(done)
     else:
         for file in done.files:
             show(file)
     if not quiet:
-        say(f"  {done.images} images, from {done.source_format} to {done.target_format}")
+        say(f"  {done.images} images, from {done.source_format} to {done.target_format}{_nothing(request)}")
         for note in done.notes:
             say(f"  {note}")
         for loss in done.lost:
             say(f"  {done.target_format} holds {loss.text}")
 
 
-def _polynomials(project: Path, output: Path | None, overwrite: bool, as_json: bool, quiet: bool) -> None:
+def _nothing(request: Any) -> str:
+    return "; nothing is written" if request.dry_run else ""
+
+
+def _polynomials(request: Any, as_json: bool, quiet: bool) -> None:
     from photoplan.products.polynomials import PolynomialsRequest, write_polynomials
 
-    done = write_polynomials(PolynomialsRequest(project, output, overwrite))
+    done = write_polynomials(
+        PolynomialsRequest(request.orientation, request.output, request.overwrite, request.dry_run)
+    )
     if as_json:
         show_json(done)
     else:
@@ -106,6 +112,8 @@ def _polynomials(project: Path, output: Path | None, overwrite: bool, as_json: b
         for image in done.images:
             low, high = image.heights
             say(f"  {image.image}: off by at most {image.worst:.2g} px for heights from {low:.0f} to {high:.0f} m")
+        if request.dry_run:
+            say("  nothing is written")
 
 
 def _list(request: Any, image_points: Path, control: Path, as_json: bool, quiet: bool) -> None:

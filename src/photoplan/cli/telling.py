@@ -15,6 +15,8 @@ SELDOM, OFTEN = 30.0, 0.1
 _BAR = 24
 #: Pixels a second below which they are told one by one, as of heights of a surface.
 _SLOW = 1e4
+#: Units that tell nothing of the pace yet.
+_FEW = 0.01
 
 
 class Telling:
@@ -95,7 +97,7 @@ class Telling:
         if self._pixels:
             rate = self._pixels / took
             words.append(f"{rate / 1e6:.3g} Mpx/s" if rate >= _SLOW else f"{rate:.0f} px/s")
-        if self._kept < finished < self._units:
+        if self._kept + _FEW < finished < self._units:
             words.append(f"{_time(took / (finished - self._kept) * (self._units - finished))} left")
         else:
             words.append(f"for {_time(took)}")

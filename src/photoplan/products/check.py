@@ -21,6 +21,7 @@ from photoplan.products.orthophoto.look import heights_in_feet, two_figures
 from photoplan.project.cameras import camera_without_pixels, is_there
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.scene import map_order, open_scene
+from photoplan.surfaces.intersect import intersect
 
 #: Terrain displacements of curvature above this deserve a strict model, pixels.
 _CURVATURE_MATTERS = 0.3
@@ -31,6 +32,8 @@ _LONGEST = 50.0
 _LONG = 2.5
 #: Lines that lie by this part of the image beside the smooth course are none of a flight, and at least so many pixels.
 _TORN, _TORN_PIXELS = 0.5, 100.0
+#: Rays along a side of an image that tell how much of it shows terrain.
+_RAYS = 10
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class ImageCheck:
     footprint: tuple[float, float]
     """Extent of the footprint in X and Y, metres; NaN if it sees no terrain."""
     on_terrain: float
-    """Part of the image's border and middle whose rays meet the terrain, 0 to 1."""
+    """Part of the image whose rays meet the terrain, by a lattice of them, 0 to 1."""
     relief_px: float
     """Largest displacement in the image by an error of 1 m in height, pixels (Behr 1989, section 6.1.2)."""
     admissible_height_error: float
@@ -70,6 +73,8 @@ class ProjectCheck:
     crs: str
     alternative: str | None
     """The reading of the orientation that would fit, where the declared one does not; None otherwise."""
+    angles: bool
+    """Whether any image with a fault is oriented by angles, which might be read in another way."""
     advice: tuple[str, ...]
     """Sentences that tell what would be better."""
 
@@ -77,6 +82,13 @@ class ProjectCheck:
     def implausible(self) -> tuple[str, ...]:
         """Images with a fault, and what it is."""
         return tuple(f"{i.image}: {i.fault}" for i in self.images if i.fault is not None)
+
+    @property
+    def remedy(self) -> str:
+        """What may help where images have faults."""
+        if self.angles:
+            return self.alternative or "no other reading of the angles fits; look at heights, axes and image names"
+        return self.alternative or "look at heights, the CRS, and whether geometry and image belong together"
 
     def json_fields(self) -> dict[str, Any]:
         """Height systems by what has them."""
@@ -134,6 +146,7 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
         heights=(*ground.height_systems, ground.working_system),
         crs=project.crs,
         alternative=reading_of_block(project, dict(zip(names, zip(views, looks))), ground),
+        angles=any(view is not None for view, check in zip(views, checks) if check.fault),
         advice=_advice(project, checks) + _of_objects(project, ground, names),
     )
 
@@ -189,13 +202,20 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
         tilt_deg=tilt,
         gsd=mean_gsd(camera, seen),
         footprint=(xmax - xmin, ymax - ymin),
-        on_terrain=seen.on_surface,
+        on_terrain=_on_terrain(camera, ground, seen),
         relief_px=relief,
         admissible_height_error=1 / relief if relief > 0 else nan,
         curvature_px=curvature,
         fault=fault,
         notes=notes,
     )
+
+
+def _on_terrain(camera: Camera, ground: Ground, seen: Footprint) -> float:
+    """Part of an image that shows terrain: holes may lie anywhere, and its border beyond the edge of a model."""
+    part = (np.arange(_RAYS) + 0.5) / _RAYS
+    xy = np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) * camera.size - 0.5
+    return float(np.isfinite(intersect(camera, xy, ground.bare, seen.height_range)[:, 0]).mean())
 
 
 def _torn(camera: Camera) -> str | None:

@@ -76,6 +76,8 @@ class ConvertRequest:
     drop_lens: bool = False
     """Whether a camera is written without its lens where the format has no such lens."""
     overwrite: bool = False
+    dry_run: bool = False
+    """Whether to write nothing, and only say what would be written and lost."""
 
 
 @dataclass(frozen=True)
@@ -121,9 +123,11 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
     block = _files_from(block, output if not target.suffix else output.parent)
     block, lost = _without_lost_lenses(block, target.losses(block), request)
     inputs = [p for p in (request.orientation, request.camera) if p is not None and not p.is_dir()]
-    for file in target.render(block, output):
+    files = list(target.render(block, output))
+    for file in files:
         check_output(file, inputs, overwrite=request.overwrite)
-    files = write_orientation(block, output, target.name, overwrite=request.overwrite)
+    if not request.dry_run:
+        files = write_orientation(block, output, target.name, overwrite=request.overwrite)
     table = block.table
     return ConvertReport(
         files=tuple(files),

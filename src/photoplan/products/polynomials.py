@@ -35,6 +35,8 @@ class PolynomialsRequest:
     output: Path | None = None
     """Folder of the files; None: that of the project."""
     overwrite: bool = False
+    dry_run: bool = False
+    """Whether to fit polynomials, and write nothing."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +89,15 @@ def write_polynomials(request: PolynomialsRequest) -> PolynomialsReport:
         check_output(path, inputs, overwrite=request.overwrite)
     with recording("convert", request, inputs) as record:
         fitted = [_fit(project, name, path) for name, path in outputs.items()]
+        report = PolynomialsReport(tuple(image for image, _, _ in fitted))
+        if request.dry_run:
+            return report
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{folder}: the folder cannot be made ({error.strerror or error})") from None
         for _, path, text in fitted:
             write_atomically(path, text.encode())
-        report = PolynomialsReport(tuple(image for image, _, _ in fitted))
         record(report.files, report)
     return report
 

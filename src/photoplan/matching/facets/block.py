@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.events import tell
 from photoplan.kernels.facets_grey import add_errors, sample_grey, sample_pixels, solve_grey
 from photoplan.kernels.facets_height import MOMENTS, GreyFacets, Pixels, add_heights, add_means, made_heights
 from photoplan.kernels.facets_signs import signs_at
@@ -109,6 +110,7 @@ class FacetBlock:
         for k in range(most):
             if self.moves and not (texture and k == 0) and self._moved < ENOUGH:
                 break
+            tell(k / most)
             self.iterate(radiometry and k == 0, texture and k == 0)
 
     def iterate(self, radiometry: bool = True, texture: bool = False) -> None:

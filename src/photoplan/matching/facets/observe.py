@@ -88,10 +88,11 @@ def facets_of(grid: MapGrid, window: Window, level: int, ratio: int, margin: int
     return Facets(left=float(left), top=float(top), pitch=grid.resolution * step, shape=(rows, columns), ratio=ratio)
 
 
-def levels_done(coarsest: int, level: int, part: float) -> float:
-    """How much of all levels is done when so much of one is: each has four times as many facets as the one before."""
-    before, now = 0.25**coarsest, 0.25**level
-    return ((now - before) / 3 + part * now) / ((1 - before) / 3 + 1)
+def levels_done(window: Window, coarsest: int, level: int, part: float) -> float:
+    """How much of all levels of a window is done when so much of one is: they cost as much as they have facets."""
+    sides = [(window.width / 2**k + 2 * MARGIN, window.height / 2**k + 2 * MARGIN) for k in range(coarsest + 1)]
+    facets = [across * along for across, along in sides]
+    return (sum(facets[level + 1 :]) + part * facets[level]) / sum(facets)
 
 
 @dataclass(frozen=True, eq=False)

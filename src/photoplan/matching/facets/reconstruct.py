@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from photoplan.events import stretch, tell
+from photoplan.events import stretch
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.block import FacetBlock
 from photoplan.matching.facets.curvature import Roughness
@@ -53,9 +54,9 @@ _BESIDE = 5
 _MISFIT = 2.0
 #: Standard deviation of grey values until it is estimated, part of their contrast.
 _NOISE = 0.1
-#: What a search costs, part of all; and of a level what is done when it is opened, before each estimate of roughness,
-#: and before its statistics.
-_SEARCHED, _OPENED, _ADJUSTED, _SETTLED = 0.35, 0.1, (0.35, 0.65), 0.85
+#: What a search costs, part of all; and of a level what is done when it is opened, adjusted, adjusted again after each
+#: estimate of roughness.
+_SEARCHED, _OPENED, _ADJUSTED, _AGAIN = 0.4, 0.1, 0.35, ((0.5, 0.7), (0.8, 0.85))
 
 
 @dataclass(frozen=True)
@@ -140,15 +141,14 @@ def reconstruct(
         start, reach = found, scheme.search.room
     moves = [0.0] * (scheme.coarsest + 1)
     for level in range(scheme.coarsest, -1, -1):
-        _tell(scheme, level, 0.0)
         facets = facets_of(grid, window, level, scheme.ratio)
         heights = _start_heights(start, facets) if block is None else _finer(block, facets, start)
         if heights is None:
             return None
-        block = _opened(views, level + scheme.base, facets, heights, block, reach) or block
+        with _part(scheme, window, level, 0.0, _OPENED):
+            block = _opened(views, level + scheme.base, facets, heights, block, reach) or block
         if block is None or block.facets is not facets:
             continue
-        _tell(scheme, level, _OPENED)
         block.limits, block.reach = _limits(start, facets, reach), reach
         if level == scheme.coarsest:
             if found is None:
@@ -156,27 +156,27 @@ def reconstruct(
             else:
                 block.roughness = block.roughness.around(block.heights)
                 block.trusted = found.sure if found.sure.mean() > _TRUSTED else None
-        block.adjust(_FIRST[level < scheme.coarsest], True)
+        with _part(scheme, window, level, _OPENED, _ADJUSTED):
+            block.adjust(_FIRST[level < scheme.coarsest], True)
         for k, (estimates, iterations) in enumerate(_THEN[level > 0]):
-            _tell(scheme, level, _ADJUSTED[k])
             if level == 0:
                 block.trusted = _telling(block, found)
             block.roughen(estimates)
             # Not before the noise has settled, nor where heights are still on their way, which looks like noise.
-            block.adjust(iterations, level == 0, texture=level == k == 0)
+            with _part(scheme, window, level, *_AGAIN[k]):
+                block.adjust(iterations, level == 0, texture=level == k == 0)
         moves[level] = block.moves[-1]
     if block is None or block.facets.pitch != grid.resolution:
         return None
-    _tell(scheme, 0, _SETTLED)
     made = _found(block, views, window, tuple(moves), residuals)
     return made if found is None else _doubting(made, found, window, scheme)
 
 
-def _tell(scheme: Scheme, level: int, part: float) -> None:
-    """Say that so much of a level is done."""
-    begun = 0.0 if scheme.search is None else _SEARCHED
-    share = begun + (1 - begun) * levels_done(scheme.coarsest, level, part)
-    tell(share, f"level {scheme.coarsest - level + 1} of {scheme.coarsest + 1}")
+def _part(scheme: Scheme, window: Window, level: int, *ends: float) -> AbstractContextManager[None]:
+    """What is told inside is of a level, from one part of it to another."""
+    first = 0.0 if scheme.search is None else _SEARCHED
+    begin, end = (first + (1 - first) * levels_done(window, scheme.coarsest, level, part) for part in ends)
+    return stretch(begin, end, f"level {scheme.coarsest - level + 1} of {scheme.coarsest + 1}")
 
 
 def _telling(block: FacetBlock, found: Searched | None) -> NDArray[np.bool_] | None:

@@ -156,7 +156,7 @@ def search(
         if found is not None:
             near = _near(found, facets)
             low, high = np.clip(near[0], low, high), np.clip(near[1], low, high)
-        begin, end = (levels_done(how.coarsest, level, part) for part in (0.0, 1.0))
+        begin, end = (levels_done(window, how.coarsest, level, part) for part in (0.0, 1.0))
         with stretch(begin, end, f"level {how.coarsest - level + 1} of {how.coarsest + 1}"):
             before, found = found, _level(views, level, how.base, facets, planes, low, high + 1) or found
         if before is not None and found is not None and found is not before:
