@@ -11,8 +11,12 @@ from photoplan.errors import UsageError
 from photoplan.geometry.rotation import (
     ROTATION_ORDERS,
     angles_from_rotation,
+    axes_of_angles,
     rotation_from_angles,
+    rotation_from_view,
     rotation_opk,
+    rotation_vector,
+    view_from_rotation,
 )
 
 angle = st.floats(-np.pi, np.pi, exclude_min=True)
@@ -74,3 +78,24 @@ def test_unknown_order_is_named() -> None:
     for call in (rotation_from_angles, angles_from_rotation):
         with pytest.raises(UsageError, match="xyz"):
             call(np.eye(3), "xyz")
+
+
+@pytest.mark.parametrize("order", ROTATION_ORDERS)
+def test_small_changes_of_angles_turn_about_their_axes(order: str) -> None:
+    angles = np.array([0.3, -0.5, 1.1])
+    R = rotation_from_angles(angles, order)
+    axes = axes_of_angles(R, order)
+    for k, letter in enumerate(order):
+        turned = rotation_from_angles(angles + 1e-6 * np.eye(3)[k], order)
+        np.testing.assert_allclose(rotation_vector(turned @ R.T) / 1e-6, axes["opk".index(letter)], atol=1e-6)
+
+
+def test_views_have_azimuth_pitch_and_roll() -> None:
+    level = rotation_from_view(np.pi / 2, 0.0, 0.0)
+    np.testing.assert_allclose(level @ (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), atol=1e-15)  # to the east
+    np.testing.assert_allclose(level @ (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), atol=1e-15)  # the south is right
+    assert (rotation_from_view(0.0, 0.0, 0.1) @ (1.0, 0.0, 0.0))[2] < 0 < rotation_from_view(0.0, 0.1, 0.0)[2, 1]
+    for stated in ((0.4, -0.9, 0.2), (-2.5, 1.2, -3.0)):
+        R = rotation_from_view(*stated)
+        np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-15)
+        assert np.linalg.det(R) == pytest.approx(1.0) and view_from_rotation(R) == pytest.approx(stated)

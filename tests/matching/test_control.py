@@ -14,6 +14,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
 from photoplan.matching.control import FoundPatch, agree, best_place, correlate, find_patch
+from photoplan.matching.ortho import OrthoPatch, ground_covariances
 
 
 def texture(side: int = 120, seed: int = 1) -> NDArray:
@@ -122,3 +123,12 @@ def test_too_few_points_are_none() -> None:
     fit = np.broadcast_to(np.eye(2) * 0.01, (50, 2, 2))
     found = agree(near, XYZ[:5], xy[:5], (fit[:5], C[:5]), 30.0)
     assert not found.keep.any()
+
+
+def test_errors_of_the_place_are_errors_of_the_height_on_slopes() -> None:
+    """Covariance of what is read at places that err, against a simulation."""
+    patch = OrthoPatch(np.zeros((3, 3)), (0.0, 0.0, 0.0), (0.4, -0.2), 0.0)
+    rng = np.random.default_rng(4)
+    xy = rng.normal(0, 0.5, (200_000, 2))
+    z = xy @ (0.4, -0.2) + rng.normal(0, 0.3, len(xy))
+    np.testing.assert_allclose(ground_covariances([patch], 0.5, 0.3)[0], np.cov(np.column_stack([xy, z]).T), atol=2e-3)

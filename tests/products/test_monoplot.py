@@ -25,7 +25,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cli.main import run
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.geometry.rotation import axes_of_angles
 from photoplan.io.project.file import load_project
 from photoplan.products.monoplot import MonoplotRequest, monoplot_file
 from photoplan.project.scene import open_scene
@@ -124,9 +124,7 @@ def test_standard_deviations_are_those_of_simulated_errors(name):
 
 
 def axes_of(tilt):
-    from photoplan.products.monoplot import _axes
-
-    return _axes(Pose.from_angles([X0, Y0, H], np.radians([tilt, -6.0, 31.0])).R_ground_camera, "opk")
+    return axes_of_angles(Pose.from_angles([X0, Y0, H], np.radians([tilt, -6.0, 31.0])).R_ground_camera, "opk")
 
 
 def direct(lens, xy, start, terrain, dh):
@@ -252,18 +250,3 @@ def test_wrong_use(small, tmp_path, capsys):
         assert run(["monoplot", str(small.project), image, str(file), "-o", str(target), *extra]) == code
         assert text in capsys.readouterr().err
         assert not out.exists()
-
-
-@pytest.mark.parametrize("order", ["opk", "pok", "kpo", "kop", "okp", "pko"])
-def test_angles_turn_about_the_axes_of_the_projects_order(order: str) -> None:
-    angles = np.radians([30.0, 25.0, 40.0])
-    R = rotation_from_angles(angles, order)
-    from photoplan.products.monoplot import _axes
-
-    axes = _axes(R, order)
-    for k, letter in enumerate(order):
-        changed = rotation_from_angles(angles + 1e-7 * (np.arange(3) == k), order)
-        turn = (changed - R) @ R.T / 1e-7
-        np.testing.assert_allclose(
-            axes["opk".index(letter)], [turn[2, 1], turn[0, 2], turn[1, 0]], atol=1e-6, err_msg=letter
-        )

@@ -11,8 +11,6 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from tools.command import Here
 from tools.small_block import NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
 
-from photoplan.products.orthophoto.sharpness import _energies, blur_of
-
 AWAY = (-60.0, 0.0, 60.0)
 OPTIONS = ("--resolution", 1.5, "--tile", 128, "--no-quicklook", "--json")
 #: Not so sharp that half a pixel between two images makes a difference.
@@ -60,30 +58,3 @@ def test_sharp_images_are_chosen(block: Block, capsys: pytest.CaptureFixture[str
     assert photoplan("run", block.folder / "p.gpkg", "--output", block.folder / "c", "--no-quicklook").code == 0
     with rasterio.open(block.folder / "products" / "a.tif") as a, rasterio.open(block.folder / "c" / "a.tif") as c:
         np.testing.assert_array_equal(a.read(), c.read())
-
-
-def test_images_and_ground_are_told_apart() -> None:
-    """Sums of both with gaps, single patches that are far off; what shares no ground with others counts as sharp."""
-    rng = np.random.default_rng(0)
-    blur, ground = np.array([0.0, 0.3, 1.2, 0.7, 0.1]), rng.normal(size=60)
-    quotients = ground[:, None] - blur + rng.normal(0, 0.02, (60, 5))
-    quotients[rng.random(quotients.shape) < 0.4] = np.nan
-    quotients[rng.integers(0, 60, 8), rng.integers(0, 5, 8)] += 5
-    alone = np.full((60, 1), np.nan)
-    alone[7] = -9.0
-    found = blur_of(np.concatenate([quotients, alone], axis=1))
-    np.testing.assert_allclose(found, [*blur, 0.0], atol=0.05)
-    assert (blur_of(np.full((3, 2), np.nan)) == 0).all()
-
-
-def test_fine_detail_goes_with_blur_by_the_filters_response() -> None:
-    """White noise has equal power at all frequencies: energies are integrals of the squared responses."""
-    grey = np.random.default_rng(3).normal(size=(712, 712))
-    w = 2 * np.pi * np.fft.fftfreq(512)
-    one = (6 + 8 * np.cos(w) + 2 * np.cos(2 * w)) / 16
-    smooth = one[:, None] * one
-    for sigma in (0.0, 1.2):
-        lens = np.exp(-(sigma**2) * (w[:, None] ** 2 + w**2))
-        want = [(lens * (1 - smooth) ** 2).mean(), (lens * (smooth - smooth**2) ** 2).mean()]
-        blurred = gaussian_filter(grey, sigma, truncate=8) if sigma else grey
-        np.testing.assert_allclose(_energies(blurred).mean(axis=(1, 2)), want, rtol=0.03)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import ndimage
-from tools.camera_model import Sensor
+from tools.camera_model import Sensor, gathered
 
 from photoplan.errors import InputError
 from photoplan.quality.camera.blooming import find_blooming
@@ -20,17 +20,13 @@ from photoplan.quality.camera.fixed_pattern import (
     signed_root,
     spectrogram,
 )
-from photoplan.quality.camera.frame_statistics import StackSums
 
 RUNS = 150
 
 
 def stack_of(sensor, photons, frames, seed, exposure_ms=20.0):
     noise = np.random.default_rng(seed)
-    sums = StackSums(2**sensor.bits - 1)
-    for _ in range(frames):
-        sums.add(sensor.frame(photons, exposure_ms, noise))
-    return sums.stack()
+    return gathered((sensor.frame(photons, exposure_ms, noise) for _ in range(frames)), 2**sensor.bits - 1)
 
 
 def pattern_of(stack, filtered=False):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tools.camera_model import Sensor
+from tools.camera_model import Sensor, gathered
 from tools.thinned import thinned
 
 from photoplan.errors import InputError
 from photoplan.quality.camera.dark_signal import dark_current, doubling_temperature
 from photoplan.quality.camera.emva import EmvaPoints, emva_sheet
-from photoplan.quality.camera.frame_statistics import Level, StackSums
+from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.linearity import linearity
 from photoplan.quality.camera.photon_transfer import photon_transfer
 from photoplan.quality.camera.saturation import find_saturation
@@ -22,10 +22,8 @@ RUNS = 500
 
 
 def level_of(sensor, photons, exposure_ms, noise, frames=2, celsius=20.0):
-    sums = StackSums(2**sensor.bits - 1)
-    for _ in range(frames):
-        sums.add(sensor.frame(photons, exposure_ms, noise, celsius))
-    return sums.stack().level
+    exposed = (sensor.frame(photons, exposure_ms, noise, celsius) for _ in range(frames))
+    return gathered(exposed, 2**sensor.bits - 1).level
 
 
 def transfer_of(sensor, noise, photons=(400, 1200, 2500, 4500, 7000, 10000)):
@@ -102,7 +100,7 @@ def test_flicker_of_the_lamp_does_not_change_the_gain():
 def test_temporal_variance_of_many_frames_without_their_drift():
     noise = np.random.default_rng(0)
     frames = [100 + 30 * k + 2.0 * noise.standard_normal((60, 70)) for k in range(5)]
-    level = StackSums(1e9).add_all(frames).stack().level
+    level = gathered(frames, 1e9).level
     assert level.temporal_variance == pytest.approx(4.0, abs=4 * level.variance_sigma)
     assert level.degrees == 4 * (60 * 70 - 1)
 
@@ -153,7 +151,7 @@ def test_single_frames_give_no_gain():
 
 def test_frames_whose_variance_does_not_grow_give_no_gain():
     noise = np.random.default_rng(9)
-    levels = [StackSums(255).add_all(100 * k + noise.standard_normal((2, 40, 40))).stack().level for k in (1, 1.5, 2)]
+    levels = [gathered(100 * k + noise.standard_normal((2, 40, 40)), 255).level for k in (1, 1.5, 2)]
     with pytest.raises(InputError, match="does not grow"):
         photon_transfer(levels)
 
@@ -382,7 +380,7 @@ def test_statistics_agree_with_numpy():
     noise = np.random.default_rng(1)
     frames = noise.integers(0, 255, (4, 20, 30)).astype(np.uint8)
     mask = noise.random((20, 30)) > 0.3
-    stack = StackSums(250, mask).add_all(frames).stack()
+    stack = gathered(frames, 250, mask)
     assert stack.mean == pytest.approx(frames.mean(axis=0))
     assert stack.variance == pytest.approx(frames.astype(float).var(axis=0, ddof=1))
     assert stack.level.mean == pytest.approx(frames[:, mask].mean())
@@ -393,6 +391,6 @@ def test_statistics_agree_with_numpy():
 
 
 def test_level_without_noise_has_no_negative_variance():
-    level = StackSums(255).add_all(np.full((3, 5, 5), 7.0)).stack().level
+    level = gathered(np.full((3, 5, 5), 7.0), 255).level
     assert isinstance(level, Level)
     assert level.temporal_variance == 0

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tools.camera_model import Sensor
+from tools.camera_model import Sensor, gathered
 from tools.thinned import some, thinned
 
-from photoplan.quality.camera.frame_statistics import Level, StackSums
+from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
 
 PHOTONS = tuple(np.linspace(600, 16000, 16))
 
 
 def level_of(sensor: Sensor, photons: float, noise: np.random.Generator, frames: int = 2) -> Level:
-    sums = StackSums(2**sensor.bits - 1)
-    return sums.add_all(sensor.frame(photons, 20.0, noise) for _ in range(frames)).stack().level
+    return gathered((sensor.frame(photons, 20.0, noise) for _ in range(frames)), 2**sensor.bits - 1).level
 
 
 def transfer_of(sensor: Sensor, seed: int, photons: tuple[float, ...] = PHOTONS) -> PhotonTransfer:

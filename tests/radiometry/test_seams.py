@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from photoplan.errors import PhotoplanError
 from photoplan.io.result_log import ResultLog
 from photoplan.radiometry import seams
-from photoplan.radiometry.seams import SeamParts, _Level
+from photoplan.radiometry.seams import SeamParts, _Level, standing_out
 from photoplan.radiometry.shown import SeamLayer, Shown, features_of
 
 
@@ -210,3 +210,12 @@ def test_parts_that_are_solved_at_once_do_not_touch(shape: tuple[int, int], part
             row, col, height, width = seams.grown(boxes[k][1], 1, shape)
             asked[row : row + height, col : col + width] += 1
         assert asked.max() == 1
+
+
+def test_houses_stand_out_of_slopes_and_unknown_ground_does_not() -> None:
+    row, col = np.mgrid[:90, :90]
+    relief = (0.03 * row + 0.02 * col).astype(np.float32)
+    relief[40:50, 30:45] += 5
+    relief[70:, 70:] = np.nan
+    found = standing_out(relief)
+    assert found[40:50, 30:45].all() and found[39, 35] and found.sum() == 10 * 15 + 2 * (10 + 15)

@@ -301,3 +301,15 @@ def test_rasters_of_planes_have_their_slope_up_to_the_border(
 def test_lights_that_cannot_be_meant_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         shading.Lighting(**wrong)
+
+
+def test_slopes_between_posts_that_are_far_apart_have_no_steps() -> None:
+    """Posts of 5 m on a parabola, pixels of 0.5 m: its slope grows evenly, that of meshes in steps."""
+    x = 1000.0 + 5.0 * np.arange(40)
+    heights = np.tile(0.01 * (x - 1000) ** 2, (40, 1)).astype(np.float32)
+    surface = RasterSurface(Posts(heights), (1000.0, 2000.0), (5.0, 5.0))
+    window = Window(100, 100, 60, 4)
+    grid = replace(GRID, width=300, height=300)
+    found, steps = (f(surface, grid, window).gradient[0, 0] for f in (shading.even_slopes, shading.surface_slopes))
+    want = 0.02 * (grid.to_map(np.stack([np.arange(100, 160), np.full(60, 100)], axis=1))[:, 0] - 1000)
+    assert np.abs(found - want).max() < 0.006 < 0.04 < np.abs(steps - want).max()

@@ -5,13 +5,24 @@ Kept apart from `photoplan.quality.formation` on purpose, so that the estimators
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import rasterio
 
-__all__ = ["Sensor", "write_frame"]
+from photoplan.quality.camera.frame_statistics import FrameStack, StackSums
+
+__all__ = ["Sensor", "gathered", "write_frame"]
+
+
+def gathered(frames: Iterable[np.ndarray], saturation: float, counted: np.ndarray | None = None) -> FrameStack:
+    """Frames gathered one after the other."""
+    sums = StackSums(saturation, counted)
+    for frame in frames:
+        sums.add(frame)
+    return sums.stack()
 
 
 @dataclass(frozen=True)

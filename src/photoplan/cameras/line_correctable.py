@@ -14,7 +14,7 @@ from photoplan.cameras.base import Camera
 from photoplan.cameras.correctable import ByCorrections, Corrections, prior_rows
 from photoplan.cameras.line import LineCamera
 from photoplan.cameras.line_chips import ChippedLine
-from photoplan.cameras.line_correction import TURNED, LineCorrection, TrackSpline, map_axes, spline_weights
+from photoplan.cameras.line_correction import TURNED, LineCorrection, PoseErrors, TrackSpline, map_axes, spline_weights
 from photoplan.cameras.line_measured import measured
 from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
@@ -24,6 +24,8 @@ from photoplan.geometry.rotation import rotation_vector, skew
 _Floats = NDArray[np.float64]
 #: Half the time over which the motion of a shaken flight is taken, lines.
 _SHORT = 1e-3
+#: Moments at which it is told how exactly a trajectory without splines is known.
+_JUDGED = 33
 #: Parameters of a mount, in their order.
 MOUNT = ("boresight about x", "boresight about y", "boresight about z",
          "lever arm x", "lever arm y", "lever arm z", "time offset")  # fmt: skip
@@ -168,6 +170,29 @@ class CorrectableLine:
         # A later record: the camera is where it was before.
         J[:, :3, 6], J[:, 3:, 6] = -speed @ axes, -turning @ TURNED
         return J
+
+    def pose_errors(
+        self, correction: LineCorrection, mount: _Floats | None, joint: _Floats | None
+    ) -> PoseErrors | None:
+        """How exactly the poses are known that come of all corrections together; None: nothing is unknown.
+
+        mount: covariance of what is unknown of it; joint: those of it and of four knots that follow each other.
+        """
+        track, axes = correction.track(self.plain.track), map_axes(self.plain.track)
+        spline = self.spline
+        count = _JUDGED if spline is None else 2 * len(spline.times)
+        rows = np.linspace(*track.oriented, max(2, count))
+        rows = rows[track.is_oriented(rows)]
+        J = [self.by_mount(track, rows, axes)[:, :, self.free]]
+        Q = mount
+        if spline is not None and joint is not None:
+            at, w = spline_weights(track.time(rows), spline.first, spline.step, len(spline.coefficients))
+            J.append((w[:, None, :, None] * np.eye(6)[:, None]).reshape(len(rows), 6, 24))
+            Q = joint[at[:, 0]]
+        if Q is None:
+            return None
+        A = np.concatenate(J, axis=2)
+        return PoseErrors(track.time(rows), A @ Q @ np.swapaxes(A, 1, 2))
 
     def seen(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> _Floats:
         """See `Correctable`: the row that was measured tells the moment, see `line_measured`."""

@@ -18,6 +18,12 @@ Axes = tuple[Triple, Triple, Triple]
 _NEAREST, _FARTHEST = 0.25, 50.0
 
 
+def triple(values: _Doubles) -> Triple:
+    """A vector (3,) as plain numbers."""
+    a, b, c = values.tolist()
+    return a, b, c
+
+
 class Frame(Hashable, Protocol):
     """An invertible mapping of space. A value: hashable, and pickles."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -80,6 +82,40 @@ def angles_from_rotation(R_ground_camera: ArrayLike, order: str = "opk") -> NDAr
     if cos_phi < 1e-12:
         omega, kappa = 0.0, np.arctan2(R[1, 0], R[1, 1])
     return np.asarray(np.linalg.det(P) * np.array([omega, np.arctan2(R[0, 2], cos_phi), kappa]))
+
+
+def axes_of_angles(R_ground_camera: ArrayLike, order: str = "opk") -> NDArray[np.float64]:
+    """Axes in ground space about which small changes of ω, φ and κ turn a camera, as rows, shape (3, 3).
+
+    Each turns about its own axis, which the rotations before it in the order have moved.
+    """
+    angles = angles_from_rotation(R_ground_camera, order)
+    axes = np.empty((3, 3))
+    for k, letter in enumerate(order):
+        before = rotation_from_angles(np.where(np.arange(3) < k, angles, 0.0), order)
+        axes["opk".index(letter)] = before[:, "opk".index(letter)]
+    return axes
+
+
+def rotation_from_view(azimuth: float, pitch: float, roll: float) -> NDArray[np.float64]:
+    """Camera axes x right, y up, z backwards on the map, as columns, of a view; radians.
+
+    Azimuths are from north to the east, pitches upwards; a positive roll turns the camera's right side downwards.
+    """
+    sa, ca, sp, cp = math.sin(azimuth), math.cos(azimuth), math.sin(pitch), math.cos(pitch)
+    axis, right = np.array([sa * cp, ca * cp, sp]), np.array([ca, -sa, 0.0])
+    up = np.cross(right, axis)
+    s, c = math.sin(roll), math.cos(roll)
+    return np.stack([c * right - s * up, s * right + c * up, -axis], axis=1)
+
+
+def view_from_rotation(R: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Azimuth, pitch and roll of a view; inverse of `rotation_from_view`, but for views straight up or down."""
+    axis = -R[:, 2]
+    azimuth = math.atan2(axis[0], axis[1])
+    right = np.array([math.cos(azimuth), -math.sin(azimuth), 0.0])
+    roll = math.atan2(-R[:, 0] @ np.cross(right, axis), R[:, 0] @ right)
+    return azimuth, math.asin(max(-1.0, min(1.0, axis[2]))), roll
 
 
 def dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,8 +23,8 @@ from photoplan.kernels.jit import inner, kernel
 CONVERGED, LEFT, SINGULAR, UNSETTLED = 0, 1, 2, 3
 #: Numbers per result: x, y, a11, a12, a21, a22, r0, r1, correlation, var x, cov xy, var y, sigma0, status.
 RESULTS = 14
-#: Where some of them stand.
-CORRELATION, COVARIANCE, SIGMA0 = 8, slice(9, 12), 12
+#: Where the correlation stands among them.
+CORRELATION = 8
 
 _POLE = np.sqrt(3.0) - 2.0
 _BORDER = 24

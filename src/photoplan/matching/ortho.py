@@ -78,6 +78,19 @@ def patch_on(
     return OrthoPatch(values, (at[0], at[1], level), (slope[0], slope[1]), float(np.sqrt(np.mean(off**2))))
 
 
+def ground_covariances(patches: Sequence[OrthoPatch], plane: float, height: float) -> NDArray[np.float64]:
+    """(n, 3, 3): an error of the place changes the height that is read there, by the slope of the ground.
+
+    plane, height: standard deviations of X and Y in the orthophoto, and of the heights; metres.
+    """
+    A = np.zeros((len(patches), 3, 2))
+    A[:, 0, 0] = A[:, 1, 1] = 1.0
+    A[:, 2] = [p.slope for p in patches]
+    covariance = plane**2 * (A @ A.transpose(0, 2, 1))
+    covariance[:, 2, 2] += height**2
+    return np.asarray(covariance)
+
+
 @dataclass(frozen=True)
 class Settings:
     """How patches are matched."""

@@ -16,6 +16,7 @@ from photoplan.cameras.lenses.base import Lens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, require_projected_metres
 from photoplan.geometry.earth_poses import enu_of_geodetic
+from photoplan.geometry.frames import triple
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import named_as, read_image_points
@@ -199,16 +200,11 @@ def _with_axes(block: OrientationBlock, request: ConvertRequest) -> OrientationB
 def _with_poses(table: OrientationTable, centers: NDArray[np.float64], opk: NDArray[np.float64]) -> OrientationTable:
     images = tuple(
         OrientedImage(
-            name=i.name, center=_triple(c), angles=_triple(a), camera=i.camera, line=i.line, fiducials=i.fiducials
+            name=i.name, center=triple(c), angles=triple(a), camera=i.camera, line=i.line, fiducials=i.fiducials
         )
         for i, c, a in zip(table.images, centers, opk)
     )
     return replace(table, images=images, angle_unit="deg", rotation="opk", direction="camera-to-ground")
-
-
-def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    a, b, c = (float(v) for v in values)
-    return a, b, c
 
 
 def _in_crs(block: OrientationBlock, crs: str | None) -> OrientationBlock:

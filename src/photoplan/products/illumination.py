@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from photoplan import __version__
 from photoplan.cameras.sun import SunProjection
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
+from photoplan.geometry.frames import triple
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.image_form import form_of, placement_of
 from photoplan.io.product import check_output
@@ -28,12 +28,10 @@ from photoplan.project.restored import kept_nodata
 from photoplan.radiometry.illumination import LightModel, LitGround, estimate_light
 from photoplan.radiometry.tone import fitted
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.shading import Lighting, surface_slopes
+from photoplan.terrain.shading import Lighting, even_slopes
 
 #: Windows along both axes from which parameters are estimated, and their side, pixels.
 _ALONG, _SIDE = 8, 64
-#: Half the distance of two posts at most over which slopes are means, pixels.
-_WIDEST = 64
 #: Pixels of these that are used, at most about.
 _MOST = 30_000
 
@@ -96,21 +94,12 @@ class _Place:
     light: Lighting
 
     def ground(self, window: Window) -> LitGround:
-        """What the terrain is like in a window of the picture.
-
-        Slopes have no steps at posts that are further apart than pixels: each is the mean over the distance of two.
-        """
-        surface = self.terrain.surface
-        reach = int(min(0.5 / surface.lattice(self.grid, window).per_pixel, _WIDEST))
-        wide = Window(window.col - reach, window.row - reach, window.width + 2 * reach, window.height + 2 * reach)
-        slopes, at = surface_slopes(surface, self.grid, wide), window.slices(wide)
-        gx, gy = (_mean(each, 2 * reach + 1, axis)[at] for each, axis in zip(slopes.gradient, (1, 0)))
-        heights = np.ascontiguousarray(slopes.heights[at])
-        flat = 1 / np.sqrt(1 + gx.astype(float) ** 2 + gy.astype(float) ** 2)
-        east, north, up = self.light.directions[0]
-        tile = TileGround.of(MapTarget(self.grid), window, heights)
-        shadow = hidden_pixels(SunProjection((east, north, up)), tile, surface)
-        return LitGround((up - east * gx - north * gy) * flat, (1 + flat) / 2, heights, shadow)
+        """What the terrain is like in a window of the picture."""
+        surface, sun = self.terrain.surface, self.light.directions[0]
+        slopes = even_slopes(surface, self.grid, window)
+        tile = TileGround.of(MapTarget(self.grid), window, slopes.heights)
+        shadow = hidden_pixels(SunProjection(triple(sun)), tile, surface)
+        return LitGround.on(slopes.gradient, slopes.heights, sun, shadow)
 
     def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Pixels and which of them count."""
@@ -160,18 +149,6 @@ def correct_illumination(request: IlluminationRequest, events: Events = SILENT) 
     )
     write_grid(request.output, place.grid.placement, dtype, place.reader.bands, nodata, tile, options)
     return report
-
-
-def _mean(values: NDArray[np.floating], length: int, axis: int) -> NDArray[np.floating]:
-    """Means over a length of those that are known, along an axis; NaN stays."""
-    known = np.isfinite(values)
-    if length == 1:
-        return values
-    total, count = (
-        uniform_filter1d(each, length, axis, mode="constant")
-        for each in (np.where(known, values, 0.0).astype(float), known.astype(float))
-    )
-    return np.asarray(np.where(known, total / np.maximum(count, 1e-9), np.nan), np.float32)
 
 
 def _open(request: IlluminationRequest) -> _Place:

@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
+from photoplan.geometry.rotation import axes_of_angles
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.polygons import check_vectors, read_features, write_features
 from photoplan.io.product import check_output
@@ -188,26 +188,13 @@ def _axes_of(
 ) -> NDArray[np.float64] | None:
     """Axes about which an image's orientation may be wrong; None: it has none."""
     if isinstance(image, Image):
-        return _axes(pose_of(project, image, ground).R_ground_camera, project.orientation.rotation)
+        return axes_of_angles(pose_of(project, image, ground).R_ground_camera, project.orientation.rotation)
     if any((*request.sigma_position, *request.sigma_angles)):
         raise UsageError(
             f"image {image.name!r} has no projection centre and no angles that could have standard deviations; state "
             "the accuracy of its geometry with `sigma_image`"
         )
     return None
-
-
-def _axes(R_ground_camera: NDArray[np.float64], order: str) -> NDArray[np.float64]:
-    """Axes in ground space about which small changes of ω, φ and κ turn the camera, by the project's rotation order.
-
-    Each turns about its own axis, which the rotations before it in the order have moved.
-    """
-    angles = angles_from_rotation(R_ground_camera, order)
-    axes = np.empty((3, 3))
-    for k, letter in enumerate(order):
-        before = rotation_from_angles(np.where(np.arange(3) < k, angles, 0.0), order)
-        axes["opk".index(letter)] = before[:, "opk".index(letter)]
-    return axes
 
 
 def _read(request: MonoplotRequest) -> _Given:

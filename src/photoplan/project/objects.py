@@ -13,7 +13,7 @@ from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.bounds import MOST_HEIGHT
 from photoplan.geometry.crs import CrsStep, crs_label, crs_step, require_projected_metres, same_crs
 from photoplan.geometry.heights import OPTIONS, HeightStep, check_height_system, height_step
-from photoplan.io.objects.file import read_with_faults
+from photoplan.io.objects.file import read_objects
 from photoplan.io.objects.model import ObjectFile
 from photoplan.io.project.model import Objects
 from photoplan.surfaces.base import Terrain
@@ -68,7 +68,7 @@ def with_objects(ground: Terrain, files: Sequence[tuple[Path, Objects]], place: 
     entries: list[int] = []
     steps: list[CrsStep | HeightStep] = []
     for entry, (path, stated) in enumerate(files):
-        own = read_with_faults(path, stated.layer)
+        own = read_objects(path, stated.layer)
         if not len(own.corners):
             raise cannot_be_used(str(path), own.faults)
         placed, taken = _placed(path, own, stated, place)

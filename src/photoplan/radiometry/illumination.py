@@ -26,6 +26,7 @@ from photoplan.adjustment.robust import huber, spread
 from photoplan.errors import GeometryError, UsageError
 
 _Floats = NDArray[np.float64]
+_Reals = NDArray[np.floating]
 
 #: What may be corrected, by name.
 CORRECTIONS = ("cosine", "c", "haze", "haze-by-height")
@@ -52,6 +53,13 @@ class LitGround:
     """Metres."""
     shadow: NDArray[np.bool_]
     """Whether other terrain keeps the sun off."""
+
+    @classmethod
+    def on(cls, gradient: _Reals, height: _Reals, sun: _Floats, shadow: NDArray[np.bool_]) -> LitGround:
+        """Slopes to the east and to the north, shape (2, h, w), under a sun in the direction (east, north, up)."""
+        (gx, gy), (east, north, up) = gradient, sun
+        flat = 1 / np.sqrt(1 + gx.astype(float) ** 2 + gy.astype(float) ** 2)
+        return cls((up - east * gx - north * gy) * flat, (1 + flat) / 2, height, shadow)
 
     @property
     def lit(self) -> NDArray[np.bool_]:

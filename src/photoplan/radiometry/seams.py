@@ -38,6 +38,8 @@ Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 _COARSEST, _BAND = 48, 5
 #: How often a part is solved at most.
 _SWEEPS = 4
+#: Ground stands out by this from what is around it, metres and pixels; height where none is known.
+_RAISED, AROUND, _ABYSS = 1.0, 25, -1e5
 #: Pairs of images and rows in each by which the usual difference is known.
 _PAIRS, _ROWS = 64, 8
 
@@ -141,6 +143,16 @@ def without_overlap(images: Sequence[Sequence[SeamLayer]], store: ArrayStore, sh
         at, mask = (np.s_[:0, :0], np.zeros((0, 0), np.bool_)) if layer is None else seen(layer)
         found.append(bool(layers) and not (counts[at][mask] > 1).any())
     return found
+
+
+def standing_out(relief: _Floats) -> _Mask:
+    """Where heights (h, w), NaN unknown, stand out from those around: houses, trees, whose parallax no picture hides.
+
+    Pixels nearer to the border than `AROUND` lack some of what is around them.
+    """
+    known = np.where(np.isnan(relief), np.float32(_ABYSS), relief)
+    ground = ndimage.grey_opening(known, size=(AROUND, AROUND))
+    return np.asarray(ndimage.binary_dilation((known - ground > _RAISED) & ~np.isnan(relief)))
 
 
 class _Level:

@@ -10,9 +10,13 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
+from photoplan.surfaces.faces import Faces
+from photoplan.surfaces.polygon_faces import LEAST_AREA
 
 #: More squares than this are not made of one polygon.
 MOST_SQUARES = 4_000_000
+#: Outlines are put together from triangles on a lattice of this width, metres.
+_LATTICE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,3 +94,23 @@ def _along(places: NDArray[np.int64]) -> NDArray[np.int64]:
     for bit in range(31):
         code |= ((places[:, 0] >> bit & 1) << (2 * bit)) | ((places[:, 1] >> bit & 1) << (2 * bit + 1))
     return code
+
+
+def outlines(faces: Faces, bounds: tuple[float, float, float, float]) -> list[tuple[str, Faces, Any]]:
+    """Objects inside bounds on the map: name, faces, and outline there."""
+    flat = faces.corners[..., :2]
+    (ax, ay), (bx, by) = (np.moveaxis(flat[:, k] - flat[:, 0], -1, 0) for k in (1, 2))
+    level = np.abs(ax * by - ay * bx) > 2 * LEAST_AREA
+    frame = shapely.box(*bounds)
+    places: dict[str, list[int]] = {}
+    for owner in np.unique(faces.owner).tolist():
+        places.setdefault(faces.names[owner], []).append(owner)
+    found = []
+    for name, mine in places.items():
+        use = np.isin(faces.owner, mine) & level
+        own = faces.only(use)
+        if own is not None:
+            outline = shapely.union_all(shapely.polygons(flat[use]), grid_size=_LATTICE).intersection(frame)
+            if outline.area > LEAST_AREA:
+                found.append((name, own, outline))
+    return found

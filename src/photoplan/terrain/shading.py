@@ -12,14 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.gradient import gradients, illumination
-from photoplan.surfaces.base import Surface
+from photoplan.surfaces.base import Surface, Terrain
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.targets.map import MapTarget
 
+#: Half the distance of two posts at most over which slopes are means, pixels.
+_WIDEST = 64
 #: Aspect of a flat place.
 FLAT = -1.0
 #: Suns of a multidirectional hillshade, from the azimuth that was given.
@@ -108,6 +111,27 @@ def surface_slopes(surface: Surface, grid: MapGrid, window: Window) -> Slopes:
         along = surface.relief(MapTarget(rows), Window(window.col, window.row, window.width, window.height + 1))
         gradients(across, along, centre, grid.resolution, gradient)
     return Slopes(middle, gradient, grid.resolution)
+
+
+def even_slopes(surface: Terrain, grid: MapGrid, window: Window) -> Slopes:
+    """As `surface_slopes`, without steps at posts that are further apart than pixels: means over two of them."""
+    reach = int(min(0.5 / surface.lattice(grid, window).per_pixel, _WIDEST))
+    wide = Window(window.col - reach, window.row - reach, window.width + 2 * reach, window.height + 2 * reach)
+    slopes, at = surface_slopes(surface, grid, wide), window.slices(wide)
+    gradient = np.stack([_mean(each, 2 * reach + 1, axis)[at] for each, axis in zip(slopes.gradient, (1, 0))])
+    return Slopes(np.ascontiguousarray(slopes.heights[at]), gradient, slopes.resolution)
+
+
+def _mean(values: NDArray[np.floating], length: int, axis: int) -> NDArray[np.floating]:
+    """Means over a length of those that are known, along an axis; NaN stays."""
+    known = np.isfinite(values)
+    if length == 1:
+        return values
+    total, count = (
+        uniform_filter1d(each, length, axis, mode="constant")
+        for each in (np.where(known, values, 0.0).astype(float), known.astype(float))
+    )
+    return np.asarray(np.where(known, total / np.maximum(count, 1e-9), np.nan), np.float32)
 
 
 def hillshade(slopes: Slopes, light: Lighting) -> NDArray[np.float32]:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photoplan.cameras.body_frame import BodyFrameCamera
 from photoplan.cameras.frame import FrameCamera
@@ -28,7 +27,6 @@ from photoplan.io.camera.isd import FORM, FRAME_MODEL, Isd
 from photoplan.io.camera.isd_lens import LENSES, lens_of, not_known
 from photoplan.io.plain_files import read_json
 
-_Floats = NDArray[np.float64]
 #: Support data of a frame are small.
 _MAX_BYTES = 20_000_000
 #: Suffixes of support data.

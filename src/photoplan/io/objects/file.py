@@ -10,19 +10,10 @@ from photoplan.io.checks import check_plain_file
 from photoplan.io.objects import cityjson, mesh, vector
 from photoplan.io.objects.model import ObjectFile
 from photoplan.io.plain_files import read_head
-from photoplan.surfaces.polygon_faces import cannot_be_used
 
 
 def read_objects(path: Path, layer: str | None = None) -> ObjectFile:
-    """As `read_with_faults`; polygons that cannot be used are an InputError that names them."""
-    found = read_with_faults(path, layer)
-    if found.faults:
-        raise cannot_be_used(str(path), found.faults)
-    return found
-
-
-def read_with_faults(path: Path, layer: str | None = None) -> ObjectFile:
-    """Faces of the objects of a file, which its content names, not its suffix.
+    """Faces of the objects of a file, which its content names, not its suffix; some may have faults.
 
     Parameters
     ----------

@@ -1,18 +1,23 @@
-"""The Cartesian system in which a block is adjusted, and the way there and back from map coordinates."""
+"""The Cartesian system in which a block is adjusted, the way there and back from map coordinates, and what the
+earth's curvature and the air add there."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.cameras.corrected import CurvatureCorrection
 from photoplan.cameras.curved import local_pose
 from photoplan.cameras.observed import GroundPoints, ObservedAttitudes, ObservedPositions
+from photoplan.cameras.refraction import Refraction
 from photoplan.geometry.heights import HeightStep
-from photoplan.geometry.local import LocalFrame
+from photoplan.geometry.local import MEAN_RADIUS, LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import angles_from_rotation
+from photoplan.geometry.rotation import angles_from_rotation, small_rotations
+from photoplan.orientation.bundle.block import Bend, BlockCamera, BlockImage
 
 _Floats = NDArray[np.float64]
 #: Step for the derivatives of angles, radians.
@@ -144,15 +149,61 @@ def angle_derivatives(R: _Floats, order: str) -> _Floats:
     By central differences; large where the angles are not determined (the second one near a right angle).
     """
     J = np.empty((3, 3))
-    for axis in range(3):
-        v = np.zeros(3)
-        v[axis] = _STEP
-        both = [angles_from_rotation(R @ _small(sign * v), order) for sign in (1.0, -1.0)]
-        difference = both[0] - both[1]
+    for axis, turn in enumerate(small_rotations(_STEP * np.eye(3))):
+        difference = angles_from_rotation(R @ turn, order) - angles_from_rotation(R @ turn.T, order)
         J[:, axis] = (difference + np.pi) % (2 * np.pi) - np.pi
     return J / (2 * _STEP)
 
 
-def _small(v: _Floats) -> _Floats:
-    K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    return np.eye(3) + K + K @ K / 2
+def make_bend(
+    frame: BlockFrame,
+    images: Sequence[BlockImage],
+    cameras: Mapping[str, BlockCamera],
+    nadir: _Floats,
+    curved: bool,
+    refracted: bool,
+) -> Bend | None:
+    """What earth curvature (as a correction) and refraction add to the central projection; None if nothing.
+
+    images: all of the block, in its order; nadir: height of the ground below each, metres; curved, refracted: which
+    of them are to be regarded.
+    """
+    if not (curved or refracted):
+        return None
+    radii = [earth_radius(frame.crs, image.pose.center[:2]) if curved else MEAN_RADIUS for image in images]
+
+    def warp_of(k: int, center: _Floats) -> Callable[[_Floats], _Floats]:
+        X, Y, Z = (float(v) for v in center)
+        refract = Refraction((X, Y, Z)) if refracted else None
+        curve = CurvatureCorrection((X, Y, Z), float(nadir[k]), radii[k] + float(nadir[k])) if curved else None
+
+        def warp(points: _Floats) -> _Floats:
+            points = points if refract is None else refract(points)
+            return points if curve is None else curve(points)
+
+        return warp
+
+    def bend(image: NDArray[np.int64], poses: tuple[Pose, ...], points: _Floats) -> _Floats:
+        on_map = points if frame.local is None else frame.local.to_map(points)
+        shift = np.empty((len(points), 2))
+        order = np.argsort(image, kind="stable")
+        for part in np.split(order, np.flatnonzero(np.diff(image[order])) + 1):
+            if not len(part):
+                continue
+            k = int(image[part[0]])
+            center = poses[k].center if frame.local is None else frame.local.to_map(poses[k].center)
+            moved = warp_of(k, center)(on_map[part])
+            moved = moved if frame.local is None else frame.local.to_local(moved)
+            camera = cameras[images[k].camera]
+            shift[part] = _pixels(images[k], camera, poses[k], moved) - _pixels(
+                images[k], camera, poses[k], points[part]
+            )
+        return shift
+
+    return bend
+
+
+def _pixels(image: BlockImage, camera: BlockCamera, pose: Pose, points: _Floats) -> _Floats:
+    p = pose.to_camera(points)
+    t = p[:, :2] / np.where(p[:, 2] < 0, -p[:, 2], np.nan)[:, None]
+    return image.plane_to_pixel(camera.c * camera.lens.distort(t) + np.array(camera.principal_point))

@@ -17,9 +17,9 @@ from photoplan.io.project.cameras import interior_of
 from photoplan.io.project.model import Project
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage, BlockProjection
-from photoplan.orientation.bundle.frame import BlockFrame, angle_derivatives
+from photoplan.orientation.bundle.frame import BlockFrame, angle_derivatives, make_bend
 from photoplan.products.adjust.cameras import Calibrated, Free, block_camera, calibrated
-from photoplan.products.adjust.frame import block_frame, make_bend, nadir_heights
+from photoplan.products.adjust.frame import block_frame, nadir_heights
 from photoplan.products.adjust.geometry import FoundCorrection, Geometry
 from photoplan.products.adjust.inputs import AdjustInputs
 from photoplan.products.adjust.projections import block_projections, found_corrections, on_map, place_of
@@ -123,6 +123,7 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
     stations = {image.name: starts[image.name].center for image in inputs.images}
     positions, attitudes = inputs.positions, inputs.attitudes
     nadir = nadir_heights(project, centers[:, :2], _mean_height(inputs.ground))
+    curved = project.orientation.earth_curvature == "correction"
     block = Block(
         cameras=cameras,
         images=tuple(images),
@@ -136,7 +137,7 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
         lever_arm_sigma=adjustment.lever_arm_sigma,
         drift=adjustment.drift,
         boresight=adjustment.boresight,
-        bend=make_bend(project, frame, tuple(images), cameras, nadir),
+        bend=make_bend(frame, images, cameras, nadir, curved=curved, refracted=project.orientation.refraction),
         projections=projections,
         on_map=on_map(frame),
     )

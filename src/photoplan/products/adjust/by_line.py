@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.line_correctable import CorrectableLine, TrackPriors
-from photoplan.cameras.line_correction import TURNED, LineCorrection, PoseErrors, map_axes, spline_weights
+from photoplan.cameras.line_correction import TURNED, LineCorrection, map_axes
 from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.camera.line.correction import line_correction_text, read_line_correction
 from photoplan.io.project.line import LineImage
@@ -23,8 +23,6 @@ from photoplan.project.ground import Ground
 _Floats = NDArray[np.float64]
 #: Lines at which angles are drawn, at most.
 _DRAWN = 3000
-#: Moments at which it is told how exactly a trajectory without splines is known.
-_JUDGED = 33
 _UNITS = np.repeat([180.0 / np.pi, 1.0, 1.0], [3, 3, 1])
 _CALLED = [*(f"{what} {axis}" for what in ("boresight", "lever arm") for axis in "xyz"), "time offset"]
 
@@ -59,11 +57,11 @@ def _priors(stated: StripAdjustment) -> TrackPriors:
 
 def _found(image: CorrectableLine, sets: Mapping[str, AdjustedCorrections]) -> FoundCorrection:
     correction = image.correction({key: each.values for key, each in sets.items()})
-    covariance, sigma, free = None, None, image.free
+    covariance, sigma, joint, over_time, free = None, None, None, None, image.free
+    Q = sets[image.keys[0]].covariance[0] if len(free) else None
     mount = np.concatenate([correction.boresight, correction.lever_arm, [correction.time_offset]]) * _UNITS
     parameters: tuple[FoundParameter, ...] = ()
-    if len(free):
-        Q = sets[image.keys[0]].covariance[0]
+    if Q is not None:
         roots = np.sqrt(np.diag(Q)) * _UNITS[free]
         parameters = tuple(
             FoundParameter(_CALLED[k], float(mount[k]), float(s), "°" if k < 3 else "m" if k < 6 else "s")
@@ -72,12 +70,12 @@ def _found(image: CorrectableLine, sets: Mapping[str, AdjustedCorrections]) -> F
         if np.isfinite(Q).all():
             covariance = np.zeros((7, 7))
             covariance[np.ix_(free, free)] = Q
-    over_time = None
     if image.spline is not None and correction.spline is not None:
         found = sets[image.keys[1]]
+        joint = found.joint["" if Q is None else image.keys[0]]
         sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
         over_time = correction.spline.times, correction.spline.coefficients
-    text = line_correction_text(correction, covariance, sigma, _pose_errors(image, correction, sets))
+    text = line_correction_text(correction, covariance, sigma, image.pose_errors(correction, Q, joint))
     return FoundCorrection(
         entries={},
         parameters=parameters,
@@ -86,29 +84,6 @@ def _found(image: CorrectableLine, sets: Mapping[str, AdjustedCorrections]) -> F
         seconds=image.plain.track.time,
         angles=_angles(image, correction),
     )
-
-
-def _pose_errors(
-    image: CorrectableLine, correction: LineCorrection, sets: Mapping[str, AdjustedCorrections]
-) -> PoseErrors | None:
-    """How exactly the poses are known that come of all corrections together; None: nothing is unknown."""
-    track, axes = correction.track(image.plain.track), map_axes(image.plain.track)
-    spline, mount = image.spline, sets.get(image.keys[0])
-    first, last = track.oriented
-    count = _JUDGED if spline is None else 2 * len(spline.times)
-    rows = np.linspace(first, last, max(2, count))
-    rows = rows[track.is_oriented(rows)]
-    J = [image.by_mount(track, rows, axes)[:, :, image.free]]
-    if spline is None:
-        if mount is None:
-            return None
-        Q = np.broadcast_to(mount.covariance[0], (len(rows), len(image.free), len(image.free)))
-    else:
-        at, w = spline_weights(track.time(rows), spline.first, spline.step, len(spline.coefficients))
-        J.append((w[:, None, :, None] * np.eye(6)[:, None]).reshape(len(rows), 6, 24))
-        Q = sets[image.keys[1]].joint[image.keys[0] if mount is not None else ""][at[:, 0]]
-    A = np.concatenate(J, axis=2)
-    return PoseErrors(track.time(rows), A @ Q @ np.swapaxes(A, 1, 2))
 
 
 def _angles(image: CorrectableLine, correction: LineCorrection) -> tuple[_Floats, _Floats]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.crs import crs_label
+from photoplan.geometry.frames import Triple, triple
 from photoplan.geometry.heights import height_label
 from photoplan.geometry.rotation import ANGLE_UNITS
 from photoplan.orientation.bundle.block import AdjustSettings
@@ -27,7 +28,6 @@ from photoplan.products.adjust.figures import (
 from photoplan.products.init.match import some
 
 _Floats = NDArray[np.float64]
-Triple = tuple[float, float, float]
 #: Kept measurements that are named.
 _WORST = 15
 #: Redundancy from which a group's variance factor says something, and from which ratio on it is told.
@@ -77,9 +77,7 @@ def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: 
         check=_check(ground),
         cameras=tuple(result.cameras),
         strips=_strips(result),
-        lever_arm=None
-        if inputs.positions is None
-        else (_triple(adjusted.lever_arm), _triple(adjusted.lever_arm_sigma)),
+        lever_arm=None if inputs.positions is None else (triple(adjusted.lever_arm), triple(adjusted.lever_arm_sigma)),
         boresight=_boresight(result),
         gross=_gross(result),
         worst=_worst(result, used),
@@ -88,7 +86,7 @@ def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: 
         critical=settings.critical,
         robust=settings.robust,
         tie_XY=result.XYZ[tie, :2],
-        point_sigma=_triple(np.sqrt(np.mean(sigma[tie] ** 2, axis=0)) if tie.any() else np.full(3, np.nan)),
+        point_sigma=triple(np.sqrt(np.mean(sigma[tie] ** 2, axis=0)) if tie.any() else np.full(3, np.nan)),
         fields=residual_fields(result, used),
         notes=(*inputs.notes, *_advice(result, used)),
         inputs=tuple((path.name, str(path)) for path in inputs.files),
@@ -168,11 +166,6 @@ def _check(ground: Sequence[GroundFigures]) -> CheckAccuracy | None:
     return check_accuracy(np.array([g.residual for g in check]), np.array([g.stated for g in check]))
 
 
-def _triple(values: _Floats) -> Triple:
-    a, b, c = (float(v) for v in values)
-    return a, b, c
-
-
 def _images(result: MapResult, used: NDArray[np.bool_]) -> tuple[ImageFigures, ...]:
     adjusted, points = result.adjusted, result.prepared.inputs.points
     positions = result.prepared.inputs.positions
@@ -196,9 +189,9 @@ def _images(result: MapResult, used: NDArray[np.bool_]) -> tuple[ImageFigures, .
                 mean=(float("nan"),) * 2 if none else (float(r[:, 0].mean()), float(r[:, 1].mean())),
                 rms=(float("nan"),) * 2 if none else (_rms(r[:, 0]), _rms(r[:, 1])),
                 worst=float(np.nanmax(w)) if np.isfinite(w).any() else float("nan"),
-                center=_triple(result.poses[k].center),
-                sigma_center=_triple(result.sigma_center[k]),
-                sigma_angles=_triple(result.sigma_angles[k]),
+                center=triple(result.poses[k].center),
+                sigma_center=triple(result.sigma_center[k]),
+                sigma_angles=triple(result.sigma_angles[k]),
             )
         )
     return tuple(out)
@@ -252,10 +245,10 @@ def ground_facts(result: MapResult) -> tuple[GroundFigures, ...]:
                 name=name,
                 check=bool(ground.check[k]),
                 rays=0 if at is None else int(adjusted.rays[at]),
-                XYZ=_triple(ground.XYZ[k]),
-                residual=_triple(result.ground_residuals[k]),
-                stated=_triple(ground.sigma[k]),
-                normalised=_triple(normalised[k]),
+                XYZ=triple(ground.XYZ[k]),
+                residual=triple(result.ground_residuals[k]),
+                stated=triple(ground.sigma[k]),
+                normalised=triple(normalised[k]),
                 rejected=(a, b, c),
                 covariance=np.full((3, 3), np.nan) if at is None else result.covariance[at],
             )
@@ -285,12 +278,12 @@ def _strips(result: MapResult) -> tuple[StripFigures, ...]:
                 name=str(name),
                 count=int(mine.sum()),
                 rejected=int(adjusted.position_rejected[mine].sum()),
-                mean=_triple(r.mean(axis=0) if len(r) else nothing),
-                rms=_triple(np.sqrt((r**2).mean(axis=0)) if len(r) else nothing),
-                shift=_triple(frame.map_vectors(found.shift, middle) if known and found is not None else nothing),
-                rate=_triple(frame.map_vectors(found.rate, middle) if known and found is not None else nothing),
-                sigma_shift=_triple(found.sigma[:3] if found is not None else nothing),
-                sigma_rate=_triple(found.sigma[3:] if found is not None else nothing),
+                mean=triple(r.mean(axis=0) if len(r) else nothing),
+                rms=triple(np.sqrt((r**2).mean(axis=0)) if len(r) else nothing),
+                shift=triple(frame.map_vectors(found.shift, middle) if known and found is not None else nothing),
+                rate=triple(frame.map_vectors(found.rate, middle) if known and found is not None else nothing),
+                sigma_shift=triple(found.sigma[:3] if found is not None else nothing),
+                sigma_rate=triple(found.sigma[3:] if found is not None else nothing),
             )
         )
     return tuple(out)
@@ -301,7 +294,7 @@ def _boresight(result: MapResult) -> tuple[Triple, Triple] | None:
     if not project.adjustment.boresight or result.prepared.inputs.attitudes is None:
         return None
     factor = ANGLE_UNITS[project.orientation.angle_unit] / (2 * np.pi)
-    return _triple(adjusted.boresight * factor), _triple(adjusted.boresight_sigma * factor)
+    return triple(adjusted.boresight * factor), triple(adjusted.boresight_sigma * factor)
 
 
 def _gross(result: MapResult) -> tuple[NamedMeasurement, ...]:

@@ -78,6 +78,12 @@ def no_run(data: SeriesData, kinds: Sequence[str], least: int, what: str) -> str
     )
 
 
+def no_pair(data: SeriesData) -> str | None:
+    """Why frames of one setting cannot be compared; None: they can."""
+    enough = data.settings("dark", "flat", least=2)
+    return None if enough else "no setting of dark or flat frames has two frames or more"
+
+
 def of_runs(
     data: SeriesData, kinds: Sequence[str], least: int, what: str, analyse: Callable[..., Findings]
 ) -> Findings:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.common import MOST_SATURATED, tried
+from photoplan.products.characterise.common import MOST_SATURATED, no_pair, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import (
     Chart,
@@ -32,11 +32,7 @@ _CANDIDATES = 1000
 #: A flat pixel must differ by this part of its surroundings.
 _FLAT_SHARE = 0.1
 
-
-def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
-    enough = data.settings("dark", "flat", least=2)
-    return None if enough else "no setting of dark or flat frames has two frames or more"
+missing = no_pair
 
 
 def analyse(data: SeriesData) -> Findings:

@@ -17,7 +17,7 @@ from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
 from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined
 from photoplan.quality.camera.line_jitter import LineJitter, line_jitter
-from photoplan.quality.camera.parallel_edges import EdgePair, above_control, compare_edges
+from photoplan.quality.camera.parallel_edges import above_control, compare_edges, mean_correlation
 from photoplan.quality.camera.plumb_edge import EdgeLines, correlate_edge, fit_edge
 from photoplan.quality.sensor import jitter_grey
 
@@ -271,7 +271,7 @@ def _pair(group: FrameGroup, first: list[Edge], second: list[Edge]) -> Findings:
     figures = []
     for prefix, what, of_pairs in (("", "", pairs), ("random_", " without fields and periodic parts", random)):
         of, verdict = Subject(at=at), of_pairs[0].verdict
-        r = _correlation(of_pairs)
+        r = mean_correlation(of_pairs)
         figures.append(of.figure(f"{prefix}correlation", *r, f"correlation of the deviations{what}", "", verdict))
         common = _mean([p.common_sigma for p in of_pairs], [p.sigma_common for p in of_pairs])
         figures.append(of.figure(f"{prefix}common_px", *common, f"common part{what}", "px"))
@@ -282,13 +282,6 @@ def _pair(group: FrameGroup, first: list[Edge], second: list[Edge]) -> Findings:
     shared, single = (sum(len(s) for s in each) for each in zip(*((p.common_spikes, p.single_spikes) for p in pairs)))
     note = f"{group.label}: {shared} spikes in both edges, {single} in one only" if shared or single else ""
     return Findings(tuple(figures), notes=(note,) if note else ())
-
-
-def _correlation(pairs: Sequence[EdgePair]) -> tuple[float, float]:
-    """Mean over frames and its standard deviation."""
-    z = [math.atanh(min(max(p.correlation, -0.999999), 0.999999)) for p in pairs]
-    sigma = float(np.mean([(p.high - p.low) / (2 * 1.96) for p in pairs])) / math.sqrt(len(pairs))
-    return math.tanh(float(np.mean(z))), sigma
 
 
 def _table(edges: Sequence[Edge]) -> Listing:

@@ -10,7 +10,7 @@ import numpy as np
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
 from photoplan.plain import plain
-from photoplan.products.characterise.common import black_of, dark_like, of_one_temperature, tried
+from photoplan.products.characterise.common import black_of, dark_like, no_pair, of_one_temperature, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
 from photoplan.quality.camera.fixed_pattern import (
@@ -26,11 +26,7 @@ from photoplan.quality.camera.frame_statistics import FrameStack, check_level, c
 #: Share of saturation that the standard asks of bright frames.
 _HALF = 0.5
 
-
-def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
-    enough = data.settings("dark", "flat", least=2)
-    return None if enough else "no setting of dark or flat frames has two frames or more"
+missing = no_pair
 
 
 def analyse(data: SeriesData) -> Findings:

@@ -26,7 +26,7 @@ from photoplan.io.project.model import Project, StatedTerrain
 from photoplan.io.raster import RasterReader
 from photoplan.io.run_record import recording
 from photoplan.matching.grey import GreyImage
-from photoplan.matching.ortho import ImageControl, OrthoPatch, Photo, Settings, control_of_image
+from photoplan.matching.ortho import ImageControl, OrthoPatch, Photo, Settings, control_of_image, ground_covariances
 from photoplan.plain import pick
 from photoplan.products.control.patches import Ortho, choose_patches
 from photoplan.project.cameras import central_without_pixels
@@ -86,10 +86,6 @@ class ControlReport:
         return {**pick(self, *own), "sigma": dict(zip(("plane", "height", "image"), self.sigma)), "images": images}
 
 
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 def propose_control(request: ControlRequest, events: Events = SILENT) -> ControlReport:
     """Match patches of an orthophoto in the photos of a project.
 
@@ -129,7 +125,7 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
             images=(),
             sigma=(np.nan,) * 3,
         )
-    covariances = _ground_covariances(patches, request, ortho)
+    covariances = ground_covariances(patches, request.ortho_sigma or ortho.resolution, request.height_sigma)
     # Images that take no part are no inputs.
     files = [project.resolve(project.image(name).file) for name in names]
     files += input_files(project.model_copy(update={"images": ()}))
@@ -235,18 +231,6 @@ def _open_ortho(request: ControlRequest, project: Project) -> Ortho:
             )
         readers.append(reader)
     return Ortho(tuple(readers))
-
-
-def _ground_covariances(patches: Sequence[OrthoPatch], request: ControlRequest, ortho: Ortho) -> NDArray[np.float64]:
-    """(n, 3, 3): an error of the place changes the height that is read there, by the slope of the ground."""
-    plane = request.ortho_sigma or ortho.resolution
-    slopes = np.array([p.slope for p in patches])
-    A = np.zeros((len(patches), 3, 2))
-    A[:, 0, 0] = A[:, 1, 1] = 1.0
-    A[:, 2] = slopes
-    covariance = plane**2 * (A @ A.transpose(0, 2, 1))
-    covariance[:, 2, 2] += request.height_sigma**2
-    return np.asarray(covariance)
 
 
 def _tables(

@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label
+from photoplan.geometry.frames import triple
 from photoplan.geometry.heights import height_label
 from photoplan.io.camera.file import CameraFile, read_cameras
 from photoplan.io.camera.model import CameraEntry, Triple
@@ -192,7 +190,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     if table is not None:
         centers, angles = placed(table, crs, systems[1])
         check_joined(*systems, crs, centers)
-        poses = {i.name: (_triple(c), _triple(a)) for i, c, a in zip(table.images, centers, angles)}
+        poses = {i.name: (triple(c), triple(a)) for i, c, a in zip(table.images, centers, angles)}
         stated = on_map(stated_positions(table, {oriented.name: file for file, oriented in pairs}), crs)
         for said in differences([i.name for i in table.images], centers, stated):
             talk(f"  warning: {said}")
@@ -232,10 +230,6 @@ def _described(request: InitRequest, pairs: Sequence[tuple[Path, object]]) -> Ca
             "its camera"
         )
     return CameraFile(Path(), {}, False)
-
-
-def _triple(values: NDArray[np.float64]) -> Triple:
-    return float(values[0]), float(values[1]), float(values[2])
 
 
 def _cameras(

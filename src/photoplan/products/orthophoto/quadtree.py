@@ -7,18 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
-from photoplan.surfaces.faces import Faces
+from photoplan.products.orthophoto.plan import OrthoPlan
 from photoplan.surfaces.objects import ObjectSurface
-from photoplan.surfaces.polygon_faces import LEAST_AREA
-from photoplan.surfaces.quadtree import decompose
-
-#: Outlines are put together from triangles on a lattice of this width, metres.
-_LATTICE = 1e-4
+from photoplan.surfaces.quadtree import decompose, outlines
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +51,7 @@ def plan_squares(plan: OrthoPlan) -> PlanSquares:
         surface = product.address(plan.project).open().surface
         below = product.part is not None and product.part.below
         faces = surface.shown if isinstance(surface, ObjectSurface) and not below else None
-        for name, own, outline in [] if faces is None else _outlines(faces, product):
+        for name, own, outline in [] if faces is None else outlines(faces, product.grid.bounds):
             tile, grid = product.plan.tiles.side, product.grid
             levels = math.ceil(math.log2(tile))
             squares = decompose(outline, (grid.left, grid.top), tile * grid.resolution, levels)
@@ -78,23 +72,3 @@ def plan_squares(plan: OrthoPlan) -> PlanSquares:
             "`photoplan ortho` with `true`, `photoplan mosaic` or `photoplan object`"
         )
     return PlanSquares(np.concatenate(bounds), {k: np.concatenate(v) for k, v in columns.items()}, tuple(counts))
-
-
-def _outlines(faces: Faces, product: OrthoProduct) -> list[tuple[str, Faces, Any]]:
-    """Objects that a product shows: name, faces, outline on the map inside the product."""
-    flat = faces.corners[..., :2]
-    (ax, ay), (bx, by) = (np.moveaxis(flat[:, k] - flat[:, 0], -1, 0) for k in (1, 2))
-    level = np.abs(ax * by - ay * bx) > 2 * LEAST_AREA
-    frame = shapely.box(*product.grid.bounds)
-    places: dict[str, list[int]] = {}
-    for owner in np.unique(faces.owner).tolist():
-        places.setdefault(faces.names[owner], []).append(owner)
-    found = []
-    for name, mine in places.items():
-        use = np.isin(faces.owner, mine) & level
-        own = faces.only(use)
-        if own is not None:
-            outline = shapely.union_all(shapely.polygons(flat[use]), grid_size=_LATTICE).intersection(frame)
-            if outline.area > LEAST_AREA:
-                found.append((name, own, outline))
-    return found

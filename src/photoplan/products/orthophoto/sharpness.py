@@ -1,10 +1,6 @@
 """How sharp each image of a block shows the ground, compared with the others that show the same ground.
 
-Patches of the product are resampled from every image that sees them. In each, what fine detail there is, is compared
-with what is twice as coarse: the quotient of both does not know contrast and exposure. It knows the ground, which all
-images of a patch have in common; so its logarithm is that of the patch plus that of the image, and medians tell both
-apart, whatever single patches show (things that move, that lean). Noise is fine detail, too: what an image has of it in
-its quietest places is taken off before.
+Patches of the product are resampled from every image that sees them, and judged by `quality.relative_sharpness`.
 """
 
 from __future__ import annotations
@@ -24,19 +20,13 @@ from photoplan.plan.product import ProductPlan
 from photoplan.plan.tiles import Tile, Tiles
 from photoplan.products.orthophoto.look import Looked
 from photoplan.products.orthophoto.settings import OrthoSettings
+from photoplan.quality.relative_sharpness import BLOCK, blur_of, detail_energies, detail_quotients
 from photoplan.targets.map import MapTarget
 
 #: Least and largest side of a patch, pixels of the product.
 _PATCH = (32, 64)
-#: Side of the blocks in which the quietest places are sought, pixels.
-_BLOCK = 8
 #: Patches along the side of a footprint.
 _ALONG = 8
-#: The share of blocks that show noise alone.
-_QUIET = 0.1
-#: Images are judged by no fewer patches.
-_LEAST = 3
-_ROUNDS = 30
 
 
 def with_blur(looked: Sequence[Looked], grid: MapGrid, settings: OrthoSettings, events: Events) -> list[Looked]:
@@ -59,21 +49,6 @@ def with_blur(looked: Sequence[Looked], grid: MapGrid, settings: OrthoSettings, 
         f"the fine detail, {100 * 2.0 ** -blur[worst]:.0f} % of what the sharpest shows"
     )
     return [replace(one, look=replace(one.look, blur=b)) for one, b in zip(looked, blur.tolist())]
-
-
-def blur_of(quotients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Blur of images (n,) from logarithms of quotients of patches and images (m, n); NaN where a patch is not shown."""
-    seen = np.isfinite(quotients)
-    # A patch that one image shows tells nothing of others.
-    use = np.where(seen & (seen.sum(axis=1) > 1)[:, None], quotients, np.nan)
-    sharp = np.zeros(use.shape[1])
-    use[:, np.isfinite(use).sum(axis=0) < _LEAST] = np.nan
-    known, rows = np.isfinite(use).any(axis=0), np.isfinite(use).any(axis=1)
-    for _ in range(_ROUNDS if rows.any() else 0):
-        ground = np.nanmedian(use[rows] - sharp, axis=1)
-        sharp[known] = np.nanmedian(use[np.ix_(rows, known)] - ground[:, None], axis=0)
-    sharp[~known] = sharp[known].max(initial=0.0)
-    return np.asarray(sharp.max() - sharp)
 
 
 def _sites(looked: Sequence[Looked], grid: MapGrid) -> list[Window]:
@@ -102,31 +77,8 @@ def _quotients(one: Looked, sites: Sequence[Window], grid: MapGrid, settings: Or
         if not ((xy > 0) & (xy < np.array(scene.camera.size) - 1)).all():
             continue
         made = render(plan, Tile(0, window), scene.sources, scene.surface, settings.kernel)
-        if made.values is not None and np.all(made.valid) and min(made.values.shape[1:]) >= 2 * _BLOCK:
-            shown[place] = _energies(made.values.astype(float).mean(axis=0))
+        if made.values is not None and np.all(made.valid) and min(made.values.shape[1:]) >= 2 * BLOCK:
+            shown[place] = detail_energies(made.values.astype(float).mean(axis=0))
     out = np.full(len(sites), np.nan)
-    if shown:
-        blocks = np.concatenate([energy.reshape(2, -1) for energy in shown.values()], axis=1)
-        noise = np.quantile(blocks, _QUIET, axis=1)
-        for place, energy in shown.items():
-            fine, coarse = energy.mean(axis=(1, 2)) - noise
-            if fine > 0 and coarse > 0:
-                out[place] = 0.5 * np.log2(fine / coarse)
+    out[list(shown)] = detail_quotients(list(shown.values()))
     return out
-
-
-def _energies(grey: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean squares of fine and of coarser detail in blocks of a patch, shape (2, rows, cols)."""
-    once = _smooth(grey)
-    twice = _smooth(once)
-    fine, coarse = (grey[2:-2, 2:-2] - once)[2:-2, 2:-2], once[2:-2, 2:-2] - twice
-    rows, cols = (size // _BLOCK for size in fine.shape)
-    parts = np.square([fine, coarse])[:, : rows * _BLOCK, : cols * _BLOCK]
-    return np.asarray(parts.reshape(2, rows, _BLOCK, cols, _BLOCK).mean(axis=(2, 4)))
-
-
-def _smooth(grey: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Binomial means of five pixels along both axes; two pixels less on every side."""
-    for _ in range(2):
-        grey = (grey[:-4] + grey[4:] + 4 * (grey[1:-3] + grey[3:-1]) + 6 * grey[2:-2]).T / 16
-    return grey

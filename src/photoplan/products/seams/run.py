@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from photoplan.engine.execute import MOST_SOURCE_BYTES
 from photoplan.engine.executors import executor_factory, threads
@@ -32,15 +31,13 @@ from photoplan.products.one_colour import one_colour_told
 from photoplan.products.orthophoto.shown import shown
 from photoplan.products.run import BASE_MEMORY, question
 from photoplan.project.scene import SceneAddress, input_files
-from photoplan.radiometry.seams import find_seams, without_overlap
+from photoplan.radiometry.seams import AROUND, find_seams, standing_out, without_overlap
 from photoplan.radiometry.shown import ArrayStore, SeamFeatures, SeamLayer, Shown, features_of
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
 
-#: Ground that stands out by this from what is around it, metres and pixels: houses, trees; and what seams cost there.
-_RAISED, _AROUND, _COSTS = 1.0, 25, 3.0
-#: Side of the parts in which that is looked at; ground where none is known.
-_PART, _ABYSS = 1024, -1e5
+#: What seams cost where ground stands out, and the side of the parts in which that is looked at.
+_COSTS, _PART = 3.0, 1024
 #: Bytes that a pixel and band of an image takes while it is looked at, and a pixel of the map.
 _PIXEL, _MAP = 60, 24
 
@@ -259,12 +256,9 @@ def _weight(found: Survey) -> NDArray[np.float32]:
     grid, surface = found.grid, painted_surface(found.looked[0].scene.surface)
     weight = np.ones((grid.height, grid.width), np.float32)
     for part in grid.window.tiles(_PART):
-        wide = Window(part.col - _AROUND, part.row - _AROUND, part.width + 2 * _AROUND, part.height + 2 * _AROUND)
+        wide = Window(part.col - AROUND, part.row - AROUND, part.width + 2 * AROUND, part.height + 2 * AROUND)
         relief = surface.relief(MapTarget(grid), wide & grid.window)
-        known = np.where(np.isnan(relief), np.float32(_ABYSS), relief)
-        ground = ndimage.grey_opening(known, size=(_AROUND, _AROUND))
-        raised = ndimage.binary_dilation((known - ground > _RAISED) & ~np.isnan(relief))
-        weight[part.slices(grid.window)][raised[part.slices(wide & grid.window)]] = _COSTS
+        weight[part.slices(grid.window)][standing_out(relief)[part.slices(wide & grid.window)]] = _COSTS
     return weight
 
 

@@ -20,6 +20,7 @@ from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.grid import USUAL_TILE, refuse_absurd
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
+from photoplan.geometry.rotation import rotation_from_view, view_from_rotation
 from photoplan.products.view.ground import ViewGround
 from photoplan.project.cameras import central_without_pixels
 from photoplan.surfaces.seen import SeenSurface
@@ -314,23 +315,13 @@ def _bundle(
         )
     focal = width / 2 / math.tan(math.radians(request.field_of_view or 60.0) / 2)
     interior = Interior.digital(request.size, (focal, focal * request.pixel_aspect))
-    R = axes @ _rotation(azimuth, pitch, math.radians(request.roll))
+    R = axes @ rotation_from_view(azimuth, pitch, math.radians(request.roll))
     return ViewTarget.of_camera(oriented_camera(interior, NoLens(), Pose(origin, R))).bundle
 
 
 def map_axes(warps: Sequence[Warp], center: NDArray[np.float64]) -> NDArray[np.float64]:
     """East, north and up of the map at a standpoint in the space that warps lead to, as columns, shape (3, 3)."""
     return next((warp.axes(center) for warp in warps if isinstance(warp, LocalFrame)), np.eye(3))
-
-
-def _rotation(azimuth: float, pitch: float, roll: float) -> NDArray[np.float64]:
-    """Camera axes x right, y up, z backwards on the map."""
-    sa, ca, sp, cp = math.sin(azimuth), math.cos(azimuth), math.sin(pitch), math.cos(pitch)
-    axis = np.array([sa * cp, ca * cp, sp])
-    right = np.array([ca, -sa, 0.0])
-    up = np.cross(right, axis)
-    s, c = math.sin(roll), math.cos(roll)
-    return np.stack([c * right - s * up, s * right + c * up, -axis], axis=1)
 
 
 def _stretched(request: CameraRequest, ground: ViewGround, target: ViewTarget, radius: float | None) -> ViewCamera:
@@ -372,8 +363,7 @@ def _resolved(made: ViewCamera, bundle: Bundle) -> CameraRequest:
         rise = (bundle.horizon - (bundle.size[1] - 1) / 2) / bundle.scale
         pitch = rise if bundle.spherical else math.atan(rise)
     elif request.look_at is not None and isinstance(bundle, FrameBundle):
-        axis = -axes.T @ bundle.camera.pose.R_ground_camera[:, 2]
-        azimuth, pitch = math.atan2(axis[0], axis[1]), math.asin(max(-1.0, min(1.0, axis[2])))
+        azimuth, pitch, _ = view_from_rotation(axes.T @ bundle.camera.pose.R_ground_camera)
     kind = request.curvature or "bend"
     usual = None if kind == "none" else USUAL_REFRACTION
     return replace(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.adjustment.iterate import by_differences
-from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation, small_rotations
+from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation, small_rotations, view_from_rotation
 from photoplan.io.naming import write_atomically
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.table import OrientationTable, OrientedImage
@@ -102,17 +102,13 @@ def _of_standpoint(camera: ViewCamera, turn: _Floats) -> _Floats:
     """Azimuth, pitch, roll and field of view, degrees."""
     target = turned(camera.target, turn)
     assert isinstance(target.bundle, FrameBundle)
-    R = map_axes(target.warps, target.center).T @ target.bundle.camera.pose.R_ground_camera
-    axis = -R[:, 2]
-    azimuth = math.atan2(axis[0], axis[1])
-    right = np.array([math.cos(azimuth), -math.sin(azimuth), 0.0])
-    up = np.cross(right, axis)
-    roll = math.atan2(-R[:, 0] @ up, R[:, 0] @ right)
+    axes = map_axes(target.warps, target.center)
+    azimuth, pitch, roll = view_from_rotation(axes.T @ target.bundle.camera.pose.R_ground_camera)
     stated = math.radians(camera.request.azimuth or 0.0)
     azimuth = stated + math.remainder(azimuth - stated, 2 * math.pi)
     half = math.tan(math.radians(camera.request.field_of_view or 60.0) / 2)
     wide = 2 * math.atan(half / math.exp(turn[3] if len(turn) > 3 else 0.0))
-    return np.degrees([azimuth, math.asin(max(-1.0, min(1.0, axis[2]))), roll, wide])
+    return np.degrees([azimuth, pitch, roll, wide])
 
 
 def _of_image(camera: ViewCamera, ground: ViewGround, turn: _Floats) -> _Floats:

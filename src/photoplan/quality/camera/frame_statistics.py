@@ -162,12 +162,6 @@ class StackSums:
         self._mean += difference / len(self._means)
         self._squares += difference * (values - self._mean)
 
-    def add_all(self, frames: Iterable[NDArray[Any]]) -> StackSums:
-        """Several frames."""
-        for frame in frames:
-            self.add(frame)
-        return self
-
     def stack(self) -> FrameStack:
         """What the frames say.
 

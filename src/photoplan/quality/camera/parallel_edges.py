@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,6 +118,13 @@ def compare_edges(first: LineJitter, second: LineJitter, offset: int = 0, *, per
         common_spikes=tuple(sorted(spikes_a & spikes_b)),
         single_spikes=tuple(sorted(spikes_a ^ spikes_b)),
     )
+
+
+def mean_correlation(pairs: Sequence[EdgePair]) -> tuple[float, float]:
+    """Correlation over several frames, the mean by Fisher's z, and its standard deviation."""
+    z = [math.atanh(min(max(p.correlation, -0.999999), 0.999999)) for p in pairs]
+    sigma = float(np.mean([(p.high - p.low) / (2 * 1.96) for p in pairs])) / math.sqrt(len(pairs))
+    return math.tanh(float(np.mean(z))), sigma
 
 
 def above_control(edge: LineJitter, control: LineJitter) -> AboveControl:
