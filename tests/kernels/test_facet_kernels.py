@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from photoplan.kernels import (
+    facets_fine,
     facets_grey,
     facets_height,
     facets_radiometry,
@@ -15,6 +16,7 @@ from photoplan.kernels import (
     facets_transfer,
 )
 from photoplan.kernels.jit import COMPILED
+from photoplan.matching.facets.fine import shares
 
 
 def carried(low, high, posts, out, wall=np.inf) -> None:
@@ -288,3 +290,22 @@ def test_radiometry_is_solved_as_a_full_matrix() -> None:
     want = np.linalg.solve(N, right)
     facets_radiometry.solve_radiometry(N, right)
     assert np.abs(right - want).max() < 1e-9 * np.abs(want).max()
+
+
+def test_what_facets_miss_of_a_wave_is_the_one_beside_it() -> None:
+    """Waves of three facets as cubic splines have them, 7 % of which is another wave."""
+    length, phase = 3.0, 0.4
+    at = np.arange(30.0) - facets_sums.PAD
+    values = (120 + 20 * np.cos(2 * np.pi * at / length + phase) + np.zeros((28, 1))).astype(np.float32)
+    places = np.zeros((40, 50, 4), np.float32)
+    places[..., :2] = np.random.default_rng(0).uniform(1.5, 10, (40, 50, 2))
+    seen = np.empty(places.shape[:2], np.float32)
+    facets_grey.sample_pixels(values, 2, places, np.ones_like(seen), seen)
+    size = 20 * np.sinc(1 / length) ** 4
+    wave = 120 + size * np.cos(2 * np.pi * 2 * places[..., 0] / length + phase)
+    missed = np.zeros_like(seen)
+    facets_fine.add_missed(values, 2, places, np.ones_like(seen), shares(), missed)
+    assert np.abs(seen - wave).max() > 0.06 * size and np.abs(seen - missed - wave).max() < 0.01 * size
+    missed[:] = 0
+    facets_fine.add_missed(np.full_like(values, 120), 2, places, np.ones_like(seen), shares(), missed)
+    assert np.abs(missed).max() < 1e-3

@@ -19,6 +19,7 @@ from tools.small_block import X0, Y0
 from photoplan.events import listening
 from photoplan.geometry.grid import Window
 from photoplan.io.project.file import load_project
+from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.plan.tiles import Tile
 from photoplan.products.surface.findings import findings
 from photoplan.products.surface.job import SurfaceJob
@@ -112,12 +113,17 @@ def test_five_images_of_different_brightness(scene: Scene, made: Path) -> None:
 def test_grey_values_are_as_fine_as_the_pixels_where_images_are_enough(scene: Scene) -> None:
     project = load_project(scene.path)
 
+    def scheme(resolution: float, *images: str) -> Scheme:
+        return plan_surface(project, SurfaceSettings(resolution, bounds=BOUNDS), images or None).scheme
+
     def ratio(resolution: float, *images: str) -> int:
-        return plan_surface(project, SurfaceSettings(resolution, bounds=BOUNDS), images or None).scheme.ratio
+        return scheme(resolution, *images).ratio
 
     # Pixels of 0.5 m: of five images four facets on 1.55 m have three each, of two images one.
     assert ratio(1.5) == ratio(1.45) == 3 and ratio(1.55) == ratio(2.0) == 4
     assert ratio(1.55, "i1", "i2") == 3 and ratio(1.8, "i1", "i2") == 4
+    # Where they are coarser, this is known.
+    assert scheme(1.55, "i1", "i2").coarse and not scheme(1.55).coarse and not scheme(1.45, "i1", "i2").coarse
 
 
 def test_a_tile_tells_its_levels_and_how_much_is_done(scene: Scene) -> None:

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.events import tell
+from photoplan.kernels.facets_fine import add_missed
 from photoplan.kernels.facets_grey import add_errors, sample_grey, sample_pixels, solve_grey
 from photoplan.kernels.facets_height import MOMENTS, GreyFacets, Pixels, add_heights, add_means, made_heights
 from photoplan.kernels.facets_signs import signs_at
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
 from photoplan.kernels.facets_sums import OFFSETS, PAD, add_grey, count_pixels, sort_pixels
 from photoplan.matching.facets.curvature import Roughness, Smoother
+from photoplan.matching.facets.fine import shares
 from photoplan.matching.facets.means import away_from_border, corners, smoothed
 from photoplan.matching.facets.observe import Facets, Relief, Sight, View
 from photoplan.matching.facets.radiometry import Transfer, first_guess, levelled
@@ -76,6 +78,8 @@ class FacetBlock:
     """Heights between which the surface stays, metres, of all or shape (rows, columns)."""
     reach: float = 0.0
     """How far the start of the heights may be wrong, metres."""
+    coarse: bool = False
+    """Whether pixels are finer than the grey facets, so that what these do not hold has to be told of them."""
     trusted: NDArray[np.bool_] | None = None
     """Posts around which pixels tell their noise, and heights how rough they are; None: all."""
     views: list[View] = field(default_factory=list)
@@ -241,6 +245,9 @@ class FacetBlock:
             np.where(np.isfinite(g), f / np.float32(s * s), np.float32(0))
             for g, f, s in zip(grey, self._factors, self.sigmas)
         ]
+        if self.coarse and len(self.values):
+            for sight, g, w in zip(self.sights, grey, weights):
+                add_missed(self.values, self.facets.ratio, sight.places, w, shares(), g)
         return grey, weights
 
     def _start(self, grey: Sequence[_Floats], weights: Sequence[_Floats]) -> None:

@@ -71,6 +71,8 @@ class Scheme:
     """Level of the image pyramids that the finest facets use: images that are much finer than these."""
     reach: float = 0.0
     """How far the start may be wrong, metres: what the coarsest level does not pull in is tried there."""
+    coarse: bool = False
+    """Whether the grey facets are coarser than pixels."""
     search: Search | None = None
     """How heights are searched within the reach with which the coarsest level then begins; None: they are not."""
 
@@ -150,6 +152,7 @@ def reconstruct(
         if block is None or block.facets is not facets:
             continue
         block.limits, block.reach = _limits(start, facets, reach), reach
+        block.coarse = scheme.coarse and level == 0
         if level == scheme.coarsest:
             if found is None:
                 block.heights = _lifted(block, reach)

@@ -33,6 +33,8 @@ _SOME = 32.0
 _SHARED = 0.2
 #: B : H of images that see the ground from the same direction.
 _PARALLEL = 1e-4
+#: Part of a pixel below which facets are finer.
+_AS_FINE = 0.999
 #: Levels at most.
 _LEVELS = 8
 #: Pixels of parallax of the reach from which on heights are searched; those for which the coarsest level of a search
@@ -73,7 +75,9 @@ def scheme_of(
     strong = reach > _RELIEF * height_error and not shaken
     if strong if settings.search is None else settings.search:
         coarsest, search = 0, _search(looked, pixels, usual, reach, coarsest)
-    return Scheme(ratio=ratio, coarsest=coarsest, base=base, reach=reach, search=search), height_error
+    coarse = ratio < _AS_FINE * pixels / 2**base
+    scheme = Scheme(ratio=ratio, coarsest=coarsest, base=base, reach=reach, coarse=coarse, search=search)
+    return scheme, height_error
 
 
 def _reach(settings: SurfaceSettings, looked: Sequence[SeenTarget], frame: Frame | None, height_error: float) -> float:
@@ -142,7 +146,7 @@ def _facets(pixels: float, most: int, images: float = 0.0) -> tuple[int, int]:
     base = max(0, math.ceil(math.log2(pixels / most)))
     pixels /= 2**base
     ratio = max(1, round(pixels))
-    finer = ratio < 0.999 * pixels and (images - 2) * (pixels / (ratio + 1)) ** 2 >= 1
+    finer = ratio < _AS_FINE * pixels and (images - 2) * (pixels / (ratio + 1)) ** 2 >= 1
     return ratio + finer, base
 
 
