@@ -120,7 +120,9 @@ class FacetBlock:
     def iterate(self, radiometry: bool = True, texture: bool = False) -> None:
         """One correction of everything; perhaps with texture told from noise from then on."""
         relief = Relief.of(self.heights)
-        # One by one, so that places of one alone are there twice.
+        # Memory is most while grey values are solved: old residuals go before, and places of one view alone are there
+        # twice.
+        self.residuals = []
         for n, sight in enumerate(self.sights):
             self.sights[n] = sight.onto(relief)
         grey, weights = self.observed()

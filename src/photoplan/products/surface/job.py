@@ -34,7 +34,7 @@ _PART, _KEPT = 1008, 256 << 20
 MISFIT = 2.0
 """Heights around which residuals are so many times larger than expected are told of: they may be wrong."""
 #: Bytes of a grey facet while it is adjusted: its equations, and what its pixel of each image needs.
-_FACET, _PIXEL = 140, 64
+_FACET, _PIXEL = 140, 60
 
 
 @dataclass(frozen=True, kw_only=True)
