@@ -83,6 +83,12 @@ def test_positions_and_rays_are_inverse(isd: dict[str, Any]) -> None:
     assert worst < 1e-8
 
 
+@pytest.mark.parametrize(("name", "kind"), [("kaguya_tc", "kaguyalism"), ("edited_radtan", "radtan")])
+def test_focal_length_and_distortion_are_told(name: str, kind: str) -> None:
+    told = csm.read(support_data(name), Path("strip.json")).describe()["focal length"]
+    assert told == f"{support_data(name)['focal_length_model']['focal_length']:.6g} mm, distortion {kind}"
+
+
 def seen(kind: str, entries: dict[str, Any], place: tuple[float, float]) -> NDArray[np.float64]:
     """Where detectors look, in millimetres, of a line whose first detector lies at a place; they are 1 mm apart."""
     isd = distorted(kind, entries) | {

@@ -42,7 +42,8 @@ def read(isd: Any, path: Path) -> StatedLine:
         )
     source = Isd(isd, path)
     try:
-        return StatedLine(file=path, form=FORM, track=_track(source), look=look(source), radii=source.radii)
+        lens = f"{source.focal_plane().focal:.6g} mm, distortion {source.distortion or 'none'}"
+        return StatedLine(file=path, form=FORM, track=_track(source), look=look(source), radii=source.radii, lens=lens)
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None

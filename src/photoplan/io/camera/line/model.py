@@ -33,6 +33,8 @@ class StatedLine:
     """How far elements of a table of detectors lie beside the curve that stands for them, columns; None: no table."""
     chips: tuple[LineLook, ...] = ()
     """Of a line of several chips, all of them, with `look` the first; empty: it is one."""
+    lens: str | None = None
+    """Focal length and kind of distortion in words; None: the file states directions alone."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -61,6 +63,7 @@ class StatedLine:
             "image": f"{self.size[0]} columns, {self.size[1]} lines of {1000 * rate:.6g} ms",
             "oriented lines": "all" if whole else f"{oriented} only; the others have no position or attitude",
             "directions": f"{1e6 * self.look.pitch:.4g} µrad from column to column in the middle{table}{chips}",
+            **({} if self.lens is None else {"focal length": self.lens}),
             **({} if not gaps else {"gaps": f"of the record: lines {gaps} have no orientation"}),
             "body": f"radii {self.radii[0] / 1000:.3f} and {self.radii[1] / 1000:.3f} km",
         }
