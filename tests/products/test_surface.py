@@ -122,8 +122,9 @@ def test_grey_values_are_as_fine_as_the_pixels_where_images_are_enough(scene: Sc
     # Pixels of 0.5 m: of five images four facets on 1.55 m have three each, of two images one.
     assert ratio(1.5) == ratio(1.45) == 3 and ratio(1.55) == ratio(2.0) == 4
     assert ratio(1.55, "i1", "i2") == 3 and ratio(1.8, "i1", "i2") == 4
-    # Where they are coarser, this is known.
-    assert scheme(1.55, "i1", "i2").coarse and not scheme(1.55).coarse and not scheme(1.45, "i1", "i2").coarse
+    # Where those of few images are hardly finer, or coarser, this is known.
+    assert scheme(1.55, "i1", "i2").coarse and scheme(1.45, "i1", "i2").coarse
+    assert not scheme(1.55).coarse and not scheme(1.5).coarse and not scheme(1.3, "i1", "i2").coarse
 
 
 def test_a_tile_tells_its_levels_and_how_much_is_done(scene: Scene) -> None:

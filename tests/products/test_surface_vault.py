@@ -137,3 +137,22 @@ def test_rays_bend_over_a_cylinder_as_they_do(tmp_path: Path, monkeypatch: pytes
         print(off.mean(), off.max())
         # Facets of 45 mm over hills of 1.2 m take 0.01 of it.
         assert len(off) > 2000 and off.mean() < 0.003 and off.max() < 0.015
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [7, 10])
+def test_standard_deviations_over_a_column_hold_for_other_reliefs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """With rays that bend as a parabola 2.4 each."""
+    lengths = np.repeat((1.2, 3.0), 6)
+    here = sys.modules[__name__]
+    monkeypatch.setattr(here, "RELIEF", waves(seed, lengths, lengths / 100, (0.0, 0.0)))
+    sizes = np.full(64, CONTRAST * np.sqrt(2 / 64))
+    monkeypatch.setattr(here, "PATTERN", waves(seed + 1, 3 * GSD * 12.0 ** np.linspace(0, 1, 64), sizes, (0.0, 0.0)))
+    project = write(tmp_path, CylinderFrame.column(AXIS, 110.0, RADIUS))
+    words = ["--resolution", 3 * GSD, "--bounds", U - 0.4, -0.4, U + 0.4, 0.4, "--reach", 0.12, "--no-search"]
+    said = inside("surface", project, "--target", f"column:{X0},{Y0},100,110,5", *words, "--no-quicklook")
+    assert said.code == 0, said.err
+    share, rms, normalised = judged(tmp_path / "products")
+    assert share == 1.0 and rms < 0.012 and 0.6 < normalised < 1.3

@@ -79,7 +79,7 @@ class FacetBlock:
     reach: float = 0.0
     """How far the start of the heights may be wrong, metres."""
     coarse: bool = False
-    """Whether pixels are finer than the grey facets, so that what these do not hold has to be told of them."""
+    """Whether grey facets are coarser than pixels or hardly finer, so that what they do not hold is told of these."""
     trusted: NDArray[np.bool_] | None = None
     """Posts around which pixels tell their noise, and heights how rough they are; None: all."""
     views: list[View] = field(default_factory=list)

@@ -72,7 +72,7 @@ class Scheme:
     reach: float = 0.0
     """How far the start may be wrong, metres: what the coarsest level does not pull in is tried there."""
     coarse: bool = False
-    """Whether the grey facets are coarser than pixels."""
+    """Whether grey facets of few images are coarser than pixels, or hardly finer."""
     search: Search | None = None
     """How heights are searched within the reach with which the coarsest level then begins; None: they are not."""
 

@@ -35,6 +35,8 @@ _SHARED = 0.2
 _PARALLEL = 1e-4
 #: Part of a pixel below which facets are finer.
 _AS_FINE = 0.999
+#: Part of a pixel from which on facets beat with pixels, for so many images of a place that these count little.
+_HARDLY, _MANY = 1.1, 3.5
 #: Levels at most.
 _LEVELS = 8
 #: Pixels of parallax of the reach from which on heights are searched; those for which the coarsest level of a search
@@ -75,7 +77,7 @@ def scheme_of(
     strong = reach > _RELIEF * height_error and not shaken
     if strong if settings.search is None else settings.search:
         coarsest, search = 0, _search(looked, pixels, usual, reach, coarsest)
-    coarse = ratio < _AS_FINE * pixels / 2**base
+    coarse = ratio < _HARDLY * pixels / 2**base and _images_of_a_place(looked, grid) < _MANY
     scheme = Scheme(ratio=ratio, coarsest=coarsest, base=base, reach=reach, coarse=coarse, search=search)
     return scheme, height_error
 
