@@ -28,6 +28,7 @@ from tools.small_block import CRS, X0, Y0, write_image
 
 #: Pixels on the ground, metres; pixels along a side of a height; flying height over base.
 GSD, RATIO, STEEP = 0.5, 3, 3.0
+#: Camera constant, pixels: of large images as wide as these, which else would see their borders at grazing angles.
 GROUND, FOCAL = 100.0, 1000.0
 SIZES = (100_000, 300_000, 1_000_000)
 
@@ -39,12 +40,13 @@ def hills(X, Y):
 
 def write_block(folder, side):
     """Four images over side × side heights, 60 % of them common to all; bounds of those."""
-    flying = FOCAL * GSD
+    focal = max(FOCAL, float(side * RATIO))
+    flying = focal * GSD
     step = flying / STEEP / 3
     extent = side * RATIO * GSD
     # Images are turned by 3°.
     size = (int((1.12 * extent + 3 * step) / GSD) + 80, int((1.06 * extent + 0.16 * step) / GSD) + 80)
-    flight = Flight((X0, Y0), GROUND + flying, (step, 0.0), (4, 1), size, FOCAL, tilt=0.0)
+    flight = Flight((X0, Y0), GROUND + flying, (step, 0.0), (4, 1), size, focal, tilt=0.0)
     path = write_project(folder, CRS, f"height = {GROUND}", "", flight)
     (folder / "rendered").mkdir()
     rng = np.random.default_rng(0)
