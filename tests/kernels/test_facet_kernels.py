@@ -17,6 +17,7 @@ from photoplan.kernels import (
 )
 from photoplan.kernels.jit import COMPILED
 from photoplan.matching.facets.fine import shares
+from photoplan.matching.facets.means import means_around
 
 
 def carried(low, high, posts, out, wall=np.inf) -> None:
@@ -309,3 +310,10 @@ def test_what_facets_miss_of_a_wave_is_the_one_beside_it() -> None:
     missed[:] = 0
     facets_fine.add_missed(np.full_like(values, 120), 2, places, np.ones_like(seen), shares(), missed)
     assert np.abs(missed).max() < 1e-3
+
+
+def test_means_of_squares_are_not_negative_beside_large_ones() -> None:
+    values = np.zeros((40, 50))
+    values[5:9, 7:12] = np.random.default_rng(0).uniform(0, 1e9, (4, 5))
+    found = means_around(values, 5)
+    assert found.min() == 0 and found.max() > 1e7

@@ -14,9 +14,13 @@ _TOGETHER = 4
 def box_means(values, before, after, out):
     """Means of values (rows, columns) over the rows and columns k − before … k + after − 1 that there are.
 
-    `out` has the same shape, float64.
+    `out` has the same shape, float64. None is below the least value: sums that slide past large ones may end beside 0.
     """
     rows, columns = values.shape
+    least = np.inf
+    for j in range(rows):
+        for i in range(columns):
+            least = min(least, values[j, i])
     down = np.zeros((_TOGETHER, columns))
     sums, along = np.zeros(columns), np.zeros(_TOGETHER)
     for j in range(-after + 1, 0):
@@ -48,4 +52,4 @@ def box_means(values, before, after, out):
                     along[n] += down[n, i + after - 1]
                 if i - before - 1 >= 0:
                     along[n] -= down[n, i - before - 1]
-                out[first + n, i] = along[n] / count
+                out[first + n, i] = max(along[n] / count, least)
