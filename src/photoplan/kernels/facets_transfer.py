@@ -6,6 +6,8 @@ differences around it have in common. So slopes and hills are curved, while an e
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from photoplan.kernels.jit import inner, kernel
@@ -23,6 +25,31 @@ CELL = 8
 _GENTLE, _STEPS, _EXACT = 0.5, 12, 1e-5
 
 
+class Ray(NamedTuple):
+    """A pixel's way down: column and row of the posts at the height 0, and their coefficients of z, z² and z³."""
+
+    u: float
+    v: float
+    ku: float
+    kv: float
+    qu: float
+    qv: float
+    cu: float
+    cv: float
+
+
+@inner
+def _place(ray, z):
+    """Column and row of the posts at a height."""
+    return ray.u + z * (ray.ku + z * (ray.qu + z * ray.cu)), ray.v + z * (ray.kv + z * (ray.qv + z * ray.cv))
+
+
+@inner
+def _change(ray, z):
+    """What these change per metre of height there."""
+    return ray.ku + z * (2.0 * ray.qu + 3.0 * z * ray.cu), ray.kv + z * (2.0 * ray.qv + 3.0 * z * ray.cv)
+
+
 @inner
 def height_at(posts, u, v):
     """Height of the facets at a place, in columns and rows of the posts; beyond the border that of the border."""
@@ -36,29 +63,30 @@ def height_at(posts, u, v):
 
 
 @inner
-def _above(posts, u, v, ku, kv, qu, qv, cu, cv, z):
-    """How far the way (u + z·ku + z²·qu + z³·cu, v + z·kv + z²·qv + z³·cv, z) is above the surface at z."""
-    return z - height_at(posts, u + z * (ku + z * (qu + z * cu)), v + z * (kv + z * (qv + z * cv)))
+def _above(posts, ray, z):
+    """How far a ray is above the surface at a height."""
+    u, v = _place(ray, z)
+    return z - height_at(posts, u, v)
 
 
 @inner
-def _first_hit(posts, u, v, ku, kv, qu, qv, cu, cv, top, bottom, slope, reach):
-    """Height at which a way first comes down to the surface; NaN: it does not. `reach`: facets that it goes per metre
+def _first_hit(posts, ray, top, bottom, slope, reach):
+    """Height at which a ray first comes down to the surface; NaN: it does not. `reach`: facets that it goes per metre
     at most."""
     stride = _STRIDE / max(reach, 1e-12)
     z = top
     while z > bottom:
-        above = _above(posts, u, v, ku, kv, qu, qv, cu, cv, z)
+        above = _above(posts, ray, z)
         if above <= 0.0:
             return z
         # The surface cannot rise faster than its steepest facet.
         after = z - max(above / (1.0 + slope * reach), stride)
-        if _above(posts, u, v, ku, kv, qu, qv, cu, cv, after) > 0.0:
+        if _above(posts, ray, after) > 0.0:
             z = after
             continue
         for _ in range(_HALVINGS):
             middle = 0.5 * (z + after)
-            if _above(posts, u, v, ku, kv, qu, qv, cu, cv, middle) > 0.0:
+            if _above(posts, ray, middle) > 0.0:
                 z = middle
             else:
                 after = middle
@@ -77,18 +105,18 @@ def _rise(posts, u, v, ku, kv):
 
 
 @inner
-def _only_hit(posts, u, v, ku, kv, qu, qv, cu, cv, z):
-    """Height at which a way meets a surface that it meets once, by Newton's way from z; NaN: not found."""
+def _only_hit(posts, ray, z):
+    """Height at which a ray meets a surface that it meets once, by Newton's way from z; NaN: not found."""
     rows, columns = posts.shape
-    enough = _EXACT / (abs(ku) + abs(kv) + 1e-12)
+    enough = _EXACT / (abs(ray.ku) + abs(ray.kv) + 1e-12)
     for _ in range(_STEPS):
-        x, y = u + z * (ku + z * (qu + z * cu)), v + z * (kv + z * (qv + z * cv))
+        x, y = _place(ray, z)
         x, y = min(max(x, 0.0), columns - 1.0), min(max(y, 0.0), rows - 1.0)
         i, j = min(int(x), columns - 2), min(int(y), rows - 2)
         a, b = x - i, y - j
         p00, p01, p10, p11 = posts[j, i], posts[j, i + 1], posts[j + 1, i], posts[j + 1, i + 1]
         upper, lower = p00 + a * (p01 - p00), p10 + a * (p11 - p10)
-        along, down = ku + z * (2.0 * qu + 3.0 * z * cu), kv + z * (2.0 * qv + 3.0 * z * cv)
+        along, down = _change(ray, z)
         rise = ((1.0 - b) * (p01 - p00) + b * (p11 - p10)) * along + (lower - upper) * down
         step = (upper + b * (lower - upper) - z) / (1.0 - rise)
         z += step
@@ -159,24 +187,25 @@ def _bulge(bent, u, v):
 
 
 @inner
-def _hit(posts, steep, u, v, ku, kv, qu, qv, cu, cv, top, bottom, slope, z):
+def _hit(posts, steep, ray, top, bottom, slope, z):
     """Where a ray first meets the surface: at once where all below the ray from above is gentle, else by a search from
     above; z: about there."""
     far = max(abs(top), abs(bottom))
-    reach = abs(ku) + abs(kv) + far * (2.0 * (abs(qu) + abs(qv)) + 3.0 * far * (abs(cu) + abs(cv)))
-    found = _only_hit(posts, u, v, ku, kv, qu, qv, cu, cv, z)
+    bent = 2.0 * (abs(ray.qu) + abs(ray.qv)) + 3.0 * far * (abs(ray.cu) + abs(ray.cv))
+    reach = abs(ray.ku) + abs(ray.kv) + far * bent
+    found = _only_hit(posts, ray, z)
     at, clear = found, not np.isnan(found)
     if clear and slope * reach < _GENTLE:
         return found
     while clear:
-        i, j = int(u + at * (ku + at * (qu + at * cu))) // CELL, int(v + at * (kv + at * (qv + at * cv))) // CELL
-        i, j = min(max(i, 0), steep.shape[1] - 1), min(max(j, 0), steep.shape[0] - 1)
+        u, v = _place(ray, at)
+        i, j = min(max(int(u) // CELL, 0), steep.shape[1] - 1), min(max(int(v) // CELL, 0), steep.shape[0] - 1)
         clear = steep[j, i] * reach < _GENTLE
         # What is around a cell goes as far as that.
         at += CELL / max(reach, 1e-12)
         if at > top:
             break
-    return found if clear else _first_hit(posts, u, v, ku, kv, qu, qv, cu, cv, top, bottom, slope, reach)
+    return found if clear else _first_hit(posts, ray, top, bottom, slope, reach)
 
 
 @kernel
@@ -223,18 +252,19 @@ def transfer(ways, right, down, posts, bent, steep, wall, out):
             last = out.shape[1] if i == ways.shape[1] - 2 else min(out.shape[1], (i + 1) * right)
             for c in range(i * right, last):
                 a = c - i * right
-                u0, v0 = first[0] + a * way[0], first[1] + a * way[1]
+                u, v = first[0] + a * way[0], first[1] + a * way[1]
                 ku, kv = first[2] + a * way[2], first[3] + a * way[3]
                 qu, qv = first[4] + a * way[4], first[5] + a * way[5]
                 cu, cv = first[6] + a * way[6], first[7] + a * way[7]
                 for k in range(4):
                     out[r, c, k] = np.nan
-                if np.isnan(u0 + v0 + ku + kv + qu + qv + cu + cv):
+                if np.isnan(u + v + ku + kv + qu + qv + cu + cv):
                     continue
-                z = _hit(posts, steep, u0, v0, ku, kv, qu, qv, cu, cv, top, bottom, slope, z)
-                u, v = u0 + z * (ku + z * (qu + z * cu)), v0 + z * (kv + z * (qv + z * cv))
+                ray = Ray(u, v, ku, kv, qu, qv, cu, cv)
+                z = _hit(posts, steep, ray, top, bottom, slope, z)
+                u, v = _place(ray, z)
                 if u >= 0.0 and v >= 0.0 and u <= columns - 1.0 and v <= rows - 1.0:
-                    ku, kv = ku + z * (2.0 * qu + 3.0 * z * cu), kv + z * (2.0 * qv + 3.0 * z * cv)
+                    ku, kv = _change(ray, z)
                     towards = max(1.0 - _rise(posts, u, v, ku, kv), _GRAZING)
                     if towards > wall:
                         continue
