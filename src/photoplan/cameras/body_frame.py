@@ -51,8 +51,7 @@ class BodyFrameCamera:
         w, h = self.size
         rows, columns = np.linspace(-0.5, h - 0.5, _SIDE), np.linspace(-0.5, w - 0.5, _SIDE)
         xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        flying = float(self.ground.height(self.frame.center[None])[0])
-        return vantage_over(self.ground, flying, lambda level: self.rays(xy, level)[0])
+        return vantage_over(self.ground, self.frame.center[None], lambda level: self.rays(xy, level)[0])
 
     def project_homogeneous(self, XYZ: ArrayLike) -> _Floats:
         """Ground (..., 3) to ideal (x·w, y·w, w), w = depth in metres; NaN behind the body."""

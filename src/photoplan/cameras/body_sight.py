@@ -15,6 +15,8 @@ from photoplan.geometry.body import BodyGround
 _Floats = NDArray[np.float64]
 #: Heights of any ground, metres: of the earth, and of other bodies, where they are at most this part of the radius.
 _EARTH, _ELSEWHERE, _PART = (-500.0, 9_000.0), (-10_000.0, 25_000.0), 0.1
+#: Heights above the ellipsoid are at most this much more than those above a geoid, metres.
+_HIGHEST_GEOID = 110.0
 #: Heights are met when they were missed by less than this before the last step, metres.
 _CLOSE = 1e-8
 
@@ -63,14 +65,14 @@ def meet(ground: BodyGround, S: _Floats, d: _Floats, heights: _Floats) -> tuple[
     return point, tangent
 
 
-def vantage_over(ground: BodyGround, flying: float, seen: Callable[[float], _Floats]) -> Vantage:
+def vantage_over(ground: BodyGround, centers: _Floats, seen: Callable[[float], _Floats]) -> Vantage:
     """Above the middle of what a camera sees: the highest ground there is, but not above the camera.
 
     Parameters
     ----------
     ground : BodyGround
-    flying : float
-        Height of the camera, metres.
+    centers : ndarray, shape (n, 3)
+        Places of the camera in the axes of the body; NaN where it is not known.
     seen : callable
         Map points (n, 3) of rays all over the image at a height.
 
@@ -80,10 +82,17 @@ def vantage_over(ground: BodyGround, flying: float, seen: Callable[[float], _Flo
         It does not see the ground.
     """
     low, high = heights_of(ground)
-    high = min(high, flying - 1.0)
+    flying = ground.to_map(centers)[:, 2]
+    if np.isnan(flying).all():
+        # A satellite may stand beside the grid of the heights of what it shows.
+        flying = ground.height(centers) - _HIGHEST_GEOID
+    high = min(high, float(np.nanmin(flying)) - 1.0)
     feet = np.concatenate([seen(level)[:, :2] for level in (min(low, high - 1.0), high)])
     if np.isnan(feet).all():
-        raise InputError("the image does not show the ground of the project; is its CRS that of the right body?")
+        raise InputError(
+            "the image does not show the ground of the project where its heights are known; is its CRS that of the "
+            "right body, and does the grid of its height system reach as far?"
+        )
     middle = (np.nanmin(feet, axis=0) + np.nanmax(feet, axis=0)) / 2
     reach = 1.1 * float(np.nanmax(np.linalg.norm(feet - middle, axis=1)))
     return Vantage(np.array([*middle, high]), low, reach)

@@ -167,8 +167,7 @@ class LineCamera:
         first, last = self.track.oriented
         rows, columns = np.linspace(first, last, 17), np.linspace(-0.5, self.size[0] - 0.5, 9)
         xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        flying = float(np.nanmin(self.ground.to_map(self.body_rays(xy)[0])[:, 2]))
-        return vantage_over(self.ground, flying, lambda level: self.rays(xy, level)[0])
+        return vantage_over(self.ground, self.body_rays(xy)[0], lambda level: self.rays(xy, level)[0])
 
     def unoriented(self, y: _Floats) -> NDArray[np.bool_]:
         """Rows inside the image whose orientation is not known."""

@@ -209,7 +209,7 @@ class StraightPart:
         S, d = flight.place[None], flight.R @ np.array([*flight.look.tangents(self._middle)[0], 1.0])
         d = d[None] / np.linalg.norm(d)
         below = S + to_sphere(S, d, np.linalg.norm(S, axis=1) - ground.height(S) + height)[:, None] * d
-        lift = float(ground.height(ground(np.column_stack([ground.to_map(below)[:, :2], [height]])))[0])
+        lift = height + float((ground.height(below) - ground.to_map(below)[:, 2])[0])
         return lift if np.isfinite(lift) else height
 
     @property

@@ -338,6 +338,7 @@ class RpcCamera:
         wanted = xy if self.correction is None else self.correction.inverse(xy)
         # The height above the ellipsoid changes from place to place, by so little that Newton's method puts it right.
         point = self.ground.to_map(self.functions.inverse(wanted, heights + self._undulation))
+        point[np.isnan(point[:, 2])] = np.nan
         point[:, 2] = heights
         miss = np.full_like(xy, np.nan)
         with np.errstate(all="ignore"):

@@ -69,14 +69,17 @@ class GeodeticGround:
         return self._to_ellipsoid(np.asarray(XYZ, float))
 
     def to_map(self, geodetic: ArrayLike) -> NDArray[np.float64]:
-        """The inverse of a call, to 1e-8 m; NaN where the CRS has no place."""
+        """The inverse of a call, to 1e-8 m; NaN where the CRS has no place, and outside the grid of the heights.
+
+        A ray may leave the grid above or below the ground that it shows, far from any point that is asked for.
+        """
         geodetic = np.asarray(geodetic, float)
         out = np.empty_like(geodetic)
         out[..., :2] = self._to_map.where_defined(geodetic[..., :2])
         out[..., 2] = geodetic[..., 2]
         if self._to_ellipsoid.definition is not None:
             for _ in range(_TURNS):
-                out[..., 2] -= self._to_ellipsoid(out) - geodetic[..., 2]
+                out[..., 2] -= self._to_ellipsoid.where_defined(out) - geodetic[..., 2]
         return out
 
     def jacobian(self, XYZ: ArrayLike) -> NDArray[np.float64]:

@@ -137,21 +137,27 @@ class HeightStep:
             A point lies outside the operation's grid.
         """
         XYZ = np.asarray(XYZ, float)
-        if self.definition is None:
-            return XYZ[..., 2].copy()
-        if not hasattr(self._own, "transformer"):
-            self._own.transformer = Transformer.from_pipeline(self.definition)
-        X, Y, Z = (np.asarray(c, float) for c in self._own.transformer.transform(*np.moveaxis(XYZ, -1, 0)))
-        given = np.isfinite(XYZ).all(axis=-1)
-        # Where a grid ends PROJ returns infinity, or leaves the point untouched to the last bit.
-        lost = given & ~(np.isfinite(Z) & np.isfinite(X) & np.isfinite(Y))
+        out = self.where_defined(XYZ)
+        lost = np.isfinite(XYZ).all(axis=-1) & np.isnan(out)
         if lost.any():
             x, y = np.atleast_2d(XYZ[lost])[0, :2]
             raise HeightSystemError(
                 f"X {x:.1f}, Y {y:.1f}: {height_label(self.source)} cannot be turned into {height_label(self.target)} "
                 f"there; the operation {self.operation!r} does not cover the point"
             )
-        return np.where(given, Z, np.nan)
+        return out
+
+    def where_defined(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """As a call; points outside the operation's grid become NaN."""
+        XYZ = np.asarray(XYZ, float)
+        if self.definition is None:
+            return XYZ[..., 2].copy()
+        if not hasattr(self._own, "transformer"):
+            self._own.transformer = Transformer.from_pipeline(self.definition)
+        X, Y, Z = (np.asarray(c, float) for c in self._own.transformer.transform(*np.moveaxis(XYZ, -1, 0)))
+        # Where a grid ends PROJ returns infinity.
+        known = np.isfinite(XYZ).all(axis=-1) & np.isfinite(Z) & np.isfinite(X) & np.isfinite(Y)
+        return np.where(known, Z, np.nan)
 
     def __reduce__(self) -> tuple[type[HeightStep], tuple[object, ...]]:
         return HeightStep, (

@@ -141,19 +141,33 @@ def _in_system(ground: Ground, address: _GroundAddress) -> Ground:
     terrain, orientation = ground.height_systems
     wanted = "ellipsoidal" if address.to_ellipsoid and orientation != "same" else orientation
     step = height_step(terrain, wanted, address.crs, ground.bounds)
-    surface = ground.surface if step.definition is None else ShiftedSurface(ground.surface, _Undulation(step))
-    operations = ground.operations if step.definition is None else (*ground.operations, step)
-    return replace(ground, surface=surface, operations=operations, working_system=wanted)
+    if step.definition is None:
+        return replace(ground, working_system=wanted)
+    surface = ShiftedSurface(ground.surface, _Undulation(step, ground.bounds))
+    return replace(ground, surface=surface, operations=(*ground.operations, step), working_system=wanted)
 
 
 @dataclass(frozen=True)
 class _Undulation:
-    """What a height step adds at map points."""
+    """What a height step adds at map points.
+
+    Rays and tiles reach beyond the terrain, where the grid of the step may have ended: the next place of the terrain
+    counts there. A place inside that the grid does not cover is an error.
+    """
 
     step: HeightStep
+    bounds: tuple[float, float, float, float] | None
+    """Of the terrain; None: it is everywhere."""
 
     def __call__(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self.step(np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1))
+        XYZ = np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1)
+        if self.bounds is None:
+            return self.step(XYZ)
+        out = self.step.where_defined(XYZ)
+        lost = np.isnan(out)
+        XYZ[lost, :2] = np.clip(XYZ[lost, :2], self.bounds[:2], self.bounds[2:])
+        out[lost] = self.step(XYZ[lost])
+        return out
 
 
 def stamp_of(path: Path) -> tuple[int, int]:
