@@ -260,7 +260,7 @@ def transfer(ways, right, down, posts, bent, steep, wall, out):
                     out[r, c, k] = np.nan
                 if np.isnan(u + v + ku + kv + qu + qv + cu + cv):
                     continue
-                ray = Ray(u, v, ku, kv, qu, qv, cu, cv)
+                ray = Ray(u=u, v=v, ku=ku, kv=kv, qu=qu, qv=qv, cu=cu, cv=cv)
                 z = _hit(posts, steep, ray, top, bottom, slope, z)
                 u, v = _place(ray, z)
                 if u >= 0.0 and v >= 0.0 and u <= columns - 1.0 and v <= rows - 1.0:
