@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,18 +14,21 @@ import rasterio
 from tools.command import Said, inside
 from tools.facet_scene import CONTRAST, GROUND, GSD, Scene, write_scene
 from tools.sketched import drawn
-from tools.small_block import X0, Y0
+from tools.small_block import X0, Y0, write_terrain
 
+from photoplan.errors import InputError
 from photoplan.events import listening
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.project.file import load_project
 from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.plan.tiles import Tile
+from photoplan.products.surface import job as surface_job
 from photoplan.products.surface.findings import findings
 from photoplan.products.surface.job import SurfaceJob
 from photoplan.products.surface.plan import plan_surface
 from photoplan.products.surface.settings import SurfaceSettings
 from photoplan.products.surface.spread import counted, median
+from photoplan.project.scenes import ScenesAddress
 from photoplan.report import surface as report
 
 CLOUDS = (".las", ".laz", ".ply")
@@ -243,6 +246,38 @@ def test_what_cannot_be_is_refused_by_name(scene: Scene, made: Path) -> None:
     assert said.code == 2 and "finer than the images" in said.err
 
 
+def test_the_file_of_a_start_is_an_input_like_all_others(scene: Scene, tmp_path: Path) -> None:
+    """No output replaces it, the record names it, and a tile that finds another one there is not made."""
+    start = write_terrain(tmp_path / "surface.tif", np.full((40, 40), GROUND))
+    said = surface(scene, "--start", start, "--output", tmp_path, "--overwrite")
+    assert said.code == 2 and "the output is an input" in said.err
+    plan = plan_surface(load_project(scene.path), SurfaceSettings(1.5, bounds=BOUNDS, start=str(start)))
+    assert plan.inputs == (*plan.address.digests, plan.begun) and plan.begun is not None
+    job = SurfaceJob(address=plan.address, grid=plan.grid, scheme=plan.scheme, start=str(start), begun=plan.begun)
+    write_terrain(start, np.full((40, 40), GROUND + 5.0))
+    with pytest.raises(InputError, match="has changed since the run was planned"):
+        job(Tile(0, Window(0, 0, 4, 4)))
+
+
+def test_memory_of_a_tile_counts_its_pictures_and_the_images_that_see_the_place_that_most_see(scene: Scene) -> None:
+    """Bounds five times as long as what is seen hold the same places; of ratios below 3 a part is a tile."""
+    x0, y0, x1, y1 = BOUNDS
+    plan = plan_surface(load_project(scene.path), SurfaceSettings(1.5, bounds=(x0 - 80, y0, x1 + 80, y1)))
+    assert sum(plan.parts.values()) < 2.5 and plan.most == 5
+    grid = MapGrid(0.0, 0.0, 1.0, 1000, 1000, None)
+    job = SurfaceJob(address=plan.address, grid=grid, scheme=plan.scheme, start="0", seen=plan.most)
+    picture = 4 * (336 * plan.scheme.ratio) ** 2
+    assert replace(job, residuals=True).bytes - job.bytes == 2 * 5 * picture
+    assert replace(job, scheme=replace(plan.scheme, ratio=1)).part == 336 == job.part
+
+
+def test_images_are_kept_for_the_next_tile_however_many_they_are(scene: Scene) -> None:
+    (one, *_) = plan_surface(load_project(scene.path), SurfaceSettings(1.5, bounds=BOUNDS)).address.scenes
+    address = ScenesAddress(tuple(replace(one, text=one.text + " " * k) for k in range(260)))
+    first, again = (surface_job._views(address, None, BOUNDS, ()) for _ in range(2))
+    assert len(first) == 260 and all(a.pyramid is b.pyramid for a, b in zip(first, again))
+
+
 def test_the_median_of_tiles_is_counted_in_classes() -> None:
     rng = np.random.default_rng(2)
     sigmas = np.exp(rng.normal(-4, 1, (3, 5000)))
@@ -312,6 +347,13 @@ def test_labels_of_a_report_keep_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     axes = drawn[0].axes[1]
     assert axes.get_xticks().tolist() == [0]
     assert {f"{tick:.0e}"[0] for tick in axes.get_yticks(minor=True)} == {"2", "5"}
+
+
+def test_a_report_leaves_room_for_the_name_of_long_coordinates() -> None:
+    with drawn():
+        picture = report._draw_fit(np.ones((60, 80)), (576704.0, 5188144.0, 576720.0, 5188156.0), ("X", "Y"))
+    with rasterio.MemoryFile(picture) as memory, memory.open() as file:
+        assert file.read(1)[:, :3].min() > 200
 
 
 def test_a_report_draws_the_residuals_of_images_that_fit_worst(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

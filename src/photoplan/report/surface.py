@@ -119,7 +119,8 @@ def _draw_fit(fit: _Doubles, extent: tuple[float, float, float, float], coordina
     ax.grid(visible=False)
     ax.set(aspect="equal", xlabel=f"{coordinates[0]}, m", ylabel=f"{coordinates[1]}, m")
     ax.ticklabel_format(useOffset=False, style="plain")
-    return png(fig)
+    # The layout leaves too little room for long coordinates where the figure is low.
+    return png(fig, bbox_inches="tight")
 
 
 def _residuals(plan: SurfacePlan, result: SurfaceResult, path: Path) -> list[str]:

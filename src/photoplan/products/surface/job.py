@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.framed import FramedCamera
 from photoplan.engine.run import Made, Output
+from photoplan.errors import InputError
 from photoplan.events import stretch
 from photoplan.geometry.frames import Frame
 from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.fingerprint import fingerprint
 from photoplan.matching.facets.observe import View
 from photoplan.matching.facets.pyramid import Pyramid
 from photoplan.matching.facets.reconstruct import MARGIN, Scheme, reconstruct
@@ -23,12 +25,14 @@ from photoplan.plan.tiles import Tile
 from photoplan.products.surface.settings import Bounds
 from photoplan.products.surface.spread import counted
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.scene import SceneAddress
+from photoplan.project.scene import Scene
 from photoplan.project.scenes import ScenesAddress, surface_of
 from photoplan.surfaces.objects import without_objects
 
 _Doubles = NDArray[np.float64]
 
+TILE = 336
+"""Side of a tile of heights; those of grey values are as many times larger as they are finer."""
 #: Grey facets along a part that is reconstructed at once, and blocks of image pyramids that are kept, bytes in all.
 _PART, _KEPT = 1008, 256 << 20
 MISFIT = 2.0
@@ -46,6 +50,8 @@ class SurfaceJob:
     scheme: Scheme
     start: str
     """See `SurfaceSettings.start`."""
+    begun: tuple[str, str] | None = None
+    """See `SurfacePlan.begun`."""
     residuals: bool = False
     """See `SurfaceSettings.residuals`."""
     frame: Frame | None = None
@@ -53,26 +59,30 @@ class SurfaceJob:
     bands: tuple[int, ...] = ()
     """See `SurfaceSettings.bands`."""
     seen: int = 0
-    """Images that see most places; 0: all."""
+    """Images that see the place that most see; 0: all."""
 
     @property
     def part(self) -> int:
         """Posts along a part of a tile that is reconstructed at once."""
-        return max(16, _PART // self.scheme.ratio)
+        return max(16, min(TILE, _PART // self.scheme.ratio))
 
     @property
     def bytes(self) -> int:
         """Memory that a tile takes."""
-        m, part = self.scheme.ratio, self.part
-        posts = (min(part, self.grid.width) + 2 * MARGIN) * (min(part, self.grid.height) + 2 * MARGIN)
-        each = _FACET + _PIXEL * (self.seen or len(self.address.scenes))
-        return posts * m**2 * each + 2 * _PART**2 * len(self.address.scenes)
+        m, images = self.scheme.ratio, len(self.address.scenes)
+
+        def facets(side: int, around: int = 0) -> int:
+            return m**2 * (min(side, self.grid.width) + 2 * around) * (min(side, self.grid.height) + 2 * around)
+
+        residuals = images if self.residuals else 0
+        made = 4 * ((2 + residuals) * facets(TILE) + residuals * facets(self.part))
+        each = _FACET + _PIXEL * (self.seen or images)
+        return facets(self.part, MARGIN) * each + 2 * _PART**2 * images + made
 
     def __call__(self, tile: Tile) -> Made:
         """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""
-        kept = _KEPT // len(self.address.scenes)
-        views = [_view(scene, kept, self.frame, self.grid.bounds, self.bands) for scene in self.address.scenes]
-        start = _start(self.address, self.start, self.grid.crs)
+        views = _views(self.address, self.frame, self.grid.bounds, self.bands)
+        start = _start(self.address, self.start, self.begun, self.grid.crs)
         window, m = tile.window, self.scheme.ratio
         shape, finest = (window.height, window.width), (m * window.height, m * window.width)
         heights, sigmas, fit = (np.full((1, *shape), np.nan, np.float32) for _ in range(3))
@@ -115,21 +125,35 @@ class SurfaceJob:
         return Made(tuple(layers) if known.any() else (None,) * len(layers), record)
 
 
-@lru_cache(maxsize=256)
-def _view(address: SceneAddress, kept: int, frame: Frame | None, bounds: Bounds, bands: tuple[int, ...]) -> View:
-    """An image and its pyramid, kept for the next tile."""
-    scene = address.open()
-    camera = scene.camera if frame is None else FramedCamera(scene.camera, frame, bounds)
-    return View(camera, Pyramid(GreyImage(scene.reader, bands=bands), kept=kept))
+@lru_cache(maxsize=2)
+def _views(address: ScenesAddress, frame: Frame | None, bounds: Bounds, bands: tuple[int, ...]) -> tuple[View, ...]:
+    """The images and their pyramids, kept for the next tile; those of products before go."""
+    kept = _KEPT // len(address.scenes)
+
+    def view(scene: Scene) -> View:
+        camera = scene.camera if frame is None else FramedCamera(scene.camera, frame, bounds)
+        return View(camera, Pyramid(GreyImage(scene.reader, bands=bands), kept=kept))
+
+    return tuple(view(scene.open()) for scene in address.scenes)
 
 
 @lru_cache(maxsize=4)
-def _start(address: ScenesAddress, start: str, crs: str) -> Callable[[_Doubles], _Doubles]:
-    """Heights with which a surface begins."""
+def _start(
+    address: ScenesAddress, start: str, begun: tuple[str, str] | None, crs: str
+) -> Callable[[_Doubles], _Doubles]:
+    """Heights with which a surface begins.
+
+    Raises
+    ------
+    InputError
+        They are those of a file that has changed since it was planned.
+    """
+    if begun is not None:
+        path, digest = begun
+        if fingerprint(path).digest != digest:
+            raise InputError(f"{path}: has changed since the run was planned; plan it again")
+        return open_terrain(Path(path)).in_crs(crs)[0].surface.heights
     if start == "terrain":
         return without_objects(surface_of(address)).heights
-    try:
-        height = float(start)
-    except ValueError:
-        return open_terrain(Path(start)).in_crs(crs)[0].surface.heights
+    height = float(start)
     return lambda XY: np.full(XY.shape[:-1], height)

@@ -13,6 +13,7 @@ from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.frames import Frame, ImageFrame
 from photoplan.geometry.grid import MapGrid
+from photoplan.io.fingerprint import fingerprint
 from photoplan.io.project.model import Project
 from photoplan.io.run_record import run_key
 from photoplan.matching.facets.reconstruct import Scheme
@@ -20,12 +21,10 @@ from photoplan.plain import pick
 from photoplan.products.orthophoto.look import extent_text
 from photoplan.products.surface.begin import start_apart
 from photoplan.products.surface.scheme import scheme_of
-from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start, number
-from photoplan.products.surface.target import SeenTarget, frame_of, over_frame, over_map, seen_part
+from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start
+from photoplan.products.surface.target import SeenTarget, frame_of, over_frame, over_map, seen_places
 from photoplan.project.scenes import ScenesAddress
 
-#: Side of a tile of heights; those of grey values are as many times larger as they are finer.
-TILE = 336
 #: Height facets are at least so many ground pixels of the images.
 _FINEST = 1.0
 #: Part of stated bounds that two images see, below which it is told: there are no heights elsewhere.
@@ -49,6 +48,8 @@ class SurfacePlan:
     frame: Frame | None
     """Of the target; None: the map."""
     scheme: Scheme
+    begun: tuple[str, str] | None
+    """Path and content digest of the file of heights with which it begins; None: it begins with none."""
     gsd: float
     """Median ground sampling distance of the images, metres."""
     height_error: float
@@ -59,6 +60,8 @@ class SurfacePlan:
     """Part of the bounds that lies inside those of what two images see, 0 to 1."""
     parts: dict[str, float]
     """Part of the bounds that each image sees, 0 to 1; one with 0 may still see margins of tiles."""
+    most: int
+    """Images that see the place in the bounds that most see."""
     key: str
     """Hash of all that decides the product."""
 
@@ -66,6 +69,11 @@ class SurfacePlan:
     def address(self) -> ScenesAddress:
         """What its images and the ground are opened by."""
         return ScenesAddress.of(self.project, self.images)
+
+    @property
+    def inputs(self) -> tuple[tuple[str, str], ...]:
+        """Path and content digest of each file that it is made of, that with which it begins among them."""
+        return self.address.digests if self.begun is None else (*self.address.digests, self.begun)
 
     @property
     def axes(self) -> tuple[str, str]:
@@ -197,7 +205,8 @@ def plan_surface(
         raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
     scheme, height_error = scheme_of(settings, looked, grid, frame, gsd)
     apart = 0.0 if frame is not None else start_apart(settings.start, grid.bounds, project.crs, looked)
-    used = tuple(one.name for one in looked)
+    places = {one.name: seen_places(one, grid.bounds) for one in looked}
+    used, file = tuple(one.name for one in looked), settings.start_file
     return SurfacePlan(
         project=project,
         settings=settings,
@@ -206,11 +215,13 @@ def plan_surface(
         grid=grid,
         frame=frame,
         scheme=scheme,
+        begun=None if file is None else (str(file.resolve()), fingerprint(file).digest),
         gsd=gsd,
         height_error=height_error,
         apart=apart,
         seen_share=seen_share,
-        parts={one.name: seen_part(one, grid.bounds) for one in looked},
+        parts={name: float(seen.mean()) for name, seen in places.items()},
+        most=int(np.sum(list(places.values()), axis=0).max()),
         key=_key(project, used, settings, scheme=scheme, grid=grid, frame=frame),
     )
 
@@ -227,8 +238,8 @@ def _key(project: Project, images: tuple[str, ...], settings: SurfaceSettings, *
     """What all decides about heights: files, what the project says of the images, settings."""
     address = ScenesAddress.of(project, images)
     files = [Path(path) for path, _ in address.digests]
-    if settings.start != "terrain" and number(settings.start) is None:
-        files.append(Path(settings.start))
+    if settings.start_file is not None:
+        files.append(settings.start_file)
     stated |= {"settings": replace(settings, points=()), "facts": address.facts}
     return run_key("surface", stated, files)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -25,8 +24,8 @@ from photoplan.plain import pick
 from photoplan.plan.tiles import Tiles
 from photoplan.products.run import Run, refuse_inputs
 from photoplan.products.surface.findings import findings
-from photoplan.products.surface.job import SurfaceJob
-from photoplan.products.surface.plan import TILE, SurfacePlan
+from photoplan.products.surface.job import TILE, SurfaceJob
+from photoplan.products.surface.plan import SurfacePlan
 from photoplan.products.surface.spread import median
 from photoplan.project.scene import input_files
 
@@ -128,14 +127,16 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
         scheme=plan.scheme,
         start=plan.settings.start,
         residuals=plan.settings.residuals,
+        begun=plan.begun,
         frame=plan.frame,
         bands=plan.settings.bands,
-        seen=min(len(plan.images), math.ceil(sum(plan.parts.values())) + 1),
+        seen=plan.most,
     )
     run.check(job.bytes)
     paths = outputs(folder, plan)
     written = [*paths.values(), *plan.settings.points]
-    refuse_inputs(input_files(plan.project), written)
+    inputs = [Path(path) for path, _ in plan.inputs]
+    refuse_inputs([*input_files(plan.project), *inputs], written)
     if len({path.resolve() for path in written}) < len(written):
         raise UsageError(f"points {', '.join(map(str, plan.settings.points))}: one file twice; give each its own name")
     for path in written:
@@ -144,7 +145,7 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
         make_folder(place)
     tiles = Tiles.every(plan.grid.window, TILE)
     run.events.begin("tiles", len(tiles))
-    with run.runner((Path(path) for path, _ in plan.address.digests), folder, job.bytes) as runner:
+    with run.runner(inputs, folder, job.bytes) as runner:
         files = _files(plan, paths, run)
         work = Work(
             name=plan.settings.name,
@@ -175,7 +176,7 @@ def _files(plan: SurfacePlan, paths: dict[str, Path], run: Run) -> dict[str, Pro
             run_key=plan.key,
             tile=side,
             overwrite=run.overwrite,
-            inputs=[file for file, _ in plan.address.digests],
+            inputs=[file for file, _ in plan.inputs],
             threads=run.workers,
             resampling="mode" if kind == "count" else "average",
             form=ImageForm(descriptions=names, units=(unit,) if unit else ()),
@@ -206,7 +207,7 @@ def _complete(
         write_run_record(
             heights.path,
             key=plan.key,
-            inputs=[input_entry(path, digest) for path, digest in plan.address.digests],
+            inputs=[input_entry(path, digest) for path, digest in plan.inputs],
             run=ran,
             kind="surface",
             product=result,

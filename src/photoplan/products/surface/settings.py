@@ -51,6 +51,11 @@ class SurfaceSettings:
         """What images see, as messages call it."""
         return "ground" if self.target == "map" else "target"
 
+    @property
+    def start_file(self) -> Path | None:
+        """The file of heights with which it begins, if it begins with one."""
+        return None if self.start == "terrain" or number(self.start) is not None else Path(self.start)
+
 
 def check_start(project: Project, settings: SurfaceSettings) -> None:
     """Refuse a start that is none.

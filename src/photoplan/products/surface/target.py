@@ -73,11 +73,11 @@ class SeenTarget:
     """Its mean ground sampling distance, metres."""
 
 
-def seen_part(one: SeenTarget, bounds: Bounds) -> float:
-    """Part of the bounds that an image sees on the mean of its heights, by a lattice of points, 0 to 1."""
+def seen_places(one: SeenTarget, bounds: Bounds) -> NDArray[np.bool_]:
+    """Which points of a lattice over the bounds, the same for all, an image sees on the mean of its heights."""
     u, v = (bounds[k] + (bounds[k + 2] - bounds[k]) * (np.arange(_POINTS) + 0.5) / _POINTS for k in (0, 1))
     at = project_points(one.camera, np.stack([*np.meshgrid(u, v), np.full((_POINTS,) * 2, sum(one.heights) / 2)], -1))
-    return float(_inside(one.camera, at).mean())
+    return _inside(one.camera, at)
 
 
 def _inside(camera: Camera, at: NDArray[np.float64]) -> NDArray[np.bool_]:
