@@ -128,6 +128,27 @@ def test_what_is_compiled_is_loaded_without_the_compiler_s_libraries(tmp_path):
         assert talk.stdout.split() == ["[1.", "1.]", str(compiles)]
 
 
+class Old:
+    """A class of types of a kernel, which another version of the package does not have."""
+
+
+@pytest.mark.skipif(not numba_parts.USABLE, reason="nothing is compiled, or by numba's documented ways")
+def test_what_was_kept_by_another_version_or_is_damaged_is_compiled_again(tmp_path, monkeypatch):
+    kept = numba_parts._Index(str(tmp_path), "kernel", ("sources", 0))
+    kept.save(Old, "code")
+    assert kept.load(Old) == "code"
+    with monkeypatch.context() as without:
+        without.delattr(sys.modules[__name__], "Old")
+        assert kept.load(int) is None
+        kept.save(int, "new")
+    assert kept.load(int) == "new" and kept.load(Old) is None
+    for path in tmp_path.glob("kernel*"):
+        path.write_bytes(path.read_bytes()[:-3])
+        assert kept.load(int) is None
+        kept.save(int, "new")
+        assert kept.load(int) == "new"
+
+
 def test_is_compiled_knows_all_kinds():
     for dtype in ("uint8", "float32"):
         for bands in (1, 3):

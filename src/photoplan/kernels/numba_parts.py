@@ -24,7 +24,7 @@ from numba.extending import intrinsic
 try:
     from llvmlite import ir
     from numba.core import cgutils
-    from numba.core.caching import FunctionCache
+    from numba.core.caching import FunctionCache, IndexDataCacheFile
     from numba.core.runtime import rtsys
 except ImportError:
     _FOUND = False
@@ -94,13 +94,37 @@ class _Kept(FunctionCache if USABLE else object):  # type: ignore[misc]
             return self._load_overload(sig, target_context)
 
 
+class _Index(IndexDataCacheFile if USABLE else object):  # type: ignore[misc]
+    """What is kept of a kernel. What cannot be read is not there: a file that is damaged, or names a class of before.
+
+    Numba reads all of an index before it asks whether the sources are the same, and ends with what goes wrong then.
+    """
+
+    def load(self, key: Any) -> Any:
+        try:
+            return super().load(key)
+        except OSError:
+            raise
+        except Exception:
+            return None
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()
+        except OSError:
+            raise
+        except Exception:
+            return {}
+
+
 def keep(dispatcher: Any) -> None:
     """Keep a kernel on the disk as long as its sources are the same; another numba follows its own rules."""
     if not USABLE:
         dispatcher.enable_caching()
         return
-    dispatcher._cache = _Kept(dispatcher.py_func)
-    dispatcher._cache._cache_file._source_stamp = stamp(dispatcher.py_func.__code__.co_filename)
+    cache = dispatcher._cache = _Kept(dispatcher.py_func)
+    own = stamp(dispatcher.py_func.__code__.co_filename)
+    cache._cache_file = _Index(cache._cache_path, cache._impl.filename_base, own)
 
 
 def is_cached(dispatcher: Any, signature: tuple[Any, ...]) -> bool:
