@@ -22,8 +22,9 @@ from photoplan.products.orthophoto.look import extent_text
 from photoplan.products.surface.begin import start_apart
 from photoplan.products.surface.scheme import scheme_of
 from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start
-from photoplan.products.surface.target import SeenTarget, frame_of, over_frame, over_map, seen_places
+from photoplan.products.surface.target import SeenTarget, over_frame, over_map, seen_places
 from photoplan.project.scenes import ScenesAddress
+from photoplan.project.target_frame import target_frame
 
 #: Height facets are at least so many ground pixels of the images.
 _FINEST = 1.0
@@ -185,7 +186,7 @@ def plan_surface(
         raise UsageError(f"images {', '.join(names)}: heights need two images at least")
     check_start(project, settings)
     events.begin("planning", len(names), "images")
-    frame, own = frame_of(project, settings.target)
+    frame, own = target_frame(project, settings.target)
     if frame is None:
         looked, blind = over_map(project, names, force, events)
     else:

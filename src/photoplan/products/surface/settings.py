@@ -26,7 +26,7 @@ class SurfaceSettings:
     """Distance of the height posts, metres."""
     target: str = "map"
     """What heights are over: `map`, `wall:X,Y,Z,AZIMUTH[,TILT]`, `vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`,
-    `column:X,Y,Z,AZIMUTH,RADIUS` or `image:NAME[,DISTANCE]`, see `frame_of`."""
+    `column:X,Y,Z,AZIMUTH,RADIUS` or `image:NAME[,DISTANCE]`, see `photoplan.project.target_frame`."""
     bounds: Bounds | None = None
     """xmin, ymin, xmax, ymax; None: all that two images see, or the image that is the target; others need them."""
     start: str = "terrain"

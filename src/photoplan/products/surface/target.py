@@ -1,8 +1,7 @@
-"""What a surface lies over: a map, a wall, or what an image sees; and which images see it."""
+"""Which images see a target of a surface, and what of it."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,50 +11,19 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Camera
 from photoplan.cameras.base import project as project_points
 from photoplan.cameras.framed import FramedCamera
-from photoplan.errors import GeometryError, UsageError
+from photoplan.errors import GeometryError
 from photoplan.events import Events
-from photoplan.geometry.bounds import HIGHEST_FLIGHT, area_fault, odd_place
 from photoplan.geometry.cylinder import CylinderFrame
-from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
+from photoplan.geometry.frames import Frame, ImageFrame
 from photoplan.io.project.model import Project
-from photoplan.plan.footprint import image_border
 from photoplan.products.orthophoto.look import look_at
 from photoplan.products.surface.settings import Bounds
-from photoplan.project.scene import Scene, map_order, open_scene
+from photoplan.project.scene import map_order, open_scene
 
 #: Points along a side of a target that are projected to see which images show it.
 _POINTS = 33
-#: Metres over which an image's projection is taken apart; from a straight line it differs by less than this part.
-_APART, _STRAIGHT = 1024.0, 1e-6
-#: Nearest of what an image shows, metres.
-_NEAR = 0.001
 #: Metres by which a place of a target lies beside a ray that meets it.
 _SAME = 1e-3
-_FORMS = (
-    "`map`, `wall:X,Y,Z,AZIMUTH[,TILT]`, `vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`, `column:X,Y,Z,AZIMUTH,RADIUS` or "
-    "`image:NAME[,DISTANCE]`"
-)
-#: Radii of vaults and columns, metres.
-_RADII = (0.01, 10_000.0)
-#: How many numbers each target has; what they are.
-_NUMBERS = {
-    "wall": (
-        (4, 5),
-        "`wall:X,Y,Z,AZIMUTH[,TILT]`: a point of the wall in the project's CRS, the azimuth of its outward normal from "
-        "north by east (-360 to 360), and by how much that is raised (-90 to 90), degrees",
-    ),
-    "vault": (
-        (5, 6),
-        "`vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`: a point of its axis in the project's CRS, the azimuth of the axis from "
-        f"north by east (-360 to 360), the radius ({_RADII[0]:g} to {_RADII[1]:g} m), and by how much the axis rises "
-        "(-90 to 90), degrees",
-    ),
-    "column": (
-        (5, 5),
-        "`column:X,Y,Z,AZIMUTH,RADIUS`: a point of its axis in the project's CRS, the azimuth that its middle faces, "
-        f"from north by east (-360 to 360), and the radius ({_RADII[0]:g} to {_RADII[1]:g} m)",
-    ),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,97 +112,3 @@ def over_frame(
             f"all images stand behind the target at the height {height:g}: {helps}\n  " + "\n  ".join(blind[:12])
         )
     return [seen[name] for name in names if name in seen], blind
-
-
-def _straight(scene: Scene, name: str) -> Camera:
-    """The camera of a scene, whose rays are straight on the ground and meet in a point, so that a target can follow it.
-
-    Raises
-    ------
-    GeometryError
-        They are not, or do not.
-    """
-    camera = scene.camera
-    try:
-        camera.rays(np.zeros((1, 2)))
-    except UsageError:
-        way = "it is a line or satellite image; choose another one"
-        if camera.vantage.central:
-            way = 'state earth_curvature = "none" and no refraction in [orientation]; so near neither counts'
-        raise GeometryError(
-            f"image {name!r}: its rays are not straight on the ground, so that no surface lies along it: {way}"
-        ) from None
-    return camera
-
-
-def frame_of(project: Project, text: str) -> tuple[Frame | None, Bounds | None]:
-    """The frame of a target as a user states it, and the bounds that it has by itself; None: it is the map, has none.
-
-    Raises
-    ------
-    UsageError
-        It is none, or says too little.
-    GeometryError, InputError
-        Of an image: it cannot be a target, or cannot be opened.
-    """
-    kind, _, rest = text.partition(":")
-    if text == "map":
-        return None, None
-    if kind in _NUMBERS:
-        numbers = _numbers(rest)
-        counts, form = _NUMBERS[kind]
-        more = numbers[4:] if kind == "wall" else numbers[5:]
-        good = len(numbers) in counts and abs(numbers[3]) <= 360 and abs(sum(more)) <= 90
-        if not good or (kind != "wall" and not _RADII[0] <= numbers[4] <= _RADII[1]):
-            raise UsageError(f"target {text}: give {form}")
-        x, y, z, *others = numbers
-        odd = odd_place((x, y, z), camera=False) or area_fault(project.crs, (x, y))
-        if odd is not None:
-            raise UsageError(f"target {text}: {odd}")
-        if kind == "wall":
-            return WallFrame.facing((x, y, z), *others), None
-        make = CylinderFrame.vault if kind == "vault" else CylinderFrame.column
-        return make((x, y, z), *others), None
-    if kind != "image" or not rest:
-        raise UsageError(f"target {text}; give {_FORMS}")
-    name, _, last = rest.rpartition(",")
-    if not name or any(image.name == rest for image in project.images):
-        return _along(project, rest, None, text)
-    return _along(project, name, next(iter(_numbers(last)), math.nan), text)
-
-
-def _numbers(text: str) -> list[float]:
-    """Finite numbers between commas; none if any of them is none."""
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        return []
-    return numbers if all(math.isfinite(n) for n in numbers) else []
-
-
-def _along(project: Project, name: str, distance: float | None, text: str) -> tuple[Frame, Bounds]:
-    """The frame of an image, and the bounds of its picture."""
-    scene = open_scene(project, project.any_image(name).name)
-    camera = _straight(scene, name)
-    center = camera.vantage.point
-    # Of a camera in a plane picture (x·w, y·w, w) are linear in XYZ, and w is the depth.
-    L, twice = (camera.project_homogeneous(center + length * np.eye(3)).T / length for length in (_APART, _APART / 2))
-    if not (np.isfinite(L).all() and np.abs(L - twice).max() <= _STRAIGHT * np.abs(L).max()):
-        raise GeometryError(f"target {text}: a fisheye image of more than 126° lies in no plane; choose another one")
-    normal = -L[2] / np.linalg.norm(L[2])
-    right = L[0] - (L[0] @ normal) * normal
-    right /= np.linalg.norm(right)
-    axes = np.array([right, np.cross(normal, right), normal])
-    if distance is None:
-        low, high = scene.footprint.height_range
-        distance = float((center[2] - (low + high) / 2) / normal[2]) if normal[2] > 0 else math.nan
-        if not _NEAR <= distance <= HIGHEST_FLIGHT:
-            raise UsageError(f"target {text}: the axis of the image meets no terrain; say `image:{name},DISTANCE`")
-    if not _NEAR <= distance <= HIGHEST_FLIGHT:
-        raise UsageError(
-            f"target {text}: give a distance from {_NEAR:g} to {HIGHEST_FLIGHT:g} m: `image:NAME,DISTANCE`"
-        )
-    frame = ImageFrame(tuple(center.tolist()), tuple(map(tuple, axes.tolist())), distance)  # type: ignore[arg-type]
-    p = camera.rays(image_border(camera.size))[1] @ axes.T
-    uv = p[:, :2] / np.where(p[:, 2:] < 0, -p[:, 2:], np.nan) * distance
-    return frame, (*np.nanmin(uv, axis=0).tolist(), *np.nanmax(uv, axis=0).tolist())
