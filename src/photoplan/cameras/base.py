@@ -217,6 +217,16 @@ def project(projection: Projection, XYZ: ArrayLike) -> NDArray[np.float64]:
     return ideal if projection.field is None else projection.field(ideal)
 
 
+def on_level(camera: Camera, xy: ArrayLike, level: float) -> NDArray[np.float64]:
+    """Where rays of image points (n, 2) go down to a level, (n, 3); NaN where they do not."""
+    origin, direction = camera.rays(xy, level)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (level - origin[:, 2:]) / direction[:, 2:]
+        # Rays that have no common centre may begin below a level.
+        down = (direction[:, 2:] < 0) & ((t > 0) | (not camera.vantage.central))
+        return np.where(down, origin + t * direction, np.nan)
+
+
 def tremor_of(projection: Projection) -> Tremor | None:
     """What of it changes from line to line; None: nothing does."""
     breaks = projection.breaks

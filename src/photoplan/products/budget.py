@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import Camera, on_level
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.project.file import load_project, parse_project
@@ -245,7 +245,7 @@ def _of_image(
     xy = np.array([tuple(far), *edges, *corners])
     columns, rows = np.meshgrid(np.linspace(0, w - 1, _MAP), np.linspace(0, h - 1, _MAP))
     every = np.concatenate([xy, np.stack([columns.ravel(), rows.ravel()], axis=1)])
-    XY = _on_level(camera, every, level)
+    XY = on_level(camera, every, level)[:, :2]
     sigma = heights.sigmas(XY)
     sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma) if np.isfinite(sigma).any() else np.nan)
     parts: dict[str, NDArray[np.float64]] = {}
@@ -284,14 +284,6 @@ def _level(camera: Camera, ground: Ground, name: str) -> float:
             f"image {name!r}: the ground below it is at {height:.0f} m, the camera at {camera.vantage.point[2]:.0f}"
         )
     return height
-
-
-def _on_level(camera: Camera, xy: NDArray[np.float64], level: float) -> NDArray[np.float64]:
-    """Where image points lie on a level, (n, 2); NaN where they do not."""
-    origin, direction = camera.rays(xy, level)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = np.where(direction[:, 2] < 0, (level - origin[:, 2]) / direction[:, 2], np.nan)
-    return np.asarray((origin + along[:, None] * direction)[:, :2])
 
 
 def _level_figures(

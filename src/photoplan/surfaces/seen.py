@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.cameras.base import CentralCamera
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.geometry.rotation import dot
@@ -30,6 +32,10 @@ _STRETCH = 1.01
 _HALVES = (0.5, 0.0), (0.0, 0.5)
 #: Cosine of the flattest incidence that sizes of pixels know.
 _EDGE_ON = 1e-6
+#: Places of shadows are lifted by this, metres, and part of their distance from the eye.
+_LIFT, _LIFT_PART = 0.02, 1e-6
+#: A photo shows a place if what is met first on its ray is no nearer than the place by more than this, of its distance.
+_SAME = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +133,21 @@ class SeenSurface:
             lost=(hits.owner < 0) & (ways[:, 2] < 0),
         )
 
+    def in_shadow(self, target: ViewTarget, seen: Seen, sun: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Pixels whose ground looks away from the sun, in a direction (3,), or that something stands before."""
+        dark = seen.normal @ sun <= 0
+        ask = np.flatnonzero((~dark & (seen.owner >= 0)).ravel())
+        start = seen.XYZ.reshape(-1, 3)[ask]
+        start = start + np.array([0, 0, 1.0]) * (_LIFT + _LIFT_PART * target.distance(seen.uvh).ravel()[ask, None])
+        away = 50_000.0
+        if self.bounds is not None:
+            xmin, ymin, xmax, ymax = self.bounds
+            away = float(np.hypot(xmax - xmin, ymax - ymin))
+        length = min(away / max(float(np.hypot(sun[0], sun[1])), 1e-6), 20_000 / max(float(sun[2]), 1e-6))
+        hits = self.terrain.first_hit(np.stack([start, start + length * sun], axis=1))
+        dark.ravel()[ask[np.isfinite(hits.along)]] = True
+        return np.asarray(dark)
+
     def _by_columns(self, terrain: RasterSurface, target: ViewTarget, window: Window) -> Seen | None:
         """What pixels show, by profiles; None: they are of no use here."""
         reach = self._reach(target)
@@ -192,3 +213,50 @@ def pixel_size(target: ViewTarget, uvh: NDArray[np.float64]) -> NDArray[np.float
 def ground_size(target: ViewTarget, seen: Seen) -> NDArray[np.float64]:
     """Side of a square of the area that each pixel covers on what it shows, metres; NaN: sky; edge-on very large."""
     return np.asarray(pixel_size(target, seen.uvh) / np.sqrt(np.maximum(np.cos(seen.incidence), _EDGE_ON)))
+
+
+def best_photos(cameras: Sequence[CentralCamera], seen: Seen, surface: SeenSurface) -> NDArray[np.uint16]:
+    """The camera, counted from one, that sees the ground of each pixel best; 0: none sees it.
+
+    Best is the one that is nearest, counted in its own pixels: the pixel in its middle, at that distance, is smallest.
+
+    Parameters
+    ----------
+    cameras : sequence of CentralCamera
+    seen : Seen
+        Shape (height, width, …).
+    surface : SeenSurface
+        What may be in the way.
+    """
+    shape = seen.owner.shape
+    there = np.flatnonzero(seen.owner.ravel() >= 0)
+    flat = {name: getattr(seen, name).reshape(-1, 3)[there] for name in ("XYZ", "normal")}
+    targets = [ViewTarget.of_camera(camera) for camera in cameras]
+    size = np.full((len(cameras), len(there)), np.inf)
+    places: list[NDArray[np.float64]] = []
+    for row, target in enumerate(targets):
+        uvh = target.to_view(flat["XYZ"])
+        places.append(uvh)
+        half = np.array(target.bundle.size) / 2
+        inside = (uvh[:, 2] > 0) & (np.abs(uvh[:, :2] + 0.5 - half) < half).all(axis=1)
+        # By the distance alone: sizes on slopes change from mesh to mesh, and each photo shall paint a region.
+        way = target.center - flat["XYZ"][inside]
+        faces = (flat["normal"][inside] * way).sum(axis=1) > 0
+        middle = pixel_size(target, np.append(half - 0.5, 1.0))
+        size[row, inside] = np.where(faces, middle * np.linalg.norm(way, axis=1), np.inf)
+    asked = np.zeros(size.shape, bool)
+    while True:
+        best = np.argmin(size, axis=0)
+        open_ = np.isfinite(size[best, np.arange(len(there))]) & ~asked[best, np.arange(len(there))]
+        if not open_.any():
+            break
+        for row in np.unique(best[open_]).tolist():
+            at = np.flatnonzero(open_ & (best == row))
+            uvh = places[row][at]
+            found = surface.at(targets[row], uvh[:, :2]).uvh[:, 2]
+            asked[row, at] = True
+            size[row, at[found < uvh[:, 2] * (1 - _SAME)]] = np.inf
+    owner = np.zeros(shape, np.uint16)
+    seen_by = np.isfinite(size.min(axis=0, initial=np.inf))
+    owner.reshape(-1)[there[seen_by]] = best[seen_by] + 1
+    return owner

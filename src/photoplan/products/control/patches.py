@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from photoplan.cameras.base import on_level
 from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
@@ -110,12 +111,8 @@ def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
         level = sum(scene.footprint.height_range) / 2
     if not np.isfinite(level):
         return None
-    origin, direction = camera.rays(image_border(camera.size), level)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = (level - origin[:, 2]) / direction[:, 2]
-        foot = origin[:, :2] + t[:, None] * direction[:, :2]
-    foot = foot[np.isfinite(foot).all(axis=1) & (direction[:, 2] < 0) & (t > 0)]
-    area = shapely.convex_hull(shapely.MultiPoint(foot))
+    foot = on_level(camera, image_border(camera.size), level)[:, :2]
+    area = shapely.convex_hull(shapely.MultiPoint(foot[np.isfinite(foot).all(axis=1)]))
     if scene.ground.bounds is not None:
         area = area.intersection(shapely.box(*scene.ground.bounds))
     return (area, camera.size) if area.area > 0 else None

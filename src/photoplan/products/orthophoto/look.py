@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import Camera, on_level
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import Events
 from photoplan.geometry.grid import refuse_absurd
@@ -154,11 +154,9 @@ def _sees_no_terrain(scene: Scene, name: str) -> str:
     level = some_height(scene.ground.bare, bounds, x, y)
     if not (vantage.central or vantage.floor < level < z):
         level = (vantage.floor + z) / 2
-    origin, direction = scene.camera.rays(image_border(scene.camera.size), level)
-    down = (direction[:, 2] < 0) & ((origin[:, 2] > level) | (not vantage.central))
-    if down.any():
-        foot = origin[down] + direction[down] * ((level - origin[down, 2]) / direction[down, 2])[:, None]
-        (xmin, ymin), (xmax, ymax) = foot[:, :2].min(axis=0), foot[:, :2].max(axis=0)
+    foot = on_level(scene.camera, image_border(scene.camera.size), level)[:, :2]
+    if np.isfinite(foot).any():
+        (xmin, ymin), (xmax, ymax) = np.nanmin(foot, axis=0), np.nanmax(foot, axis=0)
         looks = f"looks at {extent_text((xmin, ymin, xmax, ymax))} on the level {level:.0f}"
     else:
         looks = f"does not look down to the level {level:.0f}"

@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Projection
+from photoplan.cameras.base import CentralCamera, Projection
 from photoplan.cameras.build import taken_apart
 from photoplan.cameras.map import MapProjection
 from photoplan.engine.base import Reader, Source
@@ -30,7 +30,7 @@ from photoplan.plan.tiles import Tile, Tiles
 from photoplan.products.view.ground import ViewGround
 from photoplan.project.scene import open_scene
 from photoplan.surfaces.base import Surface
-from photoplan.surfaces.seen import Seen, SeenSurface, pixel_size
+from photoplan.surfaces.seen import Seen, SeenSurface, best_photos
 from photoplan.targets.base import Target
 from photoplan.targets.view import ViewTarget
 from photoplan.terrain.shading import RAMPS, Lighting, Ramp, built_in_ramp, shaded
@@ -40,8 +40,6 @@ SLOPES = Ramp(
     np.array([0.0, 10, 20, 30, 45]),
     np.array([(255, 255, 212), (254, 217, 142), (254, 153, 41), (204, 76, 2), (120, 30, 10)], float),
 )
-#: A photo shows a place if what is met first on its ray is no nearer than the place by more than this, of its distance.
-_SAME = 1e-4
 #: Longer sides of the reduced image from which the range of grey values is taken, pixels.
 _LOOKED = 512
 _PERCENT = (2.0, 98.0)
@@ -185,7 +183,8 @@ class Resampled:
         rows, window = tuple(range(len(self.sources))), scene.tile.window
         owners = None
         if self.photos:
-            owner = best_photos([source.camera for source in self.sources], scene.seen, scene.surface)
+            photos = [cast("CentralCamera", source.camera) for source in self.sources]
+            owner = best_photos(photos, scene.seen, scene.surface)
             owners = _Given(window, owner)
         tiles = Tiles(window, max(window.width, window.height), np.zeros(1, np.uint32), rows)
         plan = ProductPlan(
@@ -207,53 +206,6 @@ class _Given:
     def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
         """See `Ownership`."""
         return Share(self.owner[ground.window.slices(self.window)])
-
-
-def best_photos(cameras: Sequence[Any], seen: Seen, surface: SeenSurface) -> NDArray[np.uint16]:
-    """The camera, counted from one, that sees the ground of each pixel best; 0: none sees it.
-
-    Best is the one that is nearest, counted in its own pixels: the pixel in its middle, at that distance, is smallest.
-
-    Parameters
-    ----------
-    cameras : sequence of CentralCamera
-    seen : Seen
-        Shape (height, width, …).
-    surface : SeenSurface
-        What may be in the way.
-    """
-    shape = seen.owner.shape
-    there = np.flatnonzero(seen.owner.ravel() >= 0)
-    flat = {name: getattr(seen, name).reshape(-1, 3)[there] for name in ("XYZ", "normal")}
-    targets = [ViewTarget.of_camera(camera) for camera in cameras]
-    size = np.full((len(cameras), len(there)), np.inf)
-    places: list[NDArray[np.float64]] = []
-    for row, target in enumerate(targets):
-        uvh = target.to_view(flat["XYZ"])
-        places.append(uvh)
-        half = np.array(target.bundle.size) / 2
-        inside = (uvh[:, 2] > 0) & (np.abs(uvh[:, :2] + 0.5 - half) < half).all(axis=1)
-        # By the distance alone: sizes on slopes change from mesh to mesh, and each photo shall paint a region.
-        way = target.center - flat["XYZ"][inside]
-        faces = (flat["normal"][inside] * way).sum(axis=1) > 0
-        middle = pixel_size(target, np.append(half - 0.5, 1.0))
-        size[row, inside] = np.where(faces, middle * np.linalg.norm(way, axis=1), np.inf)
-    asked = np.zeros(size.shape, bool)
-    while True:
-        best = np.argmin(size, axis=0)
-        open_ = np.isfinite(size[best, np.arange(len(there))]) & ~asked[best, np.arange(len(there))]
-        if not open_.any():
-            break
-        for row in np.unique(best[open_]).tolist():
-            at = np.flatnonzero(open_ & (best == row))
-            uvh = places[row][at]
-            found = surface.at(targets[row], uvh[:, :2]).uvh[:, 2]
-            asked[row, at] = True
-            size[row, at[found < uvh[:, 2] * (1 - _SAME)]] = np.inf
-    owner = np.zeros(shape, np.uint16)
-    seen_by = np.isfinite(size.min(axis=0, initial=np.inf))
-    owner.reshape(-1)[there[seen_by]] = best[seen_by] + 1
-    return owner
 
 
 def illumination(normal: NDArray[np.float64], light: Lighting) -> NDArray[np.float32]:

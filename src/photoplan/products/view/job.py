@@ -22,13 +22,9 @@ from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.overlay import Overlay
 from photoplan.products.view.photo import PhotoRequest, ViewPhoto
 from photoplan.products.view.stereo import anaglyph
-from photoplan.surfaces.rays import Hits
 from photoplan.surfaces.seen import Seen, SeenSurface, ground_size
 from photoplan.targets.view import Bundle, ViewTarget
 from photoplan.terrain.shading import Lighting
-
-#: Places of shadows are lifted by this, metres, and part of their distance from the eye.
-_LIFT, _LIFT_PART = 0.02, 1e-6
 
 Colour = tuple[int, int, int]
 
@@ -246,7 +242,7 @@ def colours_of(scene: ViewScene, view: OpenView, look: LookRequest) -> Colours:
         opacity = np.float32(1.0 if request.kind == "shade" and k else request.opacity)
         out = np.where(there, out + opacity * (over - out), out)
     if look.shadows:
-        dark = in_shadow(scene, view.light)
+        dark = scene.surface.in_shadow(scene.target, seen, view.light.directions[0])
         out = np.where(dark, out * 0.45, out)
     if look.haze:
         out = hazy(out, scene.target.distance(seen.uvh), look.haze, look.haze_colour)
@@ -258,24 +254,6 @@ def hazy(colours: Colours, distance: NDArray[np.float64], alpha: float, horizon:
     """Colours at a distance, metres, through haze (Ecker 1991, eq. 5.8, after Kuhn 1989); α per kilometre."""
     left = np.exp(-alpha * np.nan_to_num(distance) / 1000).astype(np.float32)
     return np.asarray(colours * left + np.array(horizon, np.float32)[:, None, None] * (1 - left))
-
-
-def in_shadow(scene: ViewScene, light: Lighting) -> NDArray[np.bool_]:
-    """Pixels whose ground looks away from the sun, or that something stands before."""
-    seen, sun = scene.seen, light.directions[0]
-    dark = seen.normal @ sun <= 0
-    ask = np.flatnonzero((~dark & (seen.owner >= 0)).ravel())
-    start = seen.XYZ.reshape(-1, 3)[ask]
-    start = start + np.array([0, 0, 1.0]) * (_LIFT + _LIFT_PART * scene.target.distance(seen.uvh).ravel()[ask, None])
-    surface = scene.surface
-    away = 50_000.0
-    if surface.bounds is not None:
-        xmin, ymin, xmax, ymax = surface.bounds
-        away = float(np.hypot(xmax - xmin, ymax - ymin))
-    length = min(away / max(float(np.hypot(sun[0], sun[1])), 1e-6), 20_000 / max(float(sun[2]), 1e-6))
-    hits: Hits = surface.terrain.first_hit(np.stack([start, start + length * sun], axis=1))
-    dark.ravel()[ask[np.isfinite(hits.along)]] = True
-    return np.asarray(dark)
 
 
 def matrix_bands(target: ViewTarget, seen: Seen) -> Output | None:
