@@ -129,12 +129,14 @@ def test_maps_that_do_not_meet_are_refused(photoplan: Here, tmp_path: Path) -> N
     first = write(tmp_path / "a.tif", **MAP)
     far = write(tmp_path / "far.tif", crs=MAP["crs"], transform=from_origin(600_000.0, 5_300_000.0, 0.5, 0.5))
     other = write(tmp_path / "other.tif", crs="EPSG:25832", transform=MAP["transform"])
+    flat = write(tmp_path / "flat.tif", crs=MAP["crs"], transform=rasterio.Affine(1.0, 1.0, 0.0, 1.0, 1.0, 0.0))
     coarse = write(tmp_path / "coarse.tif", crs=MAP["crs"], transform=from_origin(500_000.0, 5_300_000.0, 2.0, 2.0))
     for second, message in (
         (far, "nothing in common"),
         (other, "gdalwarp -t_srs"),
         (coarse, "0.25 times as large"),
         (first, "is the first image, too"),
+        (flat, "flat.tif: transform"),
         (tmp_path / "none.tif", "none.tif"),
     ):
         said = photoplan("register", first, second, "-o", tmp_path / "v.gpkg")

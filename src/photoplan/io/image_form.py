@@ -8,6 +8,7 @@ from typing import Any
 import rasterio
 import rasterio.enums
 
+from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Placement
 from photoplan.io.gdal import GDAL_ERRORS, gdal_settings, open_raster
 from photoplan.io.raster_info import RasterInfo
@@ -46,11 +47,20 @@ class ImageForm:
 
 
 def placement_of(info: RasterInfo) -> Placement:
-    """Where a file that `read_info` has checked lies."""
+    """Where a file that `read_info` has checked lies.
+
+    Raises
+    ------
+    InputError
+        Its pixels have no area.
+    """
     if info.to_map is None:
         return Placement(info.size, crs=info.crs)
     x0, xx, xy, y0, yx, yy = info.to_map
-    return Placement(info.size, (xx, xy, x0 - (xx + xy) / 2, yx, yy, y0 - (yx + yy) / 2), info.crs)
+    try:
+        return Placement(info.size, (xx, xy, x0 - (xx + xy) / 2, yx, yy, y0 - (yx + yy) / 2), info.crs)
+    except UsageError as error:
+        raise InputError(f"{info.path}: {error}") from None
 
 
 def form_of(info: RasterInfo) -> ImageForm:

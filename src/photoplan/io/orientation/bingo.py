@@ -16,7 +16,6 @@ from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, 
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.orientation.text import angle_block, angle_lines, word_lines
 
-#: Angle unit, rotation, direction.
 KEYWORD = "ORIA"
 #: Characters of an image name that BINGO takes at most (Catalyst's guide on export to BINGO).
 NAME = 15

@@ -15,7 +15,6 @@ from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, 
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.orientation.text import angle_block, angle_lines, word_lines
 
-#: Angle unit, rotation, direction.
 COLUMNS = 7
 #: Characters of a name.
 NAME = 20

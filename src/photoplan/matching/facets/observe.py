@@ -101,6 +101,8 @@ class View:
 
     camera: Camera
     pyramid: Pyramid
+    finer: int = 0
+    """Levels by which its pixels are smaller than usual ones: it takes part reduced by as many more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +157,11 @@ class Sight:
 def look(view: View, level: int, facets: Facets, heights: tuple[float, float]) -> Sight | None:
     """Pixels of a level of a view that may look at a block between two heights, metres; None: there are none."""
     seen = pixels_between(view, level, facets, heights)
-    return None if seen is None else _followed(view.camera, seen[1], seen[0], level, facets, _known(view, heights))
+    return (
+        None
+        if seen is None
+        else _followed(view.camera, seen[1], seen[0], level + view.finer, facets, _known(view, heights))
+    )
 
 
 def pixels_between(
@@ -166,6 +172,7 @@ def pixels_between(
     low, high = _known(view, heights)
     if not low < high:
         return None
+    level += view.finer
     window = _window(view, level, facets, (low, high))
     if window.width < 2 or window.height < 2:
         return None

@@ -224,7 +224,10 @@ def _level(
     grey = np.empty(shape[1:], np.float32)
     for k in range(int(low.min()), int(high.max())):
         if (k - int(low.min())) % _EVERY == 0:
-            ats = [_positions(view, window, level + base, facets, planes, level, k) for view, window, _ in seen]
+            ats = [
+                _positions(view, window, level + base + view.finer, facets, planes, level, k)
+                for view, window, _ in seen
+            ]
         part = (k - int(low.min())) % _EVERY / _EVERY
         active = (low <= k) & (k < high)
         if not active.any():

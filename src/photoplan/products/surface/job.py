@@ -58,8 +58,10 @@ class SurfaceJob:
     """Of the target; None: the map."""
     bands: tuple[int, ...] = ()
     """See `SurfaceSettings.bands`."""
-    seen: int = 0
-    """Images that see the place that most see; 0: all."""
+    finer: tuple[int, ...] = ()
+    """See `SurfacePlan.finer`; empty: none is."""
+    seen: float = 0.0
+    """See `SurfacePlan.most`; 0: all."""
 
     @property
     def part(self) -> int:
@@ -77,11 +79,11 @@ class SurfaceJob:
         residuals = images if self.residuals else 0
         made = 4 * ((2 + residuals) * facets(TILE) + residuals * facets(self.part))
         each = _FACET + _PIXEL * (self.seen or images)
-        return facets(self.part, MARGIN) * each + 2 * _PART**2 * images + made
+        return int(facets(self.part, MARGIN) * each) + 2 * _PART**2 * images + made
 
     def __call__(self, tile: Tile) -> Made:
         """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""
-        views = _views(self.address, self.frame, self.grid.bounds, self.bands)
+        views = _views(self.address, self.finer, self.frame, self.grid.bounds, self.bands)
         start = _start(self.address, self.start, self.begun, self.grid.crs)
         window, m = tile.window, self.scheme.ratio
         shape, finest = (window.height, window.width), (m * window.height, m * window.width)
@@ -126,15 +128,18 @@ class SurfaceJob:
 
 
 @lru_cache(maxsize=2)
-def _views(address: ScenesAddress, frame: Frame | None, bounds: Bounds, bands: tuple[int, ...]) -> tuple[View, ...]:
+def _views(
+    address: ScenesAddress, finer: tuple[int, ...], frame: Frame | None, bounds: Bounds, bands: tuple[int, ...]
+) -> tuple[View, ...]:
     """The images and their pyramids, kept for the next tile; those of products before go."""
     kept = _KEPT // len(address.scenes)
 
-    def view(scene: Scene) -> View:
+    def view(scene: Scene, levels: int) -> View:
         camera = scene.camera if frame is None else FramedCamera(scene.camera, frame, bounds)
-        return View(camera, Pyramid(GreyImage(scene.reader, bands=bands), kept=kept))
+        return View(camera, Pyramid(GreyImage(scene.reader, bands=bands), kept=kept), levels)
 
-    return tuple(view(scene.open()) for scene in address.scenes)
+    levels = finer or (0,) * len(address.scenes)
+    return tuple(view(scene.open(), level) for scene, level in zip(address.scenes, levels, strict=True))
 
 
 @lru_cache(maxsize=4)

@@ -20,7 +20,7 @@ from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.plain import pick
 from photoplan.products.orthophoto.look import extent_text
 from photoplan.products.surface.begin import start_apart
-from photoplan.products.surface.scheme import scheme_of
+from photoplan.products.surface.scheme import finer_levels, scheme_of
 from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start
 from photoplan.products.surface.target import SeenTarget, over_frame, over_map, seen_places
 from photoplan.project.scenes import ScenesAddress
@@ -51,6 +51,8 @@ class SurfacePlan:
     scheme: Scheme
     begun: tuple[str, str] | None
     """Path and content digest of the file of heights with which it begins; None: it begins with none."""
+    finer: tuple[int, ...]
+    """Levels by which each image takes part reduced beyond the scheme, as its pixels are so much smaller than usual."""
     gsd: float
     """Median ground sampling distance of the images, metres."""
     height_error: float
@@ -61,8 +63,8 @@ class SurfacePlan:
     """Part of the bounds that lies inside those of what two images see, 0 to 1."""
     parts: dict[str, float]
     """Part of the bounds that each image sees, 0 to 1; one with 0 may still see margins of tiles."""
-    most: int
-    """Images that see the place in the bounds that most see."""
+    most: float
+    """Images that see the place in the bounds that most see, each counting by how many pixels it has of usual ones."""
     key: str
     """Hash of all that decides the product."""
 
@@ -90,6 +92,8 @@ class SurfacePlan:
     def __str__(self) -> str:
         g, s = self.grid, self.scheme
         reduced = f", images reduced by {2**s.base}" if s.base else ""
+        small = sum(level > 0 for level in self.finer)
+        reduced += f", {small} image{'s' * (small > 1)} with far smaller pixels reduced" if small else ""
         pixels = f"{s.ratio**2} pixel{'s' * (s.ratio > 1)} of each image per height"
         far = f" at {self.frame.distance:.4g} m" if isinstance(self.frame, ImageFrame) else ""
         seeing = sum(part > HARDLY for part in self.parts.values())
@@ -206,7 +210,8 @@ def plan_surface(
         raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
     scheme, height_error = scheme_of(settings, looked, grid, frame, gsd)
     apart = 0.0 if frame is not None else start_apart(settings.start, grid.bounds, project.crs, looked)
-    places = {one.name: seen_places(one, grid.bounds) for one in looked}
+    places, finer = {one.name: seen_places(one, grid.bounds) for one in looked}, finer_levels(looked, gsd)
+    pixels = [(gsd / one.gsd / 2**level) ** 2 for one, level in zip(looked, finer)]
     used, file = tuple(one.name for one in looked), settings.start_file
     return SurfacePlan(
         project=project,
@@ -217,12 +222,13 @@ def plan_surface(
         frame=frame,
         scheme=scheme,
         begun=None if file is None else (str(file.resolve()), fingerprint(file).digest),
+        finer=finer,
         gsd=gsd,
         height_error=height_error,
         apart=apart,
         seen_share=seen_share,
         parts={name: float(seen.mean()) for name, seen in places.items()},
-        most=int(np.sum(list(places.values()), axis=0).max()),
+        most=float(np.sum([n * seen for n, seen in zip(pixels, places.values())], axis=0).max()),
         key=_key(project, used, settings, scheme=scheme, grid=grid, frame=frame),
     )
 

@@ -130,6 +130,7 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
         begun=plan.begun,
         frame=plan.frame,
         bands=plan.settings.bands,
+        finer=plan.finer,
         seen=plan.most,
     )
     run.check(job.bytes)

@@ -37,6 +37,8 @@ _PARALLEL = 1e-4
 _AS_FINE = 0.999
 #: Part of a pixel from which on facets beat with pixels, for so many images of a place that these count little.
 _HARDLY, _MANY = 1.1, 3.5
+#: Part of a level by which pixels may be smaller than half of the usual ones.
+_NEARLY = 0.1
 #: Levels at most.
 _LEVELS = 8
 #: Pixels of parallax of the reach from which on heights are searched; those for which the coarsest level of a search
@@ -80,6 +82,15 @@ def scheme_of(
     coarse = ratio < _HARDLY * pixels / 2**base and _images_of_a_place(looked, grid) < _MANY
     scheme = Scheme(ratio=ratio, coarsest=coarsest, base=base, reach=reach, coarse=coarse, search=search)
     return scheme, height_error
+
+
+def finer_levels(looked: Sequence[SeenTarget], gsd: float) -> tuple[int, ...]:
+    """Levels by which each image is reduced whose pixels are smaller than half of the usual ones of `gsd` metres.
+
+    All of them would take memory and time by their square, and facets hold nothing of what they show. As large as the
+    usual ones they would be sharper than these, which is seen in their residuals.
+    """
+    return tuple(max(0, math.ceil(math.log2(gsd / one.gsd) - _NEARLY) - 1) for one in looked)
 
 
 def _reach(settings: SurfaceSettings, looked: Sequence[SeenTarget], frame: Frame | None, height_error: float) -> float:

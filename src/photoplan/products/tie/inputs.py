@@ -242,9 +242,9 @@ def guide_of(a: TieImage, b: TieImage, xy: NDArray[np.float64]) -> Guide | None:
     return Guide(project(b.camera, a.on_ground(xy)), _SEARCH * float(np.hypot(*b.grey.size)))
 
 
-#: Images whose features are in memory with their descriptors.
 #: Features of an image that are compared to find pairs, those of the largest scale.
 _LARGEST = 800
+#: Images whose features are in memory with their descriptors.
 _IN_MEMORY = 64
 
 
