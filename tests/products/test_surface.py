@@ -18,7 +18,7 @@ from tools.sketched import drawn
 from tools.small_block import X0, Y0, write_image, write_terrain
 
 from photoplan.errors import InputError
-from photoplan.events import listening
+from photoplan.events import SILENT, listening
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.project.file import load_project
 from photoplan.matching.facets.observe import facets_of, look
@@ -28,8 +28,10 @@ from photoplan.products.surface import job as surface_job
 from photoplan.products.surface.findings import findings
 from photoplan.products.surface.job import SurfaceJob
 from photoplan.products.surface.plan import plan_surface
+from photoplan.products.surface.scheme import scheme_of
 from photoplan.products.surface.settings import SurfaceSettings
 from photoplan.products.surface.spread import counted, median
+from photoplan.products.surface.target import over_map
 from photoplan.project.scenes import ScenesAddress
 from photoplan.report import surface as report
 
@@ -130,6 +132,19 @@ def test_grey_values_are_as_fine_as_the_pixels_where_images_are_enough(scene: Sc
     # Where those of few images are hardly finer, or coarser, this is known.
     assert scheme(1.55, "i1", "i2").coarse and scheme(1.45, "i1", "i2").coarse
     assert not scheme(1.55).coarse and not scheme(1.5).coarse and not scheme(1.3, "i1", "i2").coarse
+
+
+def test_coarser_images_leave_fewer_pixels_for_fine_grey_values(scene: Scene) -> None:
+    project, settings = load_project(scene.path), SurfaceSettings(1.55, bounds=BOUNDS)
+    plan = plan_surface(project, settings)
+    looked, _ = over_map(project, plan.images, force=False, events=SILENT)
+
+    def ratio(*times: float) -> int:
+        ones = [replace(one, gsd=time * GSD) for one, time in zip(looked, times)]
+        return scheme_of(settings, ones, plan.grid, None, GSD)[0].ratio
+
+    # Beyond any two images 3, 1.5 and 2.1 pixels of 0.5 m; four facets on 1.55 m need 1.7 of them.
+    assert (ratio(1, 1, 1, 1, 1), ratio(1, 1, 1, 2, 2), ratio(0.5, 0.5, 1, 1, 3)) == (4, 3, 4)
 
 
 def test_a_tile_tells_its_levels_and_how_much_is_done(scene: Scene) -> None:

@@ -15,7 +15,7 @@ from photoplan.geometry.grid import MapGrid
 from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.matching.facets.search import Planes, Search
 from photoplan.products.surface.settings import SurfaceSettings
-from photoplan.products.surface.target import SeenTarget
+from photoplan.products.surface.target import SeenTarget, seen_places
 
 #: Grey facets along a side of a height facet at most: images that are finer still are reduced.
 MOST_RATIO = 6
@@ -70,7 +70,7 @@ def scheme_of(
         The reach goes beyond what there can be.
     """
     pixels = settings.resolution / gsd
-    ratio, base = _facets(pixels, MOST_RATIO, _images_of_a_place(looked, grid))
+    ratio, base = _facets(pixels, MOST_RATIO, _pixels_beyond_two(looked, grid, gsd))
     height_error, usual = _heights_of_a_pixel(looked, gsd)
     reach = _reach(settings, looked, frame, height_error)
     coarsest, search = _coarsest(reach, looked, height_error, base), None
@@ -149,18 +149,27 @@ def _flying_height(looked: Sequence[SeenTarget]) -> float:
     return float(np.median(heights))
 
 
-def _facets(pixels: float, most: int, images: float = 0.0) -> tuple[int, int]:
+def _facets(pixels: float, most: int, others: float = 0.0) -> tuple[int, int]:
     """Facets along a height facet of so many pixels, and the level of the images whose pixels are as large as they.
 
     Facets are no coarser than pixels where so many images see a place that any two, which tell its height, leave a
-    pixel for each facet to the others: coarser ones do not hold what pixels show, which moves heights over whole
-    stretches where pixels drift along the facets. Of three images, slopes and finer grey values mix.
+    pixel for each facet to the others, which have `others` pixels for a usual one: coarser ones do not hold what pixels
+    show, which moves heights over whole stretches where pixels drift along the facets. Of three images, slopes and
+    finer grey values mix.
     """
     base = max(0, math.ceil(math.log2(pixels / most)))
     pixels /= 2**base
     ratio = max(1, round(pixels))
-    finer = ratio < _AS_FINE * pixels and (images - 2) * (pixels / (ratio + 1)) ** 2 >= 1
+    finer = ratio < _AS_FINE * pixels and others * (pixels / (ratio + 1)) ** 2 >= 1
     return ratio + finer, base
+
+
+def _pixels_beyond_two(looked: Sequence[SeenTarget], grid: MapGrid, gsd: float) -> float:
+    """Pixels that images beyond the two finest have of a place, for one of a usual image, in the mean of the places of
+    a grid that two see: that many images fewer two, if all have pixels of one size; less, if some are coarser."""
+    pixels = np.sort([seen_places(one, grid.bounds) * (gsd / one.gsd) ** 2 for one in looked], axis=0)
+    two = pixels[-2] > 0
+    return float(pixels[:-2].sum(axis=0)[two].mean()) if two.any() else 0.0
 
 
 def _images_of_a_place(looked: Sequence[SeenTarget], grid: MapGrid) -> float:
