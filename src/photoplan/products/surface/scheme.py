@@ -167,7 +167,9 @@ def _facets(pixels: float, most: int, others: float = 0.0) -> tuple[int, int]:
 def _pixels_beyond_two(looked: Sequence[SeenTarget], grid: MapGrid, gsd: float) -> float:
     """Pixels that images beyond the two finest have of a place, for one of a usual image, in the mean of the places of
     a grid that two see: that many images fewer two, if all have pixels of one size; less, if some are coarser."""
-    pixels = np.sort([seen_places(one, grid.bounds) * (gsd / one.gsd) ** 2 for one in looked], axis=0)
+    levels = finer_levels(looked, gsd)
+    each = [seen_places(one, grid.bounds) * (gsd / one.gsd / 2**level) ** 2 for one, level in zip(looked, levels)]
+    pixels = np.sort(each, axis=0)
     two = pixels[-2] > 0
     return float(pixels[:-2].sum(axis=0)[two].mean()) if two.any() else 0.0
 
