@@ -43,6 +43,14 @@ class Ground:
         """The surface without objects."""
         return without_objects(self.surface)
 
+    def into_working(self, crs: str) -> HeightStep:
+        """From heights in the orientation's system to those of surface and cameras, at points of the project's CRS."""
+        return height_step(self.height_systems[1], self.working_system, crs, self.bounds)
+
+    def out_of_working(self, crs: str) -> HeightStep:
+        """Back again, as whoever states heights in a project, or reads them, expects them."""
+        return height_step(self.working_system, self.height_systems[1], crs, self.bounds)
+
     def is_open(self, XY: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether no object stands at map points (..., 2) or hangs over them, shape (...)."""
         if not isinstance(self.surface, ObjectSurface):

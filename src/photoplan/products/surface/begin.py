@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.errors import UsageError
+from photoplan.geometry.heights import HeightStep
 from photoplan.products.surface.settings import Bounds, number
 from photoplan.products.surface.target import SeenTarget
 from photoplan.project.open_terrain import open_terrain
 
 
-def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarget]) -> float:
+def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarget], inward: HeightStep) -> float:
     """By how much a start lies above (below: negative) the terrain that the images were looked up on.
 
     Parameters
@@ -25,6 +26,8 @@ def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarge
     crs : str
         Of the project.
     looked : sequence of SeenTarget
+    inward : HeightStep
+        From the start's height system to the one that the images are in.
 
     Returns
     -------
@@ -48,13 +51,15 @@ def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarge
             return 0.0  # no heights there: told of the surface, which has none either
     else:
         low = high = height
-    ceilings = sorted(((float(one.camera.vantage.point[2]), one.name) for one in looked), reverse=True)
+    x0, y0, x1, y1 = bounds
+    shift = float(inward([(x0 + x1) / 2, (y0 + y1) / 2, 0.0]))
+    ceilings = sorted(((float(one.camera.vantage.point[2]) - shift, one.name) for one in looked), reverse=True)
     if sum(ceiling > low for ceiling, _ in ceilings) < 2:
         (first, name), (last, other) = ceilings[0], ceilings[-1]
         raise UsageError(
             f"start {start}: {low:.6g} m is above the images, which look down from {last:.6g} m ({other}) to "
             f"{first:.6g} m ({name})"
         )
-    lowest = min(one.heights[0] for one in looked)
-    highest = max(one.heights[1] for one in looked)
+    lowest = min(one.heights[0] for one in looked) - shift
+    highest = max(one.heights[1] for one in looked) - shift
     return max(0.0, low - highest) - max(0.0, lowest - high)

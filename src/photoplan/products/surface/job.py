@@ -85,6 +85,8 @@ class SurfaceJob:
         """Heights, their standard deviations, number of images, fit; grey values, theirs, perhaps residuals."""
         views = _views(self.address, self.finer, self.frame, self.grid.bounds, self.bands)
         start = _start(self.address, self.start, self.begun, self.grid.crs)
+        crs, ground = self.grid.crs, self.address.scenes[0].open().ground
+        outward = None if crs is None else ground.out_of_working(crs)
         window, m = tile.window, self.scheme.ratio
         shape, finest = (window.height, window.width), (m * window.height, m * window.width)
         heights, sigmas, fit = (np.full((1, *shape), np.nan, np.float32) for _ in range(3))
@@ -119,6 +121,9 @@ class SurfaceJob:
             "greys": [float(np.isfinite(grey).sum()), *(float(np.nansum(grey.astype(float) ** n)) for n in (1, 2))],
         }
         known, seen = np.isfinite(heights[0]), np.isfinite(grey[0])
+        if outward is not None and outward.definition is not None:
+            XY = self.grid.to_map(np.argwhere(known)[:, ::-1] + (window.col, window.row))
+            heights[0, known] = outward(np.column_stack([XY, heights[0, known]]))
         layers: list[Output] = [
             (heights, known), (sigmas, known), (count, count[0] > 0), (fit, known), (grey, seen), (grey_sigmas, seen)
         ]  # fmt: skip
@@ -146,7 +151,7 @@ def _views(
 def _start(
     address: ScenesAddress, start: str, begun: tuple[str, str] | None, crs: str
 ) -> Callable[[_Doubles], _Doubles]:
-    """Heights with which a surface begins.
+    """Heights with which a surface begins, in the system of the cameras; stated ones are in the orientation's.
 
     Raises
     ------
@@ -157,8 +162,18 @@ def _start(
         path, digest = begun
         if fingerprint(path).digest != digest:
             raise InputError(f"{path}: has changed since the run was planned; plan it again")
-        return open_terrain(Path(path)).in_crs(crs)[0].surface.heights
+        return _in_working(address, crs, open_terrain(Path(path)).in_crs(crs)[0].surface.heights)
     if start == "terrain":
         return without_objects(surface_of(address)).heights
     height = float(start)
-    return lambda XY: np.full(XY.shape[:-1], height)
+    return _in_working(address, crs, lambda XY: np.full(XY.shape[:-1], height))
+
+
+def _in_working(
+    address: ScenesAddress, crs: str | None, heights: Callable[[_Doubles], _Doubles]
+) -> Callable[[_Doubles], _Doubles]:
+    """Heights of a map in the system of the cameras; those over another target (no CRS) are in none."""
+    step = None if crs is None else address.scenes[0].open().ground.into_working(crs)
+    if step is None or step.definition is None:
+        return heights
+    return lambda XY: step.where_defined(np.concatenate([XY, np.asarray(heights(XY))[..., None]], axis=-1))

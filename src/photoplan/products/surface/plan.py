@@ -11,8 +11,10 @@ import numpy as np
 
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.frames import Frame, ImageFrame
+from photoplan.geometry.cylinder import CylinderFrame
+from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
 from photoplan.geometry.grid import MapGrid
+from photoplan.geometry.heights import HeightStep
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.project.model import Project
 from photoplan.io.run_record import run_key
@@ -23,6 +25,7 @@ from photoplan.products.surface.begin import start_apart
 from photoplan.products.surface.scheme import finer_levels, scheme_of
 from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start
 from photoplan.products.surface.target import SeenTarget, over_frame, over_map, seen_places
+from photoplan.project.ground import ground_of
 from photoplan.project.scenes import ScenesAddress
 from photoplan.project.target_frame import target_frame
 
@@ -47,7 +50,7 @@ class SurfacePlan:
     grid: MapGrid
     """Its pixels are the height posts."""
     frame: Frame | None
-    """Of the target; None: the map."""
+    """Of the target, in the height system of the cameras; None: the map."""
     scheme: Scheme
     begun: tuple[str, str] | None
     """Path and content digest of the file of heights with which it begins; None: it begins with none."""
@@ -191,10 +194,13 @@ def plan_surface(
     check_start(project, settings)
     events.begin("planning", len(names), "images")
     frame, own = target_frame(project, settings.target)
+    inward = ground_of(project).into_working(project.crs)
     if frame is None:
         looked, blind = over_map(project, names, force, events)
     else:
         settings = _on_frame(settings, settings.bounds or own)
+        # That of an image is where its camera is already.
+        frame = frame if isinstance(frame, ImageFrame) else at_heights(frame, inward)
         assert settings.bounds is not None
         looked, blind = over_frame(project, names, frame, settings.bounds, float(settings.start), events)
     check_bands(project, settings.bands, [one.name for one in looked])
@@ -209,7 +215,7 @@ def plan_surface(
     if min(grid.width, grid.height) < 2:
         raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
     scheme, height_error = scheme_of(settings, looked, grid, frame, gsd)
-    apart = 0.0 if frame is not None else start_apart(settings.start, grid.bounds, project.crs, looked)
+    apart = 0.0 if frame is not None else start_apart(settings.start, grid.bounds, project.crs, looked, inward)
     places, finer = {one.name: seen_places(one, grid.bounds) for one in looked}, finer_levels(looked, gsd)
     pixels = [(gsd / one.gsd / 2**level) ** 2 for one, level in zip(looked, finer)]
     used, file = tuple(one.name for one in looked), settings.start_file
@@ -231,6 +237,14 @@ def plan_surface(
         most=float(np.sum([n * seen for n, seen in zip(pixels, places.values())], axis=0).max()),
         key=_key(project, used, settings, scheme=scheme, grid=grid, frame=frame),
     )
+
+
+def at_heights(frame: Frame, step: HeightStep) -> Frame:
+    """A frame with its origin in another height system: the step between them is the same all over a target."""
+    if step.definition is None or not isinstance(frame, WallFrame | CylinderFrame | ImageFrame):
+        return frame
+    x, y, _ = frame.origin
+    return replace(frame, origin=(x, y, float(step(frame.origin))))
 
 
 def _on_frame(settings: SurfaceSettings, bounds: Bounds | None) -> SurfaceSettings:

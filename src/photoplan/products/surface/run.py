@@ -25,7 +25,7 @@ from photoplan.plan.tiles import Tiles
 from photoplan.products.run import Run, refuse_inputs
 from photoplan.products.surface.findings import findings
 from photoplan.products.surface.job import TILE, SurfaceJob
-from photoplan.products.surface.plan import SurfacePlan
+from photoplan.products.surface.plan import SurfacePlan, at_heights
 from photoplan.products.surface.spread import median
 from photoplan.project.scene import input_files
 
@@ -197,14 +197,15 @@ def _complete(
         "PHOTOPLAN_KEY": plan.key,
         TARGET: plan.settings.target,
     }
+    scene, crs = plan.address.scenes[0].open(), plan.project.crs
+    frame = None if plan.frame is None else at_heights(plan.frame, scene.ground.out_of_working(crs))
     with together():
         facts, *_ = [file.complete(tags) for file in files.values()]
         for path in plan.settings.points:
             z, sigma, grey = (files[kind].path for kind in ("heights", "sigma", "grey"))
-            write_cloud(path, z, sigma, grey, plan.project.crs, plan.frame)
+            write_cloud(path, z, sigma, grey, crs, frame)
         ran = times()
         result = _result(plan, files, ran["seconds"], facts.valid_share, tally)
-        scene = plan.address.scenes[0].open()
         write_run_record(
             heights.path,
             key=plan.key,

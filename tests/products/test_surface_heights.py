@@ -1,0 +1,63 @@
+"""Heights of `photoplan surface` are those of the orientation's system, whatever system the cameras work in."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import Transformer
+from rasterio.transform import from_origin
+from tools.facet_scene import GROUND, write_scene
+from tools.small_block import CRS, X0, Y0
+
+UNDULATION = 47.0
+#: In a process of its own: grids that were looked for once are remembered. A wall that looks up is a map.
+MADE = """
+import sys, numpy, pyproj, rasterio
+pyproj.datadir.append_data_dir(".")
+from photoplan.io.project.file import load_project
+from photoplan.products.surface.plan import plan_surface
+from photoplan.products.surface.run import make_surface
+from photoplan.products.surface.settings import SurfaceSettings
+from pathlib import Path
+project, (x, y, z) = load_project("project.toml"), map(float, sys.argv[1:])
+plan = plan_surface(project, SurfaceSettings(3.0, bounds=(x - 9, y - 9, x + 9, y + 9), start=str(z + 1), reach=8.0))
+with rasterio.open(make_surface(plan, "map").path) as file:
+    print(numpy.nanmean(file.read(1)), plan.apart)
+wall = SurfaceSettings(
+    3.0, target=f"wall:{x},{y},{z},180,90", bounds=(-9, -9, 9, 9), reach=8.0, points=(Path("wall.ply"),)
+)
+plan = plan_surface(project, wall)
+make_surface(plan, "wall")
+points = Path("wall.ply").read_bytes().partition(b"end_header\\n")[2]
+points = numpy.frombuffer(points, [("xyz", "<f8", 3), ("sigma", "<f4"), ("grey", "<f4")])
+print(points["xyz"][:, 2].mean(), plan.frame.origin[2])
+"""
+
+
+@pytest.mark.slow
+def test_heights_over_a_curved_earth_are_in_the_system_of_the_orientation(tmp_path: Path) -> None:
+    lon, lat = Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(X0, Y0)
+    corner = from_origin(lon - 0.25, lat + 0.25, 0.01, 0.01)
+    profile = {"driver": "GTiff", "width": 50, "height": 50, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(tmp_path / "us_nga_egm96_15.tif", "w", transform=corner, **profile) as file:
+        file.write(np.full((1, 50, 50), UNDULATION, np.float32))
+        file.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
+        file.set_band_description(1, "geoid_undulation")
+    scene = write_scene(tmp_path, 3)
+    text = scene.path.read_text().replace('height_system = "same"', 'height_system = "EPSG:5773"')
+    scene.path.write_text(text.replace("[orientation]", '[orientation]\nearth_curvature = "strict"'))
+    words = [str(value) for value in (X0, Y0, GROUND)]
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", MADE, *words], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    (over_map, apart), (over_wall, origin) = (map(float, line.split()) for line in run.stdout.splitlines())
+    x, y = np.meshgrid(X0 + np.linspace(-9, 9, 7), Y0 + np.linspace(-9, 9, 7))
+    # The map's scale is 0.9996: eight centimetres of the flying height.
+    assert abs(over_map - scene.heights(x, y).mean() + 0.08) < 0.1 and abs(over_wall - over_map) < 0.1
+    assert abs(origin - GROUND - UNDULATION) < 0.01 and apart == 1.0
