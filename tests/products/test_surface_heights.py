@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,8 +12,8 @@ import pytest
 import rasterio
 from pyproj import Transformer
 from rasterio.transform import from_origin
-from tools.facet_scene import GROUND, write_scene
-from tools.small_block import CRS, X0, Y0
+from tools.facet_scene import GROUND, HEIGHT, write_scene
+from tools.small_block import CRS, X0, Y0, write_terrain
 
 UNDULATION = 47.0
 #: In a process of its own: grids that were looked for once are remembered. A wall that looks up is a map.
@@ -20,6 +21,7 @@ MADE = """
 import sys, numpy, pyproj, rasterio
 pyproj.datadir.append_data_dir(".")
 from photoplan.io.project.file import load_project
+from photoplan.products.surface.job import _start
 from photoplan.products.surface.plan import plan_surface
 from photoplan.products.surface.run import make_surface
 from photoplan.products.surface.settings import SurfaceSettings
@@ -36,6 +38,10 @@ make_surface(plan, "wall")
 points = Path("wall.ply").read_bytes().partition(b"end_header\\n")[2]
 points = numpy.frombuffer(points, [("xyz", "<f8", 3), ("sigma", "<f4"), ("grey", "<f4")])
 print(points["xyz"][:, 2].mean(), plan.frame.origin[2])
+project = load_project("ellipsoidal.toml")
+plan = plan_surface(project, SurfaceSettings(3.0, bounds=(x - 9, y - 9, x + 9, y + 9), start="start.tif", reach=8.0))
+start = _start(plan.address, "start.tif", plan.begun, project.crs)
+print(start(numpy.array([[[x, y]]]))[0, 0], plan.apart)
 """
 
 
@@ -51,13 +57,21 @@ def test_heights_over_a_curved_earth_are_in_the_system_of_the_orientation(tmp_pa
     scene = write_scene(tmp_path, 3)
     text = scene.path.read_text().replace('height_system = "same"', 'height_system = "EPSG:5773"')
     scene.path.write_text(text.replace("[orientation]", '[orientation]\nearth_curvature = "strict"'))
+    # Cameras and terrain above the ellipsoid, with a start above the geoid, which its file states.
+    other = re.sub(r"(center = .*), [0-9.]+]", rf"\1, {GROUND + HEIGHT + UNDULATION}]", text)
+    other = other.replace(f"height = {GROUND}", f"height = {GROUND + UNDULATION}").replace("EPSG:5773", "ellipsoidal")
+    (tmp_path / "ellipsoidal.toml").write_text(other)
+    write_terrain(tmp_path / "start.tif", np.full((60, 64), GROUND), crs=f"{CRS}+5773")
     words = [str(value) for value in (X0, Y0, GROUND)]
     run = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", MADE, *words], cwd=tmp_path, capture_output=True, text=True, timeout=300
     )
     assert run.returncode == 0, run.stderr
-    (over_map, apart), (over_wall, origin) = (map(float, line.split()) for line in run.stdout.splitlines())
+    (over_map, apart), (over_wall, origin), (begun, beside) = (
+        map(float, line.split()) for line in run.stdout.splitlines()
+    )
     x, y = np.meshgrid(X0 + np.linspace(-9, 9, 7), Y0 + np.linspace(-9, 9, 7))
     # The map's scale is 0.9996: eight centimetres of the flying height.
     assert abs(over_map - scene.heights(x, y).mean() + 0.08) < 0.1 and abs(over_wall - over_map) < 0.1
+    assert abs(begun - GROUND - UNDULATION) < 0.01 and abs(beside) < 0.01
     assert abs(origin - GROUND - UNDULATION) < 0.01 and apart == 1.0

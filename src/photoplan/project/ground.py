@@ -43,9 +43,10 @@ class Ground:
         """The surface without objects."""
         return without_objects(self.surface)
 
-    def into_working(self, crs: str) -> HeightStep:
-        """From heights in the orientation's system to those of surface and cameras, at points of the project's CRS."""
-        return height_step(self.height_systems[1], self.working_system, crs, self.bounds)
+    def into_working(self, crs: str, stated: str | None = None) -> HeightStep:
+        """From heights in a stated system, else the orientation's, to those of surface and cameras, at points of the
+        project's CRS."""
+        return height_step(stated or self.height_systems[1], self.working_system, crs, self.bounds)
 
     def out_of_working(self, crs: str) -> HeightStep:
         """Back again, as whoever states heights in a project, or reads them, expects them."""

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.errors import UsageError
-from photoplan.geometry.heights import HeightStep
 from photoplan.products.surface.settings import Bounds, number
 from photoplan.products.surface.target import SeenTarget
+from photoplan.project.ground import Ground
 from photoplan.project.open_terrain import open_terrain
 
 
-def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarget], inward: HeightStep) -> float:
+def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarget], ground: Ground) -> float:
     """By how much a start lies above (below: negative) the terrain that the images were looked up on.
 
     Parameters
@@ -26,8 +26,8 @@ def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarge
     crs : str
         Of the project.
     looked : sequence of SeenTarget
-    inward : HeightStep
-        From the start's height system to the one that the images are in.
+    ground : Ground
+        Of the project: what height system the images are in.
 
     Returns
     -------
@@ -43,15 +43,17 @@ def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarge
     """
     if start == "terrain":
         return 0.0
-    height = number(start)
+    height, stated = number(start), None
     if height is None:
-        surface = open_terrain(Path(start)).in_crs(crs)[0].surface
-        low, high = (float(h) for h in surface.height_range(np.array(bounds)))
+        opened = open_terrain(Path(start)).in_crs(crs)[0]
+        stated = opened.height_system
+        low, high = (float(h) for h in opened.surface.height_range(np.array(bounds)))
         if not np.isfinite([low, high]).all():
             return 0.0  # no heights there: told of the surface, which has none either
     else:
         low = high = height
     x0, y0, x1, y1 = bounds
+    inward = ground.into_working(crs, stated)
     shift = float(inward([(x0 + x1) / 2, (y0 + y1) / 2, 0.0]))
     ceilings = sorted(((float(one.camera.vantage.point[2]) - shift, one.name) for one in looked), reverse=True)
     if sum(ceiling > low for ceiling, _ in ceilings) < 2:

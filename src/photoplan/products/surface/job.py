@@ -151,7 +151,8 @@ def _views(
 def _start(
     address: ScenesAddress, start: str, begun: tuple[str, str] | None, crs: str
 ) -> Callable[[_Doubles], _Doubles]:
-    """Heights with which a surface begins, in the system of the cameras; stated ones are in the orientation's.
+    """Heights with which a surface begins, in the system of the cameras; those of a user are in the one that their file
+    states, or in the orientation's.
 
     Raises
     ------
@@ -162,7 +163,8 @@ def _start(
         path, digest = begun
         if fingerprint(path).digest != digest:
             raise InputError(f"{path}: has changed since the run was planned; plan it again")
-        return _in_working(address, crs, open_terrain(Path(path)).in_crs(crs)[0].surface.heights)
+        opened = open_terrain(Path(path)).in_crs(crs)[0]
+        return _in_working(address, crs, opened.surface.heights, opened.height_system)
     if start == "terrain":
         return without_objects(surface_of(address)).heights
     height = float(start)
@@ -170,10 +172,11 @@ def _start(
 
 
 def _in_working(
-    address: ScenesAddress, crs: str | None, heights: Callable[[_Doubles], _Doubles]
+    address: ScenesAddress, crs: str | None, heights: Callable[[_Doubles], _Doubles], stated: str | None = None
 ) -> Callable[[_Doubles], _Doubles]:
-    """Heights of a map in the system of the cameras; those over another target (no CRS) are in none."""
-    step = None if crs is None else address.scenes[0].open().ground.into_working(crs)
+    """Heights of a map, perhaps in a stated system, in that of the cameras; those over another target (no CRS) are in
+    none."""
+    step = None if crs is None else address.scenes[0].open().ground.into_working(crs, stated)
     if step is None or step.definition is None:
         return heights
     return lambda XY: step.where_defined(np.concatenate([XY, np.asarray(heights(XY))[..., None]], axis=-1))

@@ -194,13 +194,13 @@ def plan_surface(
     check_start(project, settings)
     events.begin("planning", len(names), "images")
     frame, own = target_frame(project, settings.target)
-    inward = ground_of(project).into_working(project.crs)
+    ground = ground_of(project)
     if frame is None:
         looked, blind = over_map(project, names, force, events)
     else:
         settings = _on_frame(settings, settings.bounds or own)
         # That of an image is where its camera is already.
-        frame = frame if isinstance(frame, ImageFrame) else at_heights(frame, inward)
+        frame = frame if isinstance(frame, ImageFrame) else at_heights(frame, ground.into_working(project.crs))
         assert settings.bounds is not None
         looked, blind = over_frame(project, names, frame, settings.bounds, float(settings.start), events)
     check_bands(project, settings.bands, [one.name for one in looked])
@@ -215,7 +215,7 @@ def plan_surface(
     if min(grid.width, grid.height) < 2:
         raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
     scheme, height_error = scheme_of(settings, looked, grid, frame, gsd)
-    apart = 0.0 if frame is not None else start_apart(settings.start, grid.bounds, project.crs, looked, inward)
+    apart = 0.0 if frame is not None else start_apart(settings.start, grid.bounds, project.crs, looked, ground)
     places, finer = {one.name: seen_places(one, grid.bounds) for one in looked}, finer_levels(looked, gsd)
     pixels = [(gsd / one.gsd / 2**level) ** 2 for one, level in zip(looked, finer)]
     used, file = tuple(one.name for one in looked), settings.start_file
