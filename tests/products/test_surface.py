@@ -208,6 +208,19 @@ def test_a_surface_serves_as_terrain(scene: Scene, made: Path) -> None:
 
 
 @pytest.mark.slow
+def test_grey_values_are_those_of_places_with_heights(scene: Scene, tmp_path: Path) -> None:
+    """What one image alone sees would be there in some tiles and not in others."""
+    words = ("--images", "i1,i2", "--start", GROUND, "--no-quicklook", "-q", "--output", tmp_path)
+    said = inside("surface", scene.path, "--resolution", 3, *words)
+    assert said.code == 0, said.err
+    count, *_ = places(tmp_path / "surface_count.tif")
+    grey, *_ = places(tmp_path / "surface_grey.tif")
+    ratio = grey.shape[0] // count.shape[0]
+    two = np.repeat(np.repeat(count > 1, ratio, axis=0), ratio, axis=1)
+    assert (count == 1).sum() > 10 and (np.isfinite(grey) == two).all()
+
+
+@pytest.mark.slow
 def test_two_images_and_a_wrong_start(tmp_path: Path) -> None:
     """The start is 20 m below the ground, a tenth of the flying height: eight pixels of parallax."""
     scene = write_scene(tmp_path, 2, seed=7)

@@ -1,4 +1,4 @@
-"""Heights of `photoplan surface` are those of the orientation's system, whatever system the cameras work in."""
+"""Heights of `photoplan surface` and `monoplot` are those of the orientation's system, whatever system the cameras work in."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ MADE = """
 import sys, numpy, pyproj, rasterio
 pyproj.datadir.append_data_dir(".")
 from photoplan.io.project.file import load_project
+from photoplan.products.monoplot import MonoplotRequest, monoplot_file
 from photoplan.products.surface.job import _start
 from photoplan.products.surface.plan import plan_surface
 from photoplan.products.surface.run import make_surface
@@ -38,6 +39,9 @@ make_surface(plan, "wall")
 points = Path("wall.ply").read_bytes().partition(b"end_header\\n")[2]
 points = numpy.frombuffer(points, [("xyz", "<f8", 3), ("sigma", "<f4"), ("grey", "<f4")])
 print(points["xyz"][:, 2].mean(), plan.frame.origin[2])
+Path("points.csv").write_text("x,y\\n60,45\\n")
+found = monoplot_file(MonoplotRequest(Path("project.toml"), project.images[0].name, Path("points.csv"), Path("at.csv")))
+print(Path("at.csv").read_text().splitlines()[1].split(",")[4], found.height_system == "EPSG:5773")
 project = load_project("ellipsoidal.toml")
 plan = plan_surface(project, SurfaceSettings(3.0, bounds=(x - 9, y - 9, x + 9, y + 9), start="start.tif", reach=8.0))
 start = _start(plan.address, "start.tif", plan.begun, project.crs)
@@ -67,9 +71,13 @@ def test_heights_over_a_curved_earth_are_in_the_system_of_the_orientation(tmp_pa
         [sys.executable, "-W", "ignore", "-c", MADE, *words], cwd=tmp_path, capture_output=True, text=True, timeout=300
     )
     assert run.returncode == 0, run.stderr
-    (over_map, apart), (over_wall, origin), (begun, beside) = (
-        map(float, line.split()) for line in run.stdout.splitlines()
+    print(run.stdout)
+    (over_map, apart), (over_wall, origin), (plotted, system), (begun, beside) = (
+        line.split() for line in run.stdout.splitlines()
     )
+    # Points of one image, too: level ground.
+    assert abs(float(plotted) - GROUND) < 1e-3 and system == "True"
+    over_map, apart, over_wall, origin, begun, beside = map(float, (over_map, apart, over_wall, origin, begun, beside))
     x, y = np.meshgrid(X0 + np.linspace(-9, 9, 7), Y0 + np.linspace(-9, 9, 7))
     # The map's scale is 0.9996: eight centimetres of the flying height.
     assert abs(over_map - scene.heights(x, y).mean() + 0.08) < 0.1 and abs(over_wall - over_map) < 0.1

@@ -45,7 +45,7 @@ class Unfinished:
             self._log = TileLog(self.log_path, key)
             begin(self._log)
         except BaseException:
-            self._lock.release()
+            self.leave()
             raise
 
     def leave(self) -> None:

@@ -146,10 +146,12 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
             bounds = "nowhere" if seen.bounds is None else " ".join(f"{v:.8g}" for v in seen.bounds)
             center = " ".join(f"{v:.8g}" for v in camera.vantage.point)
             notes.append(f"no point is on the ground; camera at {center}, terrain in its reach {bounds}")
+        system, step = ground.height_systems[1], ground.out_of_working(project.crs)
+        found.XYZ[:, 2] = step.where_defined(found.XYZ)
         _write_table(request.output, given, found)
         if request.vectors is not None:
             _write_vectors(request.vectors, given, found, project.crs)
-        report = _report(request, found, ground.working_system, notes)
+        report = _report(request, found, system, notes)
         record([request.output, request.vectors], report)
     return report
 

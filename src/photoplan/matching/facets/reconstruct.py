@@ -305,7 +305,9 @@ def _found(
     doubt = edge_variances(block) + misfit_variances(block, misfit)
     ratio = block.facets.ratio
     inner = slice(MARGIN, MARGIN + window.height), slice(MARGIN, MARGIN + window.width)
-    astray = block.astray[inner] & (block.counted[inner] > 1)
+    # What one image alone sees has no height, and grey values no place.
+    seen = block.counted[inner] > 1
+    astray = block.astray[inner] & seen
     count = np.where(astray, np.uint8(1), block.counted[inner])
     place = [next(n for n, view in enumerate(views) if view is own) for own in block.views]
     sums = np.zeros((len(views), 2))
@@ -329,8 +331,8 @@ def _found(
         sigmas=_where(count > 1, np.sqrt(np.maximum(variance[inner], 0.0) + doubt[inner])),
         count=count,
         fit=_where(count > 1, misfit[inner]),
-        grey=_where(finer(count > 0), block.grey_values(at.reshape(-1, 2)).reshape(at.shape[:2])),
-        grey_sigmas=_where(finer(count > 0), grey_sigmas(block, at, finer(np.nan_to_num(variance[inner])))),
+        grey=_where(finer(seen), block.grey_values(at.reshape(-1, 2)).reshape(at.shape[:2])),
+        grey_sigmas=_where(finer(seen), grey_sigmas(block, at, finer(np.nan_to_num(variance[inner])))),
         residuals=pictures,
         astray=int(astray.sum()),
         sums=sums,
