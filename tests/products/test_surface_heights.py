@@ -1,4 +1,4 @@
-"""Heights of `photoplan surface` and `monoplot` are those of the orientation's system, whatever system the cameras work in."""
+"""Heights of `surface` and `monoplot` are those of the system of the orientation, whatever the cameras work in."""
 
 from __future__ import annotations
 
