@@ -75,6 +75,15 @@ def test_images_without_texture_are_told(project: Path) -> None:
         assert np.median(file.read(1)) > 5
 
 
+def test_images_of_one_grey_value_tell_no_heights(project: Path) -> None:
+    """What single precision rounds of it is no texture."""
+    for image in sorted((project.parent / "rendered").glob("*.tif")):
+        change(image, lambda pixels: np.full_like(pixels, 128))
+    assert "hardly any texture" in notes(surface(project, "--json"))
+    with rasterio.open(project.parent / "products" / "surface_sigma.tif") as file:
+        assert file.read(1).min() > 5
+
+
 def test_heights_that_texture_does_not_tell_have_a_large_sigma(tmp_path: Path) -> None:
     """A bare strip of twenty metres: what stands there follows its surroundings, and its sigma says how well."""
     scene = write_scene(tmp_path, 3, bare=10.0)

@@ -56,8 +56,9 @@ _SIDE, _MARGIN = 8, 8
 _BORDER, _LEFT_OVER = 6, 0.25
 #: Times by which curvatures weigh more to see what they take away.
 _STIFFER = 1.2
-#: Least standard deviation of grey values, parts of the contrast: images without noise have residuals of rounding.
-_QUIET = 1e-4
+#: Least standard deviation of grey values, parts of the contrast: images without noise have residuals of rounding. The
+#: part of the mean grey value that counts as contrast at least, as single precision rounds by parts of that.
+_QUIET, _PALE = 1e-4, 0.1
 
 
 @dataclass(eq=False)
@@ -336,7 +337,7 @@ class FacetBlock:
         factor = np.sqrt(found[:, 1] / np.maximum(redundancy, 1.0) / _TAKEN)
         if used.sum() < 3:
             factor[used] = np.sqrt(found[used, 1].sum() / max(redundancy[used].sum(), 1.0) / _TAKEN)
-        quiet = _QUIET * max(float(self.values.std()), 1e-6)
+        quiet = _QUIET * max(float(self.values.std()), _PALE * abs(float(self.values.mean())), 1e-6)
         gains = np.array([float(t.gains.mean()) for t in self.transfers])
         self.sums = np.column_stack([found[:, 1] * (self.sigmas * gains) ** 2 / _TAKEN, redundancy])
         self.sigmas = np.where(used, np.maximum(self.sigmas * np.clip(factor, 0.2, 5.0), quiet), self.sigmas)
