@@ -19,15 +19,17 @@ UNDULATION = 47.0
 #: In a process of its own: grids that were looked for once are remembered.
 LOOK = """
 import sys, pyproj
-pyproj.datadir.append_data_dir(".")
+from pathlib import Path
+folder = Path(sys.argv[1])
+pyproj.datadir.append_data_dir(str(folder))
 from photoplan.io.project.file import load_project
 from photoplan.plan.footprint import footprint
 from photoplan.project.cameras import camera_without_pixels, ground_of
-for name in sys.argv[1:]:
-    project = load_project(name + ".toml")
+for name in sys.argv[2:]:
+    project = load_project(folder / (name + ".toml"))
     camera, ground = camera_without_pixels(project, "strip"), ground_of(project)
     print(footprint(camera, ground.bare, ground.bounds).bounds)
-camera = camera_without_pixels(load_project("own.toml"), "strip")
+camera = camera_without_pixels(load_project(folder / "own.toml"), "strip")
 low, high = camera.vantage.floor, float(camera.vantage.point[2])
 print([low, high], (camera.rays([[300.0, 0.0], [300.0, 599.0]], 453.0)[0] > 0).all(axis=1).tolist())
 """
@@ -64,8 +66,7 @@ def test_fault_01_what_lies_beyond_the_terrain_needs_no_undulation(tmp_path: Pat
         own = f'file = "{name}.tif"\nheight_system = "{system}"\n{orientation}'
         (tmp_path / f"{name}.toml").write_text(text.replace(stated, own))
     run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", LOOK, "ellipsoid", "geoid"],
-        cwd=tmp_path,
+        [sys.executable, "-W", "ignore", "-c", LOOK, str(tmp_path), "ellipsoid", "geoid"],
         capture_output=True,
         text=True,
         timeout=120,
