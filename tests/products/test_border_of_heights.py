@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from pyproj import Transformer
 from rasterio.transform import from_origin
+from tools.geoid import UNDULATION, write_geoid
 from tools.line_strip import Strip
 
 STRIP = Strip()
 #: What lies this far east of the middle of the image has no undulation, metres; terrain ends ten metres before.
 EAST = 40.0
-UNDULATION = 47.0
 #: In a process of its own: grids that were looked for once are remembered.
 LOOK = """
 import sys, pyproj
@@ -35,26 +34,12 @@ print([low, high], (camera.rays([[300.0, 0.0], [300.0, 599.0]], 453.0)[0] > 0).a
 """
 
 
-def _grid(path: Path) -> None:
-    """Undulation as PROJ reads it, on half a degree that ends in the image."""
-    lon, lat = Transformer.from_crs(STRIP.crs, "EPSG:4326", always_xy=True).transform(
-        STRIP.origin[0] + EAST, STRIP.origin[1]
-    )
-    count, pitch = 50, 0.01
-    corner = from_origin(lon - (count - 0.5) * pitch, lat + count / 2 * pitch, pitch, pitch)
-    profile = {"driver": "GTiff", "width": count, "height": count, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(path, "w", transform=corner, **profile) as file:
-        file.write(np.full((1, count, count), UNDULATION, np.float32))
-        file.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
-        file.set_band_description(1, "geoid_undulation")
-
-
 def test_fault_01_what_lies_beyond_the_terrain_needs_no_undulation(tmp_path: Path) -> None:
-    _grid(tmp_path / "us_nga_egm96_15.tif")
+    X, Y = STRIP.origin
+    write_geoid(tmp_path, STRIP.crs, (X + EAST, Y), ends_there=True)
     text = STRIP.write(tmp_path, 500.0).read_text()
     stated = 'height = 500.0\nheight_system = "ellipsoidal"\n'
     assert stated in text
-    X, Y = STRIP.origin
     corner = from_origin(X - 90, Y + 60, 2, 2)
     profile = {"driver": "GTiff", "width": 60, "height": 60, "count": 1, "dtype": "float32", "crs": STRIP.crs}
     systems = {"ellipsoid": "ellipsoidal", "geoid": "EPSG:5773", "own": "EPSG:5773"}

@@ -28,7 +28,7 @@ from photoplan.products.surface import job as surface_job
 from photoplan.products.surface.findings import findings
 from photoplan.products.surface.job import SurfaceJob
 from photoplan.products.surface.plan import plan_surface
-from photoplan.products.surface.scheme import scheme_of
+from photoplan.products.surface.scheme import finer_levels, pixels_of_places, scheme_of
 from photoplan.products.surface.settings import SurfaceSettings
 from photoplan.products.surface.spread import counted, median
 from photoplan.products.surface.target import over_map
@@ -141,7 +141,8 @@ def test_coarser_images_leave_fewer_pixels_for_fine_grey_values(scene: Scene) ->
 
     def ratio(*times: float) -> int:
         ones = [replace(one, gsd=time * GSD) for one, time in zip(looked, times)]
-        return scheme_of(settings, ones, plan.grid, None, GSD)[0].ratio
+        pixels = pixels_of_places(ones, finer_levels(ones, GSD), plan.grid, GSD)
+        return scheme_of(settings, ones, plan.grid, None, GSD, pixels)[0].ratio
 
     # Beyond any two images 3, 1.5 and 2.1 pixels of 0.5 m; four facets on 1.55 m need 1.7 of them.
     assert (ratio(1, 1, 1, 1, 1), ratio(1, 1, 1, 2, 2), ratio(0.5, 0.5, 1, 1, 3)) == (4, 3, 4)

@@ -9,13 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from pyproj import Transformer
-from rasterio.transform import from_origin
 from tools.facet_scene import GROUND, HEIGHT, write_scene
+from tools.geoid import UNDULATION, write_geoid
 from tools.small_block import CRS, X0, Y0, write_terrain
 
-UNDULATION = 47.0
 #: In a process of its own: grids that were looked for once are remembered. A wall that looks up is a map.
 MADE = """
 import sys, numpy, pyproj, rasterio
@@ -51,13 +48,7 @@ print(start(numpy.array([[[x, y]]]))[0, 0], plan.apart)
 
 @pytest.mark.slow
 def test_heights_over_a_curved_earth_are_in_the_system_of_the_orientation(tmp_path: Path) -> None:
-    lon, lat = Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(X0, Y0)
-    corner = from_origin(lon - 0.25, lat + 0.25, 0.01, 0.01)
-    profile = {"driver": "GTiff", "width": 50, "height": 50, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(tmp_path / "us_nga_egm96_15.tif", "w", transform=corner, **profile) as file:
-        file.write(np.full((1, 50, 50), UNDULATION, np.float32))
-        file.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
-        file.set_band_description(1, "geoid_undulation")
+    write_geoid(tmp_path, CRS, (X0, Y0))
     scene = write_scene(tmp_path, 3)
     text = scene.path.read_text().replace('height_system = "same"', 'height_system = "EPSG:5773"')
     scene.path.write_text(text.replace("[orientation]", '[orientation]\nearth_curvature = "strict"'))

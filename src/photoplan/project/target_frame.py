@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,8 +12,10 @@ from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.bounds import HIGHEST_FLIGHT, area_fault, odd_place
 from photoplan.geometry.cylinder import CylinderFrame
 from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
+from photoplan.geometry.heights import HeightStep
 from photoplan.io.project.model import Project
 from photoplan.plan.footprint import Bounds, image_border
+from photoplan.project.ground import ground_of
 from photoplan.project.scene import Scene, open_scene
 
 #: Metres over which an image's projection is taken apart; from a straight line it differs by less than this part.
@@ -70,6 +73,8 @@ def _straight(scene: Scene, name: str) -> Camera:
 def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | None]:
     """The frame of a target as a user states it, and the bounds that it has by itself; None: it is the map, has none.
 
+    A user states heights in the system of the orientation; the frame is in that of the cameras.
+
     Raises
     ------
     UsageError
@@ -91,6 +96,7 @@ def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | No
         odd = odd_place((x, y, z), camera=False) or area_fault(project.crs, (x, y))
         if odd is not None:
             raise UsageError(f"target {text}: {odd}")
+        z = float(ground_of(project).into_working(project.crs)((x, y, z)))
         if kind == "wall":
             return WallFrame.facing((x, y, z), *others), None
         make = CylinderFrame.vault if kind == "vault" else CylinderFrame.column
@@ -101,6 +107,14 @@ def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | No
     if not name or any(image.name == rest for image in project.images):
         return _along(project, rest, None, text)
     return _along(project, name, next(iter(_numbers(last)), math.nan), text)
+
+
+def at_heights(frame: Frame, step: HeightStep) -> Frame:
+    """A frame with its origin in another height system: the step between them is the same all over a target."""
+    if step.definition is None or not isinstance(frame, WallFrame | CylinderFrame | ImageFrame):
+        return frame
+    x, y, _ = frame.origin
+    return replace(frame, origin=(x, y, float(step(frame.origin))))
 
 
 def _numbers(text: str) -> list[float]:

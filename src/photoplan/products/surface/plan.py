@@ -11,10 +11,8 @@ import numpy as np
 
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.cylinder import CylinderFrame
-from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
+from photoplan.geometry.frames import Frame, ImageFrame
 from photoplan.geometry.grid import MapGrid
-from photoplan.geometry.heights import HeightStep
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.project.model import Project
 from photoplan.io.run_record import run_key
@@ -22,9 +20,9 @@ from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.plain import pick
 from photoplan.products.orthophoto.look import extent_text
 from photoplan.products.surface.begin import start_apart
-from photoplan.products.surface.scheme import finer_levels, scheme_of
+from photoplan.products.surface.scheme import finer_levels, pixels_of_places, scheme_of
 from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start
-from photoplan.products.surface.target import SeenTarget, over_frame, over_map, seen_places
+from photoplan.products.surface.target import SeenTarget, over_frame, over_map
 from photoplan.project.ground import ground_of
 from photoplan.project.scenes import ScenesAddress
 from photoplan.project.target_frame import target_frame
@@ -194,13 +192,10 @@ def plan_surface(
     check_start(project, settings)
     events.begin("planning", len(names), "images")
     frame, own = target_frame(project, settings.target)
-    ground = ground_of(project)
     if frame is None:
         looked, blind = over_map(project, names, force, events)
     else:
         settings = _on_frame(settings, settings.bounds or own)
-        # That of an image is where its camera is already.
-        frame = frame if isinstance(frame, ImageFrame) else at_heights(frame, ground.into_working(project.crs))
         assert settings.bounds is not None
         looked, blind = over_frame(project, names, frame, settings.bounds, float(settings.start), events)
     check_bands(project, settings.bands, [one.name for one in looked])
@@ -214,10 +209,12 @@ def plan_surface(
     grid = MapGrid.covering(bounds, settings.resolution, project.crs if frame is None else None)
     if min(grid.width, grid.height) < 2:
         raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
-    scheme, height_error = scheme_of(settings, looked, grid, frame, gsd)
-    apart = 0.0 if frame is not None else start_apart(settings.start, grid.bounds, project.crs, looked, ground)
-    places, finer = {one.name: seen_places(one, grid.bounds) for one in looked}, finer_levels(looked, gsd)
-    pixels = [(gsd / one.gsd / 2**level) ** 2 for one, level in zip(looked, finer)]
+    finer = finer_levels(looked, gsd)
+    pixels = pixels_of_places(looked, finer, grid, gsd)
+    scheme, height_error = scheme_of(settings, looked, grid, frame, gsd, pixels)
+    apart = 0.0
+    if frame is None:
+        apart = start_apart(settings.start, grid.bounds, project.crs, looked, ground_of(project))
     used, file = tuple(one.name for one in looked), settings.start_file
     return SurfacePlan(
         project=project,
@@ -233,18 +230,10 @@ def plan_surface(
         height_error=height_error,
         apart=apart,
         seen_share=seen_share,
-        parts={name: float(seen.mean()) for name, seen in places.items()},
-        most=float(np.sum([n * seen for n, seen in zip(pixels, places.values())], axis=0).max()),
+        parts={one.name: float((seen > 0).mean()) for one, seen in zip(looked, pixels)},
+        most=float(pixels.sum(axis=0).max()),
         key=_key(project, used, settings, scheme=scheme, grid=grid, frame=frame),
     )
-
-
-def at_heights(frame: Frame, step: HeightStep) -> Frame:
-    """A frame with its origin in another height system: the step between them is the same all over a target."""
-    if step.definition is None or not isinstance(frame, WallFrame | CylinderFrame | ImageFrame):
-        return frame
-    x, y, _ = frame.origin
-    return replace(frame, origin=(x, y, float(step(frame.origin))))
 
 
 def _on_frame(settings: SurfaceSettings, bounds: Bounds | None) -> SurfaceSettings:

@@ -25,9 +25,10 @@ from photoplan.plan.tiles import Tiles
 from photoplan.products.run import Run, refuse_inputs
 from photoplan.products.surface.findings import findings
 from photoplan.products.surface.job import TILE, SurfaceJob
-from photoplan.products.surface.plan import SurfacePlan, at_heights
+from photoplan.products.surface.plan import SurfacePlan
 from photoplan.products.surface.spread import median
 from photoplan.project.scene import input_files
+from photoplan.project.target_frame import at_heights
 
 #: What the files hold: name of the file behind that of the product, band, unit.
 KINDS = {

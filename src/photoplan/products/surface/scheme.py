@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.cameras.base import tremor_of
 from photoplan.errors import GeometryError, UsageError
@@ -47,7 +48,12 @@ _RELIEF, _PLANES, _ROOM = 24.0, 24.0, 3.0
 
 
 def scheme_of(
-    settings: SurfaceSettings, looked: Sequence[SeenTarget], grid: MapGrid, frame: Frame | None, gsd: float
+    settings: SurfaceSettings,
+    looked: Sequence[SeenTarget],
+    grid: MapGrid,
+    frame: Frame | None,
+    gsd: float,
+    pixels_there: NDArray[np.float64],
 ) -> tuple[Scheme, float]:
     """The scheme of a surface, and what one pixel of parallax between the outermost images is in height, metres.
 
@@ -61,6 +67,8 @@ def scheme_of(
         Of the target; None: the map.
     gsd : float
         Of the images, metres.
+    pixels_there : ndarray
+        See `pixels_of_places`.
 
     Raises
     ------
@@ -70,7 +78,7 @@ def scheme_of(
         The reach goes beyond what there can be.
     """
     pixels = settings.resolution / gsd
-    ratio, base = _facets(pixels, MOST_RATIO, _pixels_beyond_two(looked, grid, gsd))
+    ratio, base = _facets(pixels, MOST_RATIO, _pixels_beyond_two(pixels_there))
     height_error, usual = _heights_of_a_pixel(looked, gsd)
     reach = _reach(settings, looked, frame, height_error)
     coarsest, search = _coarsest(reach, looked, height_error, base), None
@@ -91,6 +99,15 @@ def finer_levels(looked: Sequence[SeenTarget], gsd: float) -> tuple[int, ...]:
     usual ones they would be sharper than these, which is seen in their residuals.
     """
     return tuple(max(0, math.ceil(math.log2(gsd / one.gsd) - _NEARLY) - 1) for one in looked)
+
+
+def pixels_of_places(
+    looked: Sequence[SeenTarget], levels: Sequence[int], grid: MapGrid, gsd: float
+) -> NDArray[np.float64]:
+    """Pixels, so reduced, that each image has of places of a lattice over a grid, for one of a usual image; 0 where it
+    sees none, shape (n, k, k)."""
+    each = [seen_places(one, grid.bounds) * (gsd / one.gsd / 2**level) ** 2 for one, level in zip(looked, levels)]
+    return np.array(each)
 
 
 def _reach(settings: SurfaceSettings, looked: Sequence[SeenTarget], frame: Frame | None, height_error: float) -> float:
@@ -164,12 +181,10 @@ def _facets(pixels: float, most: int, others: float = 0.0) -> tuple[int, int]:
     return ratio + finer, base
 
 
-def _pixels_beyond_two(looked: Sequence[SeenTarget], grid: MapGrid, gsd: float) -> float:
-    """Pixels that images beyond the two finest have of a place, for one of a usual image, in the mean of the places of
-    a grid that two see: that many images fewer two, if all have pixels of one size; less, if some are coarser."""
-    levels = finer_levels(looked, gsd)
-    each = [seen_places(one, grid.bounds) * (gsd / one.gsd / 2**level) ** 2 for one, level in zip(looked, levels)]
-    pixels = np.sort(each, axis=0)
+def _pixels_beyond_two(pixels: NDArray[np.float64]) -> float:
+    """Pixels that images beyond the two finest have of a place, for one of a usual image, in the mean of the places
+    that two see: that many images fewer two, if all have pixels of one size; less, if some are coarser."""
+    pixels = np.sort(pixels, axis=0)
     two = pixels[-2] > 0
     return float(pixels[:-2].sum(axis=0)[two].mean()) if two.any() else 0.0
 
