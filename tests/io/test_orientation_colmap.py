@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -102,18 +103,57 @@ MODELS = {
     "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
     "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
     "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fx fy cx cy",
+    "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 0 0 k3 k4 0 0",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 k3 k4 0 0 0 0 0 0 0 0",
+    "SIMPLE_DIVISION": "f cx cy 0",
+    "DIVISION": "fx fy cx cy 0",
+    "FOV": "fx fy cx cy 0",
+    "EUCM": "fx fy cx cy 0 1",
 }
+#: COLMAP's model numbers, as its header `sensor/models.h` lists them.
+NUMBERS = {
+    "SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5,
+    "FULL_OPENCV": 6, "FOV": 7, "SIMPLE_RADIAL_FISHEYE": 8, "RADIAL_FISHEYE": 9, "THIN_PRISM_FISHEYE": 10,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 11, "SIMPLE_DIVISION": 12, "DIVISION": 13, "SIMPLE_FISHEYE": 14, "FISHEYE": 15,
+    "EUCM": 16,
+}  # fmt: skip
 
 
+def number(name: str) -> float:
+    return P[name] if name in P else float(name)
+
+
+def model_bin(folder: Path, cameras: list[Any], images: list[Any]) -> None:
+    """Write a binary model after COLMAP's `reconstruction_io_binary.cc`; every image has two points."""
+    data = struct.pack("<Q", len(cameras))
+    for key, kind, values in cameras:
+        data += struct.pack(f"<IiQQ{len(values)}d", key, kind, 1000, 750, *values)
+    (folder / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", len(images))
+    for key, w, t, camera, name in images:
+        data += struct.pack("<I7dI", key, *w, *t, camera) + name.encode() + b"\0"
+        data += struct.pack("<Q", 2) + struct.pack("<ddQ", 1.0, 2.0, 7) * 2
+    (folder / "images.bin").write_bytes(data)
+
+
+@pytest.mark.parametrize("form", ["name", "number", "binary"])
 @pytest.mark.parametrize("name", MODELS)
-def test_models_see_the_documented_pixels(tmp_path: Path, name: str) -> None:
+def test_models_see_the_documented_pixels(tmp_path: Path, name: str, form: str) -> None:
     given = MODELS[name].split()
     q = Rotation.from_rotvec([0.2, -0.4, 1.3])
     t = np.array([1.0, -2.0, 30.0])
     w = np.roll(q.as_quat(), 1)
-    cameras = f"7 {name} 1000 750 {' '.join(repr(P[n]) for n in given)}\n"
-    images = f"3 {' '.join(map(repr, w.tolist()))} {' '.join(map(repr, t.tolist()))} 7 a folder/b c.jpg\n\n"
-    block = read_orientation_block(model(tmp_path, cameras, images) / "images.txt", format="colmap")
+    word = {"name": name, "number": NUMBERS[name]}.get(form)
+    values = [number(n) for n in given]
+    if form == "binary":
+        model_bin(tmp_path, [(7, NUMBERS[name], values)], [(3, w.tolist(), t.tolist(), 7, "a folder/b c.jpg")])
+        block = read_orientation_block(tmp_path)
+    else:
+        cameras = f"7 {word} 1000 750 {' '.join(map(repr, values))}\n"
+        images = f"3 {' '.join(map(repr, w.tolist()))} {' '.join(map(repr, t.tolist()))} 7 a folder/b c.jpg\n\n"
+        block = read_orientation_block(model(tmp_path, cameras, images) / "images.txt", format="colmap")
     assert block.table.images[0].name == "a folder/b c.jpg"
     p = {n: P[n] if n in given else 0.0 for n in P}
     fx, fy = (P["f"], P["f"]) if "f" in given else (P["fx"], P["fy"])
@@ -141,7 +181,10 @@ def test_losses() -> None:
 @pytest.mark.parametrize(
     ("cameras", "images", "says"),
     [
-        (CAMERAS.replace("SIMPLE_PINHOLE", "FOV"), IMAGES, r"cameras\.txt:4: camera model 'FOV' is not supported"),
+        (CAMERAS.replace("SIMPLE_PINHOLE", "MINE"), IMAGES, r"cameras\.txt:4: camera model 'MINE' is not supported"),
+        (CAMERAS.replace("SIMPLE_PINHOLE", "18"), IMAGES, r"cameras\.txt:4: camera model '18' is not supported"),
+        (CAMERAS.replace("SIMPLE_RADIAL", "12"), IMAGES, r"model SIMPLE_DIVISION with k = -0.0218531 has no form here"),
+        (CAMERAS.replace("SIMPLE_PINHOLE 3072 2304 2559.81 1536", "17 8 4 8"), IMAGES, r".*4 numbers|EQUIRECTANGULAR"),
         (CAMERAS.replace("2559.81 ", ""), IMAGES, r"cameras\.txt:4: .*5 numbers"),
         (CAMERAS.replace("2559.81", "-1"), IMAGES, r"cameras\.txt:4: .*greater than 0"),
         (CAMERAS.replace("2 PIN", "1 PIN"), IMAGES, r"cameras\.txt:5: camera 1 is given twice"),
@@ -161,7 +204,79 @@ def test_fault_18_broken_models(tmp_path: Path, cameras: str, images: str, says:
         read_orientation_block(model(tmp_path, cameras, images), format="colmap")
 
 
-def test_a_binary_model_says_how_to_convert_it(tmp_path: Path) -> None:
+def test_an_incomplete_model_is_refused(tmp_path: Path) -> None:
     (tmp_path / "images.bin").write_bytes(b"\0")
-    with pytest.raises(InputError, match="colmap model_converter --output_type TXT"):
+    with pytest.raises(InputError, match="is not a COLMAP model; give the folder"):
         read_orientation_block(tmp_path, format="colmap")
+
+
+@pytest.mark.parametrize("cut", [3, 8, 20, 60, 90, 120])
+def test_fault_31_a_cut_binary_model_is_refused(tmp_path: Path, cut: int) -> None:
+    model_bin(tmp_path, [(1, 1, [900.0, 900.0, 500.0, 375.0])], [(1, [1.0, 0, 0, 0], [0.0, 0, 0], 1, "a.jpg")])
+    whole = (tmp_path / "images.bin").read_bytes()
+    (tmp_path / "images.bin").write_bytes(whole[:cut])
+    with pytest.raises(InputError, match=r"images\.bin: (ends after|image 'a.jpg' has 2 points)"):
+        read_orientation_block(tmp_path, format="colmap")
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 1 << 60) + whole[8:])
+    with pytest.raises(InputError, match="ends after"):
+        read_orientation_block(tmp_path, format="colmap")
+
+
+RIG = Rotation.from_rotvec([0.02, 0.05, -0.3])
+
+
+def rigged(folder: Path, *, moved: float = 0.0, turned: float = 0.0, sensor: int = 2, binary: bool = False) -> Path:
+    """A model of two images of one rig; the second one's pose in images may be moved or turned."""
+    q1, t1 = Rotation.from_rotvec([3.0, 0.2, 0.1]), np.array([4.0, 30.0, -7.0])
+    q21, t21 = RIG, np.array([0.5, 0.02, 0.0])
+    q2, t2 = Rotation.from_rotvec([0, 0, turned]) * q21 * q1, q21.apply(t1) + t21 + [moved, 0, 0]
+
+    def words(q: Rotation, t: np.ndarray) -> list[float]:
+        return [*np.roll(q.as_quat(), 1).tolist(), *t.tolist()]
+
+    def text(q: Rotation, t: np.ndarray) -> str:
+        return " ".join(map(repr, words(q, t)))
+
+    if binary:
+        camera, empty = [900.0, 900.0, 500.0, 375.0], np.array([])
+        images = [(1, words(q1, empty), t1.tolist(), 1, "l/1.jpg"), (2, words(q2, empty), t2.tolist(), 2, "r/1.jpg")]
+        model_bin(folder, [(1, 1, camera), (2, 1, camera)], images)
+        rigs = struct.pack("<QIIiIiIB7d", 1, 1, 2, 0, 1, 0, sensor, 1, *words(q21, t21))
+        frames = struct.pack("<QII7dIiIQiIQ", 1, 1, 1, *words(q1, t1), 2, 0, 1, 1, 0, 2, 2)
+        (folder / "rigs.bin").write_bytes(rigs)
+        (folder / "frames.bin").write_bytes(frames)
+        return folder
+    cameras = "".join(f"{k} PINHOLE 1000 750 900 900 500 375\n" for k in (1, 2))
+    model(folder, cameras, f"1 {text(q1, t1)} 1 l/1.jpg\n\n2 {text(q2, t2)} 2 r/1.jpg\n\n")
+    (folder / "rigs.txt").write_text(f"# rigs\n1 2 CAMERA 1 CAMERA {sensor} 1 {text(q21, t21)}\n")
+    (folder / "frames.txt").write_text(f"1 1 {text(q1, t1)} 2 CAMERA 1 1 CAMERA 2 2\n")
+    return folder
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_rigs_and_frames_are_compared_with_the_images(tmp_path: Path, binary: bool) -> None:
+    block = read_orientation_block(rigged(tmp_path, binary=binary))
+    assert "poses of 2 images agree with rigs" in block.table.notes[0]
+    assert [i.name for i in block.table.images] == ["l/1.jpg", "r/1.jpg"]
+    for wrong in ({"moved": 0.01}, {"turned": 0.001}):
+        with pytest.raises(InputError, match=r"rigs\.\w+ and frames\.\w+ contradict images\.\w+: image 'r/1.jpg'"):
+            read_orientation_block(rigged(tmp_path, binary=binary, **wrong))
+    with pytest.raises(InputError, match="camera 2 is not a sensor of rig 1"):
+        read_orientation_block(rigged(tmp_path, binary=binary, sensor=3))
+
+
+def test_text_and_binary_of_one_folder_agree_or_are_refused(tmp_path: Path) -> None:
+    read_orientation_block(rigged(rigged(tmp_path), binary=True))
+    rigged(tmp_path, moved=0.5)
+    for name in ("rigs.txt", "frames.txt"):
+        (tmp_path / name).unlink()
+    with pytest.raises(InputError, match=r"images\.txt and images\.bin disagree \(image 'r/1.jpg'"):
+        read_orientation_block(tmp_path)
+    assert read_orientation_block(tmp_path / "images.bin").table.images[1].name == "r/1.jpg"
+
+
+def test_outsiders_models(shared: Path, tmp_path: Path) -> None:
+    block = read_orientation_block(shared / "cases/18_colmap4_models/m")
+    assert block.cameras["1"].lens.type == "opencv_fisheye"
+    with pytest.raises(InputError, match=r"image 'cam1/frame 002.tif': \d+ units and 10°"):
+        read_orientation_block(shared / "cases/12_colmap_rigs_disagree/m")

@@ -65,7 +65,7 @@ def _kind(path: Path, head: bytes) -> str | None:
             return name
     if path.suffix.lower() == ".bin" and len(head) >= 8 and struct.unpack_from("<Q", head)[0] < 1 << 32:
         known = path.name if path.name in _COLMAP else "a model"
-        return f"{known} of COLMAP in binary; write it as text: colmap model_converter --output_type TXT"
+        return f"{known} of COLMAP in binary; give its folder as orientation"
     text = head.decode("utf-8", "replace").lstrip("\ufeff")
     for pattern, name in _TEXT:
         if re.search(pattern, text, re.IGNORECASE):

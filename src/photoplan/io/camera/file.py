@@ -79,6 +79,7 @@ CAMERA_FORMATS: dict[str, Callable[[Path], dict[str, CameraEntry]]] = {
     ".xml": orientation_metashape.read_cameras,
     ".cam": camera_pix4d.read,
     ".txt": _text,
+    ".bin": orientation_colmap.read_cameras,
 }
 
 
@@ -95,7 +96,8 @@ class CameraFile:
 
 def read_cameras(path: str | Path) -> CameraFile:
     """Cameras of a file: own TOML, YAML (orthority's layout, OpenCV), JSON of OpenSfM and OpenDroneMap, Metashape's
-    ``cameras.xml``, Pix4D's ``.cam`` and ``calibrated_camera_parameters.txt``, COLMAP's ``cameras.txt``.
+    ``cameras.xml``, Pix4D's ``.cam`` and ``calibrated_camera_parameters.txt``, COLMAP's
+    ``cameras.txt`` and ``cameras.bin``.
 
     Raises
     ------

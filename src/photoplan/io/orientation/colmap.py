@@ -1,15 +1,21 @@
-"""COLMAP's text model: ``cameras.txt``, ``images.txt`` and ``points3D.txt`` of one folder.
+"""COLMAP models, text and binary: cameras, images, rigs and frames of one folder.
 
-As its documentation defines it (colmap.github.io: Output Format, Camera Models, Database Format): an image's pose is a
-unit quaternion (w, x, y, z; Hamilton) and a translation that take world coordinates to camera coordinates, the axes
-being x right, y down, z forwards, so the projection centre is −Rᵀ t. Lenses are OpenCV's. The corner of the upper-left
-pixel is (0, 0), its centre (0.5, 0.5). The world has no CRS.
+As COLMAP's documentation and `reconstruction_io_binary.cc` define it (colmap.github.io: Output Format, Camera Models):
+an image's pose is a unit quaternion (w, x, y, z; Hamilton) and a translation that take world coordinates to camera
+coordinates, the axes being x right, y down, z forwards, so the projection centre is −Rᵀ t. Lenses are OpenCV's. The
+corner of the upper-left pixel is (0, 0), its centre (0.5, 0.5). The world has no CRS.
+
+Since version 3.12, ``rigs`` and ``frames`` state the same poses once more: camera-from-world is sensor-from-rig times
+rig-from-world. COLMAP itself uses these and ignores the poses of ``images``; here both must agree.
 """
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,23 +25,77 @@ from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
+from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
 from photoplan.io.orientation.text import numbers
-from photoplan.io.plain_files import read_text
+from photoplan.io.plain_files import finite, read_text
 
 MAX_BYTES = 2 << 30
-#: Parameters of every model: one or two focal lengths f, principal point c, coefficients of the lens.
+#: Parameters of every camera model, in the order of COLMAP's model numbers (0, 1, 2, …).
 _MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "FOV": ("fx", "fy", "cx", "cy", "omega"),
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        *("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4"),
+    ),
+    "SIMPLE_DIVISION": ("f", "cx", "cy", "k"),
+    "DIVISION": ("fx", "fy", "cx", "cy", "k"),
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
+    "EUCM": ("fx", "fy", "cx", "cy", "alpha", "beta"),
+    "EQUIRECTANGULAR": ("w", "h"),
 }
+_NUMBERED = tuple(_MODELS)
+_BINARY = ("cameras.bin", "images.bin", "rigs.bin", "frames.bin")
+_FISHEYES = tuple(name for name in _MODELS if name.endswith("FISHEYE"))
+#: Parameters that must be 0, by model: this program has no lens with these terms.
+_ZERO = {
+    "FOV": ("omega",),
+    "THIN_PRISM_FISHEYE": ("p1", "p2", "sx1", "sy1"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ("k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4"),
+    "SIMPLE_DIVISION": ("k",),
+    "DIVISION": ("k",),
+    "EUCM": ("alpha",),
+}
+#: Poses of rigs and images may differ by rounding only: radians, and parts of the spread of the projection centres.
+_TURNED, _APART = 1e-4, 1e-3
+
+
+@dataclass(frozen=True)
+class _Rigid:
+    """World coordinates to those of a camera or a rig: x = R X + t."""
+
+    R: NDArray[np.float64]
+    t: NDArray[np.float64]
+
+    def __matmul__(self, other: _Rigid) -> _Rigid:
+        return _Rigid(self.R @ other.R, self.R @ other.t + self.t)
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """Origin of the camera in world coordinates (3,)."""
+        return -self.R.T @ self.t
+
+
+@dataclass
+class _Model:
+    """Contents of one folder; keys are COLMAP's numbers."""
+
+    cameras: dict[str, CameraEntry] = field(default_factory=dict)
+    images: dict[int, tuple[str, str, _Rigid, int | None]] = field(default_factory=dict)
+    """Name, camera, pose and line of the file."""
+    rigs: dict[int, dict[int, _Rigid | None]] = field(default_factory=dict)
+    """Sensor-from-rig of every camera; None: not stated."""
+    frames: dict[int, tuple[int, _Rigid, list[tuple[int, int]]]] = field(default_factory=dict)
+    """Rig, rig-from-world, and the camera and image numbers of the frame."""
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
@@ -44,64 +104,150 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     Parameters
     ----------
     path : Path
-        The folder, or one of its files.
+        The folder, or one of its files. A file decides between text and binary if the folder has both.
 
     Raises
     ------
     InputError
-        A file is missing or a line is not of the format; the message names it.
+        A file is missing or damaged, or rigs and frames contradict the images; the message names the file.
     """
-    folder = _folder(path)
-    cameras = read_cameras(folder / "cameras.txt")
-    images = tuple(_images(folder / "images.txt"))
-    note = "a COLMAP model states no CRS; unless it was georeferenced, position, scale and axes are its own"
-    table = OrientationTable(folder / "images.txt", images, notes=(note,))
-    used = {i.camera for i in images}
-    return OrientationBlock(table, {name: c for name, c in cameras.items() if name in used})
-
-
-def _folder(path: Path) -> Path:
     folder = path if path.is_dir() else path.parent
-    missing = [n for n in ("cameras.txt", "images.txt") if not (folder / n).is_file()]
-    if missing:
-        binary = (folder / "images.bin").is_file()
-        hint = "; convert the model to text: colmap model_converter --output_type TXT" if binary else ""
-        raise InputError(f"{folder}: holds no {' and no '.join(missing)}, so it is no COLMAP model as text{hint}")
-    return folder
+    forms = [s for s in ("txt", "bin") if all((folder / f"{n}.{s}").is_file() for n in ("cameras", "images"))]
+    if not forms:
+        missing = [n for n in ("cameras.txt", "images.txt") if not (folder / n).is_file()]
+        raise InputError(
+            f"{folder}: has no {' and no '.join(missing)}, so it is not a COLMAP model; "
+            "give the folder with cameras and images as .txt or .bin"
+        )
+    if path.suffix[1:].lower() in forms:
+        forms = [path.suffix[1:].lower()]
+    models = {suffix: _read_model(folder, suffix) for suffix in forms}
+    if len(models) == 2:
+        poses = [{n: pose for n, _, pose, _ in model.images.values()} for model in models.values()]
+        differing = next((n for n in poses[0].keys() ^ poses[1].keys()), None) or _contradiction(*poses)
+        if differing is not None:
+            raise InputError(
+                f"{folder}: images.txt and images.bin disagree (image {differing}); "
+                "give the file that is meant, or remove the other one"
+            )
+    suffix, model = next(iter(models.items()))
+    notes = _check_rigs(model, folder, suffix)
+    file = folder / f"images.{suffix}"
+    images = tuple(
+        posed(name, pose.center, pose.R.T @ FLIP, camera, line) for name, camera, pose, line in model.images.values()
+    )
+    notes.append("a COLMAP model states no CRS; unless it was georeferenced, position, scale and axes are its own")
+    used = {i.camera for i in images}
+    cameras = {name: c for name, c in model.cameras.items() if name in used}
+    return OrientationBlock(OrientationTable(file, images, notes=tuple(notes)), cameras)
+
+
+def _contradiction(stated: dict[str, _Rigid], others: dict[str, _Rigid]) -> str | None:
+    """The first image whose poses differ by more than rounding, with the difference; None: all agree."""
+    centers = np.array([pose.center for pose in stated.values()]).reshape(-1, 3)
+    spread = float(np.sqrt(((centers - centers.mean(axis=0)) ** 2).sum(axis=1).mean())) if len(centers) else 0.0
+    for name in stated.keys() & others.keys():
+        one, other = stated[name], others[name]
+        turned = float(np.linalg.norm(Rotation.from_matrix(one.R @ other.R.T).as_rotvec()))
+        apart = float(np.linalg.norm(one.center - other.center))
+        if turned > _TURNED or apart > max(_APART * spread, 1e-8 * float(np.linalg.norm(one.center))):
+            return f"{name!r}: {apart:.3g} units and {np.degrees(turned):.3g}° apart"
+    return None
+
+
+def _check_rigs(model: _Model, folder: Path, suffix: str) -> list[str]:
+    """Refuse rigs and frames that contradict the images; return notes on what could not be compared."""
+    if not model.frames:
+        return []
+    where = f"{folder}: rigs.{suffix} and frames.{suffix}"
+    expected: dict[str, _Rigid] = {}
+    open_ = 0
+    for number, (rig, rig_from_world, members) in model.frames.items():
+        if rig not in model.rigs:
+            raise InputError(f"{where}: frame {number} is of rig {rig}, which is not described")
+        for camera, image in members:
+            if image not in model.images:
+                continue
+            name, own, _, _ = model.images[image]
+            if str(camera) != own:
+                raise InputError(f"{where}: image {name!r} is of camera {camera}, but images.{suffix} states {own}")
+            if camera not in model.rigs[rig]:
+                raise InputError(f"{where}: frame {number}: camera {camera} is not a sensor of rig {rig}")
+            sensor = model.rigs[rig][camera]
+            if sensor is None:
+                open_ += 1
+            else:
+                expected[name] = sensor @ rig_from_world
+    found = _contradiction({n: pose for n, _, pose, _ in model.images.values()}, expected)
+    if found is not None:
+        raise InputError(
+            f"{where} contradict images.{suffix}: image {found}. Export the model again with COLMAP; if "
+            f"images.{suffix} is right, give a folder without rigs and frames"
+        )
+    notes = [f"poses of {len(expected)} images agree with rigs.{suffix} and frames.{suffix}"] if expected else []
+    unknown = len(model.images) - len(expected)
+    if unknown:
+        notes.append(f"{unknown} images: rigs and frames state no pose; those of images.{suffix} are used")
+    return notes
 
 
 def read_cameras(path: Path) -> dict[str, CameraEntry]:
-    """Cameras of a ``cameras.txt`` by their number, as text.
+    """Cameras of a ``cameras.txt`` or ``cameras.bin`` by their number, as text.
 
     Raises
     ------
     InputError
         A line is not of the format, or the model is not supported.
     """
+    if path.suffix.lower() == ".bin":
+        return _Binary(path).cameras()
     cameras: dict[str, CameraEntry] = {}
     for number, line in _lines(path):
         words = line.split()
         where = f"{path}:{number}"
-        if len(words) < 5 or words[1] not in _MODELS:
-            given = words[1] if len(words) > 1 else line[:50]
-            raise InputError(f"{where}: camera model {given!r} is not supported; allowed are {', '.join(_MODELS)}")
-        if words[0] in cameras:
-            raise InputError(f"{where}: camera {words[0]} is given twice")
-        cameras[words[0]] = _camera(words[1], words[2:], where)
+        if len(words) < 4:
+            raise InputError(f"{where}: {line[:50]!r}; CAMERA_ID, MODEL, WIDTH, HEIGHT and parameters are needed")
+        model = _model_name(words[1], where)
+        values = numbers(words[2:], where, f"camera model {model}", 2 + len(_MODELS[model]))
+        _add_camera(cameras, words[0], model, values, where)
     return cameras
 
 
-def _camera(model: str, words: list[str], where: str) -> CameraEntry:
-    width, height, *values = numbers(words, where, f"camera model {model}", 2 + len(_MODELS[model]))
-    v = dict(zip(_MODELS[model], values))
+def _model_name(given: str, where: str) -> str:
+    """Name of a camera model that is given by name or number."""
+    name = _NUMBERED[int(given)] if given.isdecimal() and int(given) < len(_NUMBERED) else given
+    if name not in _MODELS:
+        raise InputError(f"{where}: camera model {given!r} is not supported; it must be one of {', '.join(_MODELS)}")
+    return name
+
+
+def _add_camera(cameras: dict[str, CameraEntry], key: str, model: str, values: Iterable[float], where: str) -> None:
+    width, height, *parameters = values
+    v = dict(zip(_MODELS[model], parameters))
+    odd = [f"{name} = {v[name]:g}" for name in _ZERO.get(model, ()) if v[name] != 0]
+    if odd or "cx" not in v:
+        terms = f" with {', '.join(odd)}" if odd else ""
+        raise InputError(
+            f"{where}: camera model {model}{terms} has no form here; undistort the images with "
+            "`colmap image_undistorter`, or calibrate with OPENCV, FULL_OPENCV or OPENCV_FISHEYE"
+        )
+    if key in cameras:
+        raise InputError(f"{where}: camera {key} is given twice")
     focal = (v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0)))
-    fisheye = model.endswith("FISHEYE")
+    fisheye = model in _FISHEYES
     k = tuple(v.get(f"k{i + 1}", 0.0) for i in range(4 if fisheye else 6))
-    p = (v.get("p1", 0.0), v.get("p2", 0.0))
-    form = OpenCVForm(
-        size=(int(width), int(height)), focal=focal, point=(v["cx"] - 0.5, v["cy"] - 0.5), fisheye=fisheye, k=k, p=p
-    )
-    return frame_camera(form, where)
+    p = (0.0, 0.0) if fisheye else (v.get("p1", 0.0), v.get("p2", 0.0))
+    size, point = (int(width), int(height)), (v["cx"] - 0.5, v["cy"] - 0.5)
+    cameras[key] = frame_camera(OpenCVForm(size=size, focal=focal, point=point, fisheye=fisheye, k=k, p=p), where)
+
+
+def _rigid(values: Iterable[float], where: str) -> _Rigid:
+    """A pose of QW, QX, QY, QZ, TX, TY, TZ."""
+    numbers_ = np.array(list(values), float)
+    length = float(np.linalg.norm(numbers_[:4]))
+    if not 0.99 < length < 1.01:
+        raise InputError(f"{where}: the quaternion has the length {length:.3g}, not 1")
+    return _Rigid(Rotation.from_quat(np.roll(numbers_[:4], -1)).as_matrix(), numbers_[4:])
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -110,7 +256,23 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-def _images(path: Path) -> Iterator[OrientedImage]:
+def _read_model(folder: Path, suffix: str) -> _Model:
+    """All files of one form; rigs and frames only where both are there."""
+    rigged = all((folder / f"{name}.{suffix}").is_file() for name in ("rigs", "frames"))
+    model = _Model(read_cameras(folder / f"cameras.{suffix}"))
+    if suffix == "bin":
+        model.images = _Binary(folder / "images.bin").images()
+        if rigged:
+            model.rigs = _Binary(folder / "rigs.bin").rigs()
+            model.frames = _Binary(folder / "frames.bin").frames()
+    else:
+        _text_images(folder / "images.txt", model)
+        if rigged:
+            _text_rigs(folder, model)
+    return model
+
+
+def _text_images(path: Path, model: _Model) -> None:
     """Every image; the line of its points, which may be empty, is passed over."""
     lines = enumerate(read_text(path, MAX_BYTES).split("\n"), 1)
     for number, line in lines:
@@ -123,15 +285,140 @@ def _images(path: Path) -> Iterator[OrientedImage]:
                 f"{where}: {len(words)} columns; IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID and NAME are needed "
                 "(a line with points follows every image, even if it is empty)"
             )
-        values = numbers(words[1:8], where, f"image {words[9]!r}: pose", 7)
-        q, t = np.array(values[:4]), np.array(values[4:])
-        if not 0.99 < np.linalg.norm(q) < 1.01:
-            raise InputError(
-                f"{where}: image {words[9]!r}: the quaternion has the length {np.linalg.norm(q):.3g}, not 1"
-            )
-        R_camera_world = Rotation.from_quat(np.roll(q, -1)).as_matrix()
-        yield posed(words[9].strip(), -R_camera_world.T @ t, R_camera_world.T @ FLIP, words[8], number)
+        name = words[9].strip()
+        pose = _rigid(numbers(words[1:8], where, f"image {name!r}: pose", 7), f"{where}: image {name!r}")
+        key = _whole(words[0], where)
+        if key in model.images:
+            raise InputError(f"{where}: image number {key} is given twice ({model.images[key][0]!r} and {name!r})")
+        model.images[key] = (name, words[8], pose, number)
         next(lines, None)
+
+
+def _text_rigs(folder: Path, model: _Model) -> None:
+    for number, line in _lines(folder / "rigs.txt"):
+        where = f"{folder / 'rigs.txt'}:{number}"
+        words = _Words(line, where)
+        sensors = model.rigs.setdefault(words.whole(), {})
+        for k in range(words.whole()):
+            kind, sensor = words.next(), words.whole()
+            # The reference sensor is the rig itself and has no pose of its own.
+            stated = k > 0 and words.whole() != 0
+            pose = words.pose() if stated else None if k else _Rigid(np.eye(3), np.zeros(3))
+            if kind == "CAMERA":
+                sensors[sensor] = pose
+    for number, line in _lines(folder / "frames.txt"):
+        words = _Words(line, f"{folder / 'frames.txt'}:{number}")
+        frame, rig, pose = words.whole(), words.whole(), words.pose()
+        data = [(words.next(), words.whole(), words.whole()) for _ in range(words.whole())]
+        model.frames[frame] = rig, pose, [(sensor, image) for kind, sensor, image in data if kind == "CAMERA"]
+
+
+def _whole(word: str, where: str) -> int:
+    if not word.isdecimal() or len(word) > 20:
+        raise InputError(f"{where}: {word[:40]!r} is not a whole number")
+    return int(word)
+
+
+class _Words:
+    """The words of one line, taken one after the other."""
+
+    def __init__(self, line: str, where: str) -> None:
+        self._words, self._where = iter(line.split()), where
+
+    def next(self) -> str:
+        """Return the next word."""
+        word = next(self._words, None)
+        if word is None:
+            raise InputError(f"{self._where}: the line ends too early; export the model again")
+        return word
+
+    def whole(self) -> int:
+        """Return the next word as a whole number."""
+        return _whole(self.next(), self._where)
+
+    def pose(self) -> _Rigid:
+        """Return the next seven words as a pose."""
+        return _rigid(numbers([self.next() for _ in range(7)], self._where, "pose", 7), self._where)
+
+
+class _Binary:
+    """A binary file, read from its beginning; every count is compared with what is left of the file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._at = path, 0
+        try:
+            if path.stat().st_size > MAX_BYTES:
+                raise InputError(f"{path}: more than {MAX_BYTES} bytes; at most that many are read")
+            self._data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+    def _take(self, code: str) -> tuple[Any, ...]:
+        end = self._at + struct.calcsize("<" + code)
+        if end > len(self._data):
+            raise InputError(f"{self._path}: ends after {len(self._data)} bytes, in the middle of an entry")
+        values = struct.unpack_from("<" + code, self._data, self._at)
+        self._at = end
+        return values
+
+    def _pose(self, what: str) -> _Rigid:
+        where = f"{self._path}: {what}"
+        return _rigid(finite(self._take("7d"), where, 7), where)
+
+    def cameras(self) -> dict[str, CameraEntry]:
+        """Return the cameras of ``cameras.bin``."""
+        cameras: dict[str, CameraEntry] = {}
+        for _ in range(self._take("Q")[0]):
+            key, number, width, height = self._take("IiQQ")
+            where = f"{self._path}: camera {key}"
+            model = _model_name(str(number), where)
+            if max(width, height) > 1 << 31:
+                raise InputError(f"{where}: {width} × {height} pixels; the file is damaged")
+            values = finite(self._take(f"{len(_MODELS[model])}d"), where, len(_MODELS[model]))
+            _add_camera(cameras, str(key), model, (width, height, *values), where)
+        return cameras
+
+    def images(self) -> dict[int, tuple[str, str, _Rigid, int | None]]:
+        """Return the images of ``images.bin``; their points are passed over."""
+        images: dict[int, tuple[str, str, _Rigid, int | None]] = {}
+        for _ in range(self._take("Q")[0]):
+            (key,) = self._take("I")
+            pose, (camera,) = self._pose(f"image {key}"), self._take("I")
+            end = self._data.find(b"\0", self._at)
+            name = self._data[self._at : max(end, self._at)].decode("utf-8", "replace")
+            self._at = end + 1 if end >= 0 else len(self._data)
+            (points,) = self._take("Q")
+            if points > (len(self._data) - self._at) // 24:
+                raise InputError(f"{self._path}: image {name[:200]!r} has {points} points, more than the file holds")
+            self._at += 24 * points
+            if key in images:
+                raise InputError(f"{self._path}: image number {key} is given twice ({images[key][0]!r} and {name!r})")
+            images[key] = (name, str(camera), pose, None)
+        return images
+
+    def rigs(self) -> dict[int, dict[int, _Rigid | None]]:
+        """Return the rigs of ``rigs.bin``; sensors of type 0 are cameras."""
+        rigs: dict[int, dict[int, _Rigid | None]] = {}
+        for _ in range(self._take("Q")[0]):
+            key, count = self._take("II")
+            sensors = rigs.setdefault(key, {})
+            for k in range(count):
+                kind, sensor = self._take("iI")
+                stated = k > 0 and self._take("B")[0] != 0
+                pose = self._pose(f"rig {key}") if stated else None if k else _Rigid(np.eye(3), np.zeros(3))
+                if kind == 0:
+                    sensors[sensor] = pose
+        return rigs
+
+    def frames(self) -> dict[int, tuple[int, _Rigid, list[tuple[int, int]]]]:
+        """Return the frames of ``frames.bin``."""
+        frames = {}
+        for _ in range(self._take("Q")[0]):
+            key, rig = self._take("II")
+            pose, (count,) = self._pose(f"frame {key}"), self._take("I")
+            data = [self._take("iIQ") for _ in range(count)]
+            frames[key] = rig, pose, [(sensor, image) for kind, sensor, image in data if kind == 0]
+        return frames
 
 
 def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
@@ -182,10 +469,12 @@ def _losses(block: OrientationBlock) -> Iterable[Loss]:
 
 def _sniff(path: Path, head: str) -> bool:
     if path.is_dir():
-        return (path / "images.txt").is_file() and (path / "cameras.txt").is_file()
+        return any(all((path / f"{n}.{s}").is_file() for n in ("images", "cameras")) for s in ("txt", "bin"))
+    if path.suffix.lower() == ".bin":
+        return path.name in _BINARY
     return "IMAGE_ID, QW, QX, QY, QZ" in head or "CAMERA_ID, MODEL, WIDTH, HEIGHT" in head
 
 
 FORMAT = OrientationFormat(
-    name="colmap", title="COLMAP model as text", sniff=_sniff, read=read, render=_render, losses=_losses, suffix=""
+    name="colmap", title="COLMAP model", sniff=_sniff, read=read, render=_render, losses=_losses, suffix=""
 )
