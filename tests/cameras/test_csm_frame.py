@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 import rasterio
 from numpy.typing import NDArray
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from tools.command import inside
 
 from photoplan.cameras.base import project
 from photoplan.errors import InputError
+from photoplan.geometry.crs import crs_step
 from photoplan.io.camera.csm_frame import is_frame, read, read_frame
 from photoplan.io.camera.line.file import read_line
 from photoplan.plan.footprint import footprint
@@ -102,18 +103,56 @@ class TestOverItsBody:
         assert np.abs(camera.derivatives(XYZ) - apart).max() < 1e-6
 
     def test_beside_and_behind_the_body_there_is_nothing(self) -> None:
-        """Ceres fills the image but for its corners: rays there meet nothing, and its far side is not seen."""
+        """Ceres fills the image: rays beside it meet nothing, and its far side is not seen."""
         stated = read_frame(DATA / "ceres_dawnfc.json")
         camera = stated.camera("+proj=stere +lat_0=-90 +a=482000 +b=446000 +units=m +no_defs", "ellipsoidal")
-        middle, corner = camera.rays(np.array([[511.5, 511.5], [1023.0, 1023.0]]), 0.0)[0]
+        middle, corner, beside = camera.rays(np.array([[511.5, 511.5], [1023.0, 1023.0], [1600.0, 1600.0]]), 0.0)[0]
         seen = footprint(camera, LevelSurface(0.0), None)
-        assert np.isfinite(middle).all() and np.isnan(corner).all()
-        assert seen.bounds is not None and 0.5 < seen.on_surface < 1.0
+        assert np.isfinite([middle, corner]).all() and np.isnan(beside).all()
+        assert seen.bounds is not None and seen.on_surface == 1.0
         # A point over the other pole, in a map that has it, lies on the line of sight, and is not seen.
         north = stated.camera("+proj=eqc +a=482000 +b=446000 +units=m +no_defs", "ellipsoidal")
         over = np.stack([np.linspace(-1e6, 1e6, 9), np.full(9, 7e5), np.zeros(9)], axis=-1)
         assert np.isnan(project(north, over)).all()
         assert np.isfinite(project(stated.frame, north.ground(over))).any()
+
+    @pytest.mark.parametrize(
+        "projection", ["eqc", "merc", "lcc +lat_1=20 +lat_2=40", "stere +lat_0=40 +lon_0=30", "stere +lat_0=90", "moll"]
+    )
+    @pytest.mark.parametrize("name", ["vesta_radtan", "edited_vesta_radtan"])
+    def test_every_ray_that_meets_a_flattened_body_has_its_place(self, name: str, projection: str) -> None:
+        """The reference's places, by PROJ's own forward projection, over all of the image; asked: to a centimetre."""
+        stated = read_frame(DATA / f"{name}.json")
+        crs = f"+proj={projection} +a={stated.radii[0]!r} +b={stated.radii[1]!r} +units=m +no_defs"
+        camera = stated.camera(crs, "ellipsoidal")
+        table = np.loadtxt(DATA / f"{name}.points.txt")
+        table = table[(table[:, -1] == 0) & (table[:, 2] == 0)]
+        place = camera.rays(table[:, 1::-1] - 0.5, table[:, 2])[0]
+        X, Y, Z = table[:, 3:6].T
+        lon, lat = np.arctan2(Y, X), np.arctan(Z / np.hypot(X, Y) * (stated.radii[0] / stated.radii[1]) ** 2)
+        wanted = Transformer.from_crs(CRS(crs).geodetic_crs, crs, always_xy=True).transform(*np.degrees([lon, lat]))
+        off = np.abs(place[:, :2] - np.stack(wanted, axis=-1)).max()
+        print(f"\n{name}, {projection}: {len(table)} rays, {off:.1e} m")
+        assert off < 0.01
+        assert np.abs(project(camera, place) - (table[:, 1::-1] - 0.5)).max() < 1e-6
+
+    @pytest.mark.parametrize("projection", ["laea", "laea +lat_0=40 +lon_0=10", "sinu", "cea"])
+    def test_a_projection_that_proj_cannot_invert_there_is_refused_by_name(self, projection: str) -> None:
+        """They lead 1 to 900 m away on Vesta; the same projections are right on a sphere, and on the earth."""
+        stated = read_frame(DATA / "vesta_radtan.json")
+        a, b = stated.radii
+        camera = stated.camera(f"+proj={projection} +a={a!r} +b={b!r} +units=m +no_defs", "ellipsoidal")
+        name = projection.split()[0]
+        with pytest.raises(InputError, match=rf"\+proj={name}.*PROJ cannot invert.*289 and 229 km.* m away; choose"):
+            camera.rays(np.array([[511.5, 511.5], [300.0, 700.0]]), 0.0)
+        with pytest.raises(InputError, match="PROJ cannot invert"):
+            footprint(camera, LevelSurface(0.0), None)
+        eqc = f"+proj=eqc +a={a!r} +b={b!r} +units=m +no_defs"
+        with pytest.raises(InputError, match="PROJ cannot invert"):
+            crs_step(camera.ground.crs, eqc, (50_000.0, 50_000.0, 60_000.0, 60_000.0))
+        sphere = stated.camera(f"+proj={projection} +R={a!r} +units=m +no_defs", "ellipsoidal")
+        assert np.isfinite(sphere.rays(np.array([[511.5, 511.5]]), 0.0)[0]).all()
+        crs_step(f"+proj={projection} +datum=WGS84 +units=m", "EPSG:4326", (1e5, 1e5, 2e5, 2e5))
 
     def test_a_map_of_another_body_is_refused(self) -> None:
         with pytest.raises(InputError, match=r"radius 2439.4 km.* 6378.1 km"):

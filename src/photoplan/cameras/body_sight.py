@@ -44,13 +44,15 @@ def meet(ground: BodyGround, S: _Floats, d: _Floats, heights: _Floats) -> tuple[
         Unit direction there, on the map.
     """
     with np.errstate(all="ignore"):
-        r = to_sphere(S, d, radius_below(ground, S) + heights)
-        at = S + r[:, None] * d
-        cos = np.einsum("ni,ni->n", at, d) / np.linalg.norm(at, axis=1)
+        # The ellipsoid at these heights, nearly, is the unit sphere in units of its semi-axes.
+        axes = np.stack([ground.ellipsoid.a + heights] * 2 + [ground.ellipsoid.b + heights], axis=1)
+        way = np.linalg.norm(d / axes, axis=1)
+        r = to_sphere(S / axes, d / axes / way[:, None], 1.0) / way
         for _ in range(12):
-            point = ground.to_map(S + r[:, None] * d)
+            at = S + r[:, None] * d
+            point = ground.to_map(at)
             miss = point[:, 2] - heights
-            r = r - miss / cos
+            r = r - miss / np.einsum("ni,ni->n", ground.ellipsoid.up(at), d)
             # The step that was taken gains three digits and more.
             if not (np.abs(miss) > _CLOSE).any():
                 break

@@ -88,8 +88,12 @@ class BodyGround:
 
     def height(self, xyz: ArrayLike) -> NDArray[np.float64]:
         """Height above the body's ellipsoid (...) of points in its axes (..., 3), metres."""
-        ellipsoid = self._own.ellipsoid if self._geodetic is None else self._wgs84
-        return ellipsoid.geodetic(np.asarray(xyz, float))[2]
+        return self.ellipsoid.geodetic(np.asarray(xyz, float))[2]
+
+    @property
+    def ellipsoid(self) -> Ellipsoid:
+        """The body's, whose middle and axes are those of the body."""
+        return self._own.ellipsoid if self._geodetic is None else self._wgs84
 
     @property
     def reach(self) -> float:

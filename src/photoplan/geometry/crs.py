@@ -50,6 +50,8 @@ def parse_crs(text: str, where: str = "CRS") -> CRS:
 
 #: A map's metre on the ground: units are converted, projections stretch.
 _SCALES = 0.1, 10.0
+#: The inverse of a projection undoes it to this, metres (PROJ's LAEA on the earth: tenths of a millimetre).
+INVERTED = 1e-3
 #: Radii of bodies that ellipsoids describe, from Phobos to Jupiter, metres; those of planets in kilometres are not.
 _RADII = 1e4, 1e8
 
@@ -61,21 +63,111 @@ def _unusable(crs: CRS) -> str:
     radius = 6378137.0 if crs.ellipsoid is None else crs.ellipsoid.semi_major_metre
     if not _RADII[0] < radius < _RADII[1]:
         return f"a body of radius {radius / 1000:g} km"
-    # Some of these places are near the middle of any map.
-    lon, lat = (v.ravel() for v in np.meshgrid(np.arange(-180.0, 180.0, 15.0), np.arange(-75.0, 80.0, 25.0)))
     try:
-        transformer = Transformer.from_crs(crs.geodetic_crs, crs, always_xy=True)
-        x, y = transformer.transform(lon, lat)
-        north = transformer.transform(lon, lat + 0.01)
-        back = transformer.transform(x, y, direction="INVERSE")
+        usable = np.isfinite(_axes_on_ground(crs)).all(axis=(1, 2)).any()
     except ProjError:
         return "PROJ cannot compute with its numbers"
+    return "" if usable else (
+        "nowhere is one of its metres near a metre and its inverse leads back: a number of it is wrong, or PROJ cannot "
+        "invert it on its body"
+    )
+
+
+def _axes_on_ground(crs: CRS) -> NDArray[np.float64]:
+    """Return X and Y (rows) per hundredth of a degree east and north (columns) at places of the earth, (n, 2, 2).
+
+    NaN where the projection is not usable. Some of the places are near the middle of any map; the first is in the
+    middle of the area of use, if the CRS states one.
+    """
+    lon, lat = (v.ravel() for v in np.meshgrid(np.arange(-180.0, 180.0, 15.0), np.arange(-75.0, 80.0, 25.0)))
+    area = crs.area_of_use
+    if area is not None:
+        east = (area.east - area.west) % 360.0 or 360.0
+        lon, lat = np.append(area.west + east / 2, lon), np.append((area.south + area.north) / 2, lat)
+    radius = 6378137.0 if crs.ellipsoid is None else crs.ellipsoid.semi_major_metre
+    geodetic = crs.geodetic_crs
+    unit = np.radians(1.0) / (1.0 if geodetic is None else geodetic.axis_info[0].unit_conversion_factor)
+    transformer = Transformer.from_crs(geodetic, crs, always_xy=True)
+    at = np.stack(transformer.transform(lon * unit, lat * unit), axis=-1)
+    north = np.stack(transformer.transform(lon * unit, (lat + 0.01) * unit), axis=-1)
+    east = np.stack(transformer.transform((lon + 0.01) * unit, lat * unit), axis=-1)
+    back = transformer.transform(at[:, 0], at[:, 1], direction="INVERSE")
     with np.errstate(all="ignore"):
-        turned = (back[0] - lon + 180.0) % 360.0 - 180.0
-        scale = np.hypot(north[0] - x, north[1] - y) * crs.axis_info[0].unit_conversion_factor / (_HUNDREDTH * radius)
-        close = np.hypot(turned, back[1] - lat) < 1e-6
-        usable = close & (scale > _SCALES[0]) & (scale < _SCALES[1])
-    return "" if usable.any() else "nowhere is one of its metres near a metre: a number of it is wrong"
+        axes = np.stack([east - at, north - at], axis=-1)
+        turned = nearest_turn(back[0] / unit - lon, 0.0, 360.0)
+        metres = crs.axis_info[0].unit_conversion_factor / (_HUNDREDTH * radius)
+        scale = np.linalg.norm(axes[:, :, 1], axis=1) * metres
+        close = np.hypot(turned, back[1] / unit - lat) < 1e-6
+        axes[~(close & (scale > _SCALES[0]) & (scale < _SCALES[1]))] = np.nan
+    return axes
+
+
+@lru_cache(maxsize=256)
+def is_left_handed(text: str) -> bool:
+    """Whether X, Y and heights of a projected CRS are a left-handed system, such as X south and Y west."""
+    axes = _axes_on_ground(parse_crs(text))
+    turns = np.linalg.det(axes[np.isfinite(axes).all(axis=(1, 2))])
+    return bool(len(turns) and turns[0] < 0)
+
+
+def nearest_turn(x: ArrayLike, about: ArrayLike, turn: float) -> NDArray[np.float64]:
+    """Longitudes, or X of a map that goes round the earth, counted within half a turn about a place."""
+    x = np.asarray(x, float)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(x - turn * np.round((x - about) / turn))
+
+
+@lru_cache(maxsize=256)
+def turn_of(text: str) -> float | None:
+    """Length in X of one turn about the earth in a CRS: geographic ones, and maps on a cylinder; None: others."""
+    crs = parse_crs(text)
+    crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    if crs.is_geographic:
+        return float(2.0 * np.pi / crs.axis_info[0].unit_conversion_factor)
+    if not crs.is_projected or crs.geodetic_crs is None:
+        return None
+    turn = turn_of(crs.geodetic_crs.to_wkt()) or 360.0
+    lon = np.arange(-180.0, 180.0, 5.0) / 360.0 * turn
+    to_map = Transformer.from_crs(crs.geodetic_crs, crs, always_xy=True)
+    X, X_north = (np.asarray(to_map.transform(lon, np.full(len(lon), lat * turn / 360.0))[0]) for lat in (0.0, 40.0))
+    if not (np.isfinite(X).all() and np.isfinite(X_north).all()):
+        return None
+    step = float(np.median(np.diff(X)))
+    even = step > 0 and np.abs(nearest_turn(np.diff(X) - step, 0.0, step * len(lon))).max() < 1e-6 * step
+    return step * len(lon) if even and np.abs(X - X_north).max() < 1e-6 * step else None
+
+
+def refuse_inexact(crs: str, XY: ArrayLike) -> None:
+    """Refuse a projection which PROJ cannot invert at map points (n, 2): there and back must lead to the same place.
+
+    Raises
+    ------
+    InputError
+        It leads more than a millimetre away; some projections have no exact inverse on flattened bodies.
+    """
+    parsed = parse_crs(crs)
+    XY = np.asarray(XY, float).reshape(-1, 2)
+    if not parsed.is_projected or parsed.geodetic_crs is None:
+        return
+    to_map = Transformer.from_crs(parsed.geodetic_crs, parsed, always_xy=True)
+    lonlat = to_map.transform(XY[:, 0], XY[:, 1], direction="INVERSE")
+    back = np.stack(to_map.transform(*lonlat), axis=-1)
+    off = np.linalg.norm(back - XY, axis=1) * parsed.axis_info[0].unit_conversion_factor
+    known = np.isfinite(off)
+    if (off[known] > INVERTED).any():
+        raise inexact_projection(crs, float(off[known].max()))
+
+
+def inexact_projection(crs: str, off: float) -> InputError:
+    """The error for a projection that PROJ cannot invert on its body: there and back leads so many metres away."""
+    ellipsoid = parse_crs(crs).ellipsoid
+    radii = "" if ellipsoid is None else (
+        f" on a body with radii {ellipsoid.semi_major_metre / 1000:.6g} and {ellipsoid.semi_minor_metre / 1000:.6g} km"
+    )
+    return InputError(
+        f"CRS {crs_label(crs)!r}: PROJ cannot invert this projection{radii}: there and back leads {off:.3g} m away; "
+        "choose another projection, such as +proj=eqc or +proj=lcc, or a sphere (+R=…)"
+    )
 
 
 def require_projected_metres(text: str, where: str = "CRS") -> CRS:
@@ -105,7 +197,24 @@ def require_projected_metres(text: str, where: str = "CRS") -> CRS:
             f"{where}: {crs.name!r} is in {', '.join(sorted(units))}; a projected CRS in metres is needed "
             "(inputs in other CRSs are transformed, products are in metres)"
         )
+    if is_left_handed(text):
+        directions = " and ".join(axis.direction for axis in crs.axis_info[:2])
+        raise InputError(
+            f"{where}: {crs.name!r} ({crs_label(text)}) counts X and Y to the {directions}, which is left-handed with "
+            "heights upwards: no rotation of a camera is right in it; give a CRS with X to the east and Y to the north"
+            f"{_east_north_of(crs)}"
+        )
     return crs
+
+
+def _east_north_of(crs: CRS) -> str:
+    """Name a CRS with usual axes for the area of another one, in brackets; empty if that states no area."""
+    area = crs.area_of_use
+    if area is None:
+        return ""
+    middle = area.west + ((area.east - area.west) % 360.0) / 2
+    twin = {"EPSG:5513": "EPSG:5514", "EPSG:2065": "EPSG:5221", "EPSG:5515": "EPSG:5516"}.get(canonical_crs(crs.to_wkt()))
+    return f" ({twin or utm_codes((area.south + area.north) / 2, middle)[0]})"
 
 
 def split_compound(text: str) -> tuple[str, str | None]:
@@ -172,6 +281,9 @@ class CrsStep:
     """Its stated accuracy, metres; None if it has none."""
     definition: str
     """PROJ pipeline."""
+    about: float | None = None
+    """X of the target within half a turn of which results are counted, for CRSs that go round the earth (degrees of
+    longitude, or X of a map on a cylinder); None: as PROJ counts them, which is within ±180° of the CRS's middle."""
     _own: threading.local = field(default_factory=threading.local, repr=False, compare=False)
 
     def __call__(self, XY: ArrayLike) -> NDArray[np.float64]:
@@ -199,6 +311,9 @@ class CrsStep:
         X, Y = self._transformer().transform(XY[..., 0], XY[..., 1])
         out = np.stack([np.asarray(X, float), np.asarray(Y, float)], axis=-1)
         out[~(np.isfinite(out) & np.isfinite(XY)).all(axis=-1)] = np.nan
+        turn = None if self.about is None else turn_of(self.target)
+        if turn is not None and self.about is not None:
+            out[..., 0] = nearest_turn(out[..., 0], self.about, turn)
         return out
 
     def _transformer(self) -> Transformer:
@@ -209,11 +324,16 @@ class CrsStep:
         return transformer
 
     def __reduce__(self) -> tuple[Callable[..., CrsStep], tuple[str | float | None, ...]]:
-        return CrsStep, (self.source, self.target, self.operation, self.accuracy, self.definition)
+        return CrsStep, (self.source, self.target, self.operation, self.accuracy, self.definition, self.about)
 
 
 @lru_cache(maxsize=64)
-def crs_step(source: str, target: str, bounds: tuple[float, float, float, float] | None = None) -> CrsStep:
+def crs_step(
+    source: str,
+    target: str,
+    bounds: tuple[float, float, float, float] | None = None,
+    about: float | None = None,
+) -> CrsStep:
     """Exact step from one horizontal CRS to another.
 
     Parameters
@@ -222,11 +342,14 @@ def crs_step(source: str, target: str, bounds: tuple[float, float, float, float]
         Strings that pyproj reads; of compound CRSs the horizontal part is taken.
     bounds : tuple of float, optional
         xmin, ymin, xmax, ymax in `source`: where it is used, which decides between operations of different areas.
+    about : float, optional
+        X of the target near which its results are counted; see `CrsStep.about`.
 
     Raises
     ------
     InputError
-        No operation without a fallback is available; a missing grid is named.
+        No operation without a fallback is available (a missing grid is named), or PROJ cannot invert one of the
+        projections in the bounds.
     """
     a, b = (parse_crs(t).to_2d() for t in (source, target))
     a, b = (c.sub_crs_list[0] if c.is_compound else c for c in (a, b))
@@ -243,9 +366,14 @@ def crs_step(source: str, target: str, bounds: tuple[float, float, float, float]
         )
     best = group.transformers[0]
     accuracy = best.accuracy if best.accuracy is not None and best.accuracy >= 0 else None
-    return CrsStep(
-        source=source, target=target, operation=best.description, accuracy=accuracy, definition=best.definition
-    )
+    step = CrsStep(source, target, best.description, accuracy, best.definition, about)
+    if bounds is not None and np.isfinite(bounds).all():
+        x, y = np.linspace(bounds[0], bounds[2], 3), np.linspace(bounds[1], bounds[3], 3)
+        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        for crs, flat in ((source, a), (target, b)):
+            if flat.ellipsoid is not None and 0 < flat.ellipsoid.inverse_flattening < _FLATTENED:
+                refuse_inexact(crs, places if crs == source else step.where_defined(places))
+    return step
 
 
 def utm_codes(latitude: float, longitude: float) -> list[str]:
@@ -263,6 +391,8 @@ def missing_grids(group: TransformerGroup) -> list[str]:
     return [g.short_name for o in group.unavailable_operations[:1] for g in o.grids if not g.available]
 
 
+#: Bodies with a smaller inverse flattening than this are not like the earth: PROJ's series for it are checked there.
+_FLATTENED = 250.0
 #: Half the side of the area of a point, degrees.
 _POINT = 1e-6
 
@@ -278,8 +408,15 @@ def area_of(crs: CRS, bounds: tuple[float, float, float, float] | None) -> Any:
         return None
     if not np.isfinite([west, south, east, north]).all():
         return None
+    # Longitudes may be counted from 0 to 360°; an area across 180° has its west east of its east.
+    wide = (east - west) % 360.0 if abs(east - west) != 360.0 else 360.0
+    if east > west and east - west >= 360.0:
+        west, east = -180.0, 180.0
+    else:
+        west = float(nearest_turn(west - _POINT, 0.0, 360.0))
+        east = float(nearest_turn(west + wide + 2 * _POINT, 0.0, 360.0))
     # To older PROJ the area of a single point is nowhere.
-    return AreaOfInterest(west - _POINT, south - _POINT, east + _POINT, north + _POINT)
+    return AreaOfInterest(west, south - _POINT, east, north + _POINT)
 
 
 #: Derivatives of a step between systems are taken over this distance to either side, metres.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.geometry.crs import CrsStep, crs_step
+from photoplan.geometry.crs import CrsStep, crs_step, nearest_turn
 from photoplan.geometry.heights import HeightStep, height_step
 
 WGS84 = "EPSG:4326"
@@ -87,6 +87,7 @@ class GeodeticGround:
         XYZ = np.asarray(XYZ, float)
         steps = np.array([[_REACH, 0, 0], [-_REACH, 0, 0], [0, _REACH, 0], [0, -_REACH, 0]])
         around = self(XYZ[..., None, :] + steps)
+        around[..., 0] = nearest_turn(around[..., 0], around[..., :1, 0], 360.0)
         J = np.zeros((*XYZ.shape, 3))
         J[..., 0] = (around[..., 0, :] - around[..., 1, :]) / (2 * _REACH)
         J[..., 1] = (around[..., 2, :] - around[..., 3, :]) / (2 * _REACH)

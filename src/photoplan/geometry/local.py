@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import crs_label, require_projected_metres
+from photoplan.geometry.crs import INVERTED, crs_label, inexact_projection, nearest_turn, require_projected_metres
 
 #: Earth radius where no CRS tells a better one, metres (Ecker 1991, table 4.2).
 MEAN_RADIUS = 6_380_000.0
+#: Ellipsoids of the earth have a smaller squared eccentricity; what is made for the earth is checked beyond it.
+EARTHLIKE = 0.01
+#: Turns of the iteration for the inverse of a projection on a flattened body; one gains a digit or half of one.
+_TURNS = 30
 #: Half the distance over which the mapping's derivative is taken, metres: the mapping is so smooth (its third
 #: derivative is of the order 1/R²) that truncation and rounding both stay below 1e-10.
 _REACH = 100.0
@@ -34,6 +39,15 @@ class Ellipsoid:
         """By its semi-axes, metres."""
         return cls(equatorial, 1.0 - (polar / equatorial) ** 2)
 
+    @property
+    def b(self) -> float:
+        """Semi-minor axis, metres."""
+        return self.a * math.sqrt(1.0 - self.e2)
+
+    def up(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Outward normal (..., 3) below Cartesian coordinates (..., 3)."""
+        return self.geocentric(*self.geodetic(xyz))[1]
+
     def geocentric(
         self, lon: NDArray[np.float64], lat: NDArray[np.float64], height: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -51,9 +65,9 @@ class Ellipsoid:
         """Longitude, latitude (radians) and height of Cartesian coordinates (..., 3)."""
         p, z = np.hypot(xyz[..., 0], xyz[..., 1]), xyz[..., 2]
         b_over_a = math.sqrt(1.0 - self.e2)
-        # Bowring's iteration for the parametric latitude: one step is good to 1e-8 m, two to the last digit.
+        # Bowring's iteration for the parametric latitude: on the earth one step is good to 1e-8 m, two to the last digit.
         t = z / (p * b_over_a)
-        for _ in range(2):
+        for _ in range(2 if self.e2 < EARTHLIKE else 12):
             cos = 1.0 / np.sqrt(1.0 + t * t)
             sin = t * cos
             tan = (z + self.e2 / b_over_a * self.a * sin**3) / (p - self.e2 * self.a * cos**3)
@@ -72,20 +86,69 @@ class ProjectedCrs:
     unit: float
     """Radians in one unit of the geographic coordinates."""
     ellipsoid: Ellipsoid
+    crs: str
+    """As it was given, for messages."""
+    sphere: Transformer | None = None
+    """The inverse of the same projection of a sphere; None: the body is flattened no more than the earth."""
 
     def radians(self, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Longitude and latitude in radians of map points (..., 2); NaN where the projection ends."""
-        lon, lat = self.to_geographic.transform(XY[..., 0], XY[..., 1])
-        lon, lat = (np.where(np.isfinite(v), v, np.nan) * self.unit for v in (lon, lat))
-        return lon, lat
+        """Longitude and latitude in radians of map points (..., 2); NaN where the projection ends.
+
+        Raises
+        ------
+        InputError
+            The body is flattened, and PROJ cannot invert the projection at most of the points.
+        """
+        lon, lat = self._inverse(self.to_geographic, XY)
+        return (lon, lat) if self.sphere is None else self._inverted(XY, lon, lat)
 
     def map(self, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map points (..., 2) of longitude and latitude in radians."""
+        """Map points (..., 2) of longitude and latitude in radians; NaN where they do not lead back. Raises as `radians`."""
         out = self._forward(lon, lat)
         # Some inverse projections of PROJ are good to tenths of a millimetre only (LAEA); as `radians` uses them, the
         # difference is taken out here, so that the two are inverse to the last digit.
         back_lon, back_lat = self.radians(out)
-        return self._forward(2.0 * lon - back_lon, 2.0 * lat - back_lat)
+        with np.errstate(invalid="ignore"):
+            d_lon, d_lat = nearest_turn(back_lon - lon, 0.0, 2.0 * np.pi), back_lat - lat
+            lost = ~(self.ellipsoid.a * np.hypot(d_lon * np.cos(lat), d_lat) <= INVERTED)
+        exact = self._forward(lon - d_lon, lat - d_lat)
+        exact[lost] = np.nan
+        return exact
+
+    def _inverted(
+        self, XY: NDArray[np.float64], lon: NDArray[np.float64], lat: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Longitude and latitude that the projection takes to map points, from PROJ's inverse of it.
+
+        PROJ's series and iterations are made for the earth; on bodies that are flattened more they stop too early or
+        give up. Where they do, the inverse on a sphere is iterated, which gains a digit each time.
+        """
+        with np.errstate(invalid="ignore"):
+            off = np.linalg.norm(self._forward(lon, lat) - XY[..., :2], axis=-1)
+            wrong = off > INVERTED
+            if 2 * np.count_nonzero(wrong) > np.count_nonzero(np.isfinite(off)):
+                raise inexact_projection(self.crs, float(off[wrong].max()))
+            todo = ~(off <= INVERTED) & np.isfinite(XY[..., :2]).all(axis=-1)
+            if not todo.any():
+                return lon, lat
+            wanted = XY[todo][:, :2]
+            goal = self._inverse(self.sphere, wanted)
+            at = goal
+            for _ in range(_TURNS):
+                here = self._inverse(self.sphere, self._forward(*at))
+                at = at[0] + nearest_turn(goal[0] - here[0], 0.0, 2.0 * np.pi), at[1] + goal[1] - here[1]
+            found = np.linalg.norm(self._forward(*at) - wanted, axis=-1) <= INVERTED
+            lon, lat = np.array(lon), np.array(lat)
+            lon[todo], lat[todo] = np.where(found, at[0], np.nan), np.where(found, at[1], np.nan)
+        return lon, lat
+
+    def _inverse(
+        self, way: Transformer | None, XY: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        assert way is not None
+        lon, lat = way.transform(XY[..., 0], XY[..., 1])
+        lon, lat = (np.where(np.isfinite(v), v, np.nan) * self.unit for v in (lon, lat))
+        return lon, lat
 
     def _forward(self, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
         X, Y = self.to_geographic.transform(lon / self.unit, lat / self.unit, direction="INVERSE")
@@ -115,7 +178,20 @@ def projected_crs(crs: str) -> ProjectedCrs:
     transformer = Transformer.from_crs(projected, geographic, always_xy=True)
     flattening = 1.0 / ellipsoid.inverse_flattening if ellipsoid.inverse_flattening else 0.0
     unit = geographic.axis_info[0].unit_conversion_factor
-    return ProjectedCrs(transformer, unit, Ellipsoid(ellipsoid.semi_major_metre, flattening * (2.0 - flattening)))
+    body = Ellipsoid(ellipsoid.semi_major_metre, flattening * (2.0 - flattening))
+    sphere = _sphere_of(projected, body.a) if body.e2 > EARTHLIKE else None
+    return ProjectedCrs(transformer, unit, body, crs, sphere)
+
+
+def _sphere_of(crs: CRS, radius: float) -> Transformer:
+    """The inverse of a projection as it is on a sphere."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        plain = crs.to_dict()
+    for name in ("a", "b", "rf", "f", "ellps", "datum", "R"):
+        plain.pop(name, None)
+    flat = CRS.from_dict({**plain, "R": radius})
+    return Transformer.from_crs(flat, flat.geodetic_crs, always_xy=True)
 
 
 @dataclass(frozen=True)
@@ -152,6 +228,7 @@ class LocalFrame:
                 f"origin X {X}, Y {Y}, height {self.height} has no position in {crs_label(self.crs)}; are the "
                 "coordinates in this CRS?"
             )
+        projection.map(lon, lat)
         s, c, S, C = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
         object.__setattr__(self, "origin_XY", (X, Y))
         object.__setattr__(self, "_projection", projection)
