@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.cameras.base import Camera, project
 from photoplan.cameras.rpc import BOUND, RationalFunctions, terms
 from photoplan.errors import GeometryError
+from photoplan.geometry.crs import nearest_turn
 from photoplan.geometry.geodetic import GeodeticGround
 
 #: Rounds of the weighting by the denominator; it stands still after three.
@@ -52,7 +53,9 @@ def fitted_functions(geodetic: ArrayLike, xy: ArrayLike) -> RationalFunctions:
     GeometryError
         There are too few points, or they lie in a plane.
     """
-    ground, image = (np.asarray(values, float) for values in (geodetic, xy))
+    ground, image = (np.array(values, float) for values in (geodetic, xy))
+    if len(ground):
+        ground[:, 0] = nearest_turn(ground[:, 0], ground[0, 0], 360.0)
     low, high = (f(np.concatenate([image, ground], axis=1), axis=0) for f in (np.min, np.max))
     offset, scale = (low + high) / 2, (high - low) / 2
     if len(ground) < 39 or not (np.isfinite(scale).all() and (scale > 0).all()):
@@ -66,7 +69,7 @@ def fitted_functions(geodetic: ArrayLike, xy: ArrayLike) -> RationalFunctions:
     return RationalFunctions(
         image_offset=(float(offset[0]), float(offset[1])),
         image_scale=(float(scale[0]), float(scale[1])),
-        ground_offset=(float(offset[2]), float(offset[3]), float(offset[4])),
+        ground_offset=(float(nearest_turn(offset[2], 0.0, 360.0)), float(offset[3]), float(offset[4])),
         ground_scale=(float(scale[2]), float(scale[3]), float(scale[4])),
         coefficients=np.concatenate(quotients),
     )

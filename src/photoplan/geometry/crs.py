@@ -67,9 +67,13 @@ def _unusable(crs: CRS) -> str:
         usable = np.isfinite(_axes_on_ground(crs)).all(axis=(1, 2)).any()
     except ProjError:
         return "PROJ cannot compute with its numbers"
-    return "" if usable else (
-        "nowhere is one of its metres near a metre and its inverse leads back: a number of it is wrong, or PROJ cannot "
-        "invert it on its body"
+    return (
+        ""
+        if usable
+        else (
+            "nowhere is one of its metres near a metre and its inverse leads back: a number of it is wrong, or PROJ "
+            "cannot invert it on its body"
+        )
     )
 
 
@@ -137,6 +141,20 @@ def turn_of(text: str) -> float | None:
     return step * len(lon) if even and np.abs(X - X_north).max() < 1e-6 * step else None
 
 
+def middle_longitude(text: str) -> float | None:
+    """Longitude in the middle of a CRS's area of use, or that of its projection, degrees; None: it has none."""
+    crs = parse_crs(text)
+    area = crs.area_of_use
+    if area is not None and abs(area.east - area.west) < 360.0:
+        return float(nearest_turn(area.west + (area.east - area.west) % 360.0 / 2, 0.0, 360.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        stated = crs.to_dict()
+    if "zone" in stated:
+        return 6.0 * float(stated["zone"]) - 183.0
+    return float(stated["lon_0"]) if "lon_0" in stated else None
+
+
 def refuse_inexact(crs: str, XY: ArrayLike) -> None:
     """Refuse a projection which PROJ cannot invert at map points (n, 2): there and back must lead to the same place.
 
@@ -161,11 +179,10 @@ def refuse_inexact(crs: str, XY: ArrayLike) -> None:
 def inexact_projection(crs: str, off: float) -> InputError:
     """The error for a projection that PROJ cannot invert on its body: there and back leads so many metres away."""
     ellipsoid = parse_crs(crs).ellipsoid
-    radii = "" if ellipsoid is None else (
-        f" on a body with radii {ellipsoid.semi_major_metre / 1000:.6g} and {ellipsoid.semi_minor_metre / 1000:.6g} km"
-    )
+    a, b = (0.0, 0.0) if ellipsoid is None else (ellipsoid.semi_major_metre, ellipsoid.semi_minor_metre)
+    radii = f"{a / 1000:.6g} and {b / 1000:.6g} km"
     return InputError(
-        f"CRS {crs_label(crs)!r}: PROJ cannot invert this projection{radii}: there and back leads {off:.3g} m away; "
+        f"CRS {crs_label(crs)!r}: PROJ cannot invert this projection on a body with radii {radii}: there and back leads {off:.3g} m away; "
         "choose another projection, such as +proj=eqc or +proj=lcc, or a sphere (+R=…)"
     )
 
@@ -213,7 +230,9 @@ def _east_north_of(crs: CRS) -> str:
     if area is None:
         return ""
     middle = area.west + ((area.east - area.west) % 360.0) / 2
-    twin = {"EPSG:5513": "EPSG:5514", "EPSG:2065": "EPSG:5221", "EPSG:5515": "EPSG:5516"}.get(canonical_crs(crs.to_wkt()))
+    twin = {"EPSG:5513": "EPSG:5514", "EPSG:2065": "EPSG:5221", "EPSG:5515": "EPSG:5516"}.get(
+        canonical_crs(crs.to_wkt())
+    )
     return f" ({twin or utm_codes((area.south + area.north) / 2, middle)[0]})"
 
 

@@ -149,6 +149,12 @@ class Placement:
         return self.transform or (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
     @property
+    def middle(self) -> tuple[float, float]:
+        """X and Y in the middle of the raster."""
+        (width, height), (a, b, c, d, e, f) = self.size, self.coefficients
+        return (a * width + b * height) / 2 + c, (d * width + e * height) / 2 + f
+
+    @property
     def linear(self) -> NDArray[np.float64]:
         """What a step to the next column and to the next row is in the plane, (2, 2)."""
         return np.array(self.coefficients).reshape(2, 3)[:, :2]

@@ -65,7 +65,7 @@ class Ellipsoid:
         """Longitude, latitude (radians) and height of Cartesian coordinates (..., 3)."""
         p, z = np.hypot(xyz[..., 0], xyz[..., 1]), xyz[..., 2]
         b_over_a = math.sqrt(1.0 - self.e2)
-        # Bowring's iteration for the parametric latitude: on the earth one step is good to 1e-8 m, two to the last digit.
+        # Bowring's iteration for the parametric latitude: on earth one step is good to 1e-8 m, two to the last digit.
         t = z / (p * b_over_a)
         for _ in range(2 if self.e2 < EARTHLIKE else 12):
             cos = 1.0 / np.sqrt(1.0 + t * t)
@@ -103,7 +103,7 @@ class ProjectedCrs:
         return (lon, lat) if self.sphere is None else self._inverted(XY, lon, lat)
 
     def map(self, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map points (..., 2) of longitude and latitude in radians; NaN where they do not lead back. Raises as `radians`."""
+        """Map points (..., 2) of longitude and latitude in radians; NaN if they do not lead back; raises as `radians`."""
         out = self._forward(lon, lat)
         # Some inverse projections of PROJ are good to tenths of a millimetre only (LAEA); as `radians` uses them, the
         # difference is taken out here, so that the two are inverse to the last digit.

@@ -8,7 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.geometry.crs import CrsStep, crs_step, require_projected_metres, same_crs
+from photoplan.geometry.crs import (
+    CrsStep,
+    crs_label,
+    crs_step,
+    middle_longitude,
+    nearest_turn,
+    parse_crs,
+    require_projected_metres,
+    same_crs,
+    turn_of,
+)
 from photoplan.io.surface_file import target_of
 from photoplan.io.terrain.known_ranges import KnownRanges
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
@@ -48,7 +58,10 @@ class OpenTerrain:
             They do not; the message states both.
         """
         a, b = self.bounds, bounds
-        if not (a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]):
+        turn = turn_of(self.crs) or 0.0
+        if not any(
+            a[0] < b[2] + k * turn and b[0] + k * turn < a[2] and a[1] < b[3] and b[1] < a[3] for k in (-1, 0, 1)
+        ):
             asked, covered = (" ".join(f"{v:.10g}" for v in each) for each in (b, a))
             raise GeometryError(f"bounds {asked} do not meet {self.path}, which covers {covered}")
 
@@ -66,10 +79,14 @@ class OpenTerrain:
         t = np.linspace(0, 1, 17)
         xmin, ymin, xmax, ymax = self.bounds
         x, y = xmin + t * (xmax - xmin), ymin + t * (ymax - ymin)
-        corners = back(np.stack(np.meshgrid(x, y), axis=-1)).reshape(-1, 2)
+        # A grid of half the world reaches beyond most maps.
+        corners = back.where_defined(np.stack(np.meshgrid(x, y), axis=-1)).reshape(-1, 2)
+        corners = corners[np.isfinite(corners).all(axis=1)]
+        if not len(corners):
+            raise InputError(f"{self.path}: nothing of its area has coordinates in {crs_label(crs)}; is the CRS right?")
         low, high = corners.min(axis=0), corners.max(axis=0)
         bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        step = crs_step(crs, self.crs, bounds)
+        step = crs_step(crs, self.crs, bounds, self._about(crs))
         surface: RasterSurface | HybridSurface
         if isinstance(self.surface, RasterSurface):
             surface = replace(self.surface, to_grid_crs=step)
@@ -77,6 +94,17 @@ class OpenTerrain:
             assert self.model is not None
             surface = HybridSurface(self.model, step)
         return replace(self, surface=surface, bounds=bounds, crs=crs), (step,)
+
+    def _about(self, crs: str) -> float | None:
+        """X about which places of another CRS are counted in that of the terrain; None: it does not go round."""
+        turn = turn_of(self.crs)
+        if turn is None:
+            return None
+        middle, longitude = (self.bounds[0] + self.bounds[2]) / 2, middle_longitude(crs)
+        if longitude is None or self.bounds[2] - self.bounds[0] < 0.9 * turn or not parse_crs(self.crs).is_geographic:
+            return middle
+        # A grid that goes round the earth is cut opposite of the map's middle.
+        return float(nearest_turn(longitude / 360.0 * turn, middle, turn))
 
 
 def open_terrain(path: Path, crs: str | None = None, option: str = "with `crs` EPSG:nnnn") -> OpenTerrain:
@@ -133,7 +161,9 @@ def _open_raster(path: Path, crs: str | None, option: str) -> OpenTerrain:
         raise InputError(f"{path}: the grid is rotated or not north-up; bring it north-up with gdalwarp first")
     columns, rows = info.size
     bounds = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
-    surface = RasterSurface(reader, (x0, y0), (xx, -yy), part=reader.block, store=KnownRanges.of(reader))
+    surface = RasterSurface(
+        reader, (x0, y0), (xx, -yy), part=reader.block, store=KnownRanges.of(reader), turn=turn_of(found)
+    )
     return OpenTerrain(
         path=info.path,
         surface=surface,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.geometry.crs import nearest_turn
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.profiles import Shown
 from photoplan.kernels.sample_grid import sample_lattice, sample_points
@@ -50,6 +51,8 @@ class RasterSurface:
     """Columns and rows that are best read at once: the blocks of a file."""
     store: RangeStore | None = field(default=None, repr=False, compare=False)
     """Keeps ranges of heights for later runs."""
+    turn: float | None = None
+    """Length in X of one turn about the earth, for grids in longitudes and in maps on a cylinder; None: others."""
     _ranges: GridRanges = field(init=False, repr=False, compare=False)
     _kept: dict[int, Cache] = field(init=False, repr=False, compare=False, default_factory=dict)
     """Parts that rays were followed over last, by their side."""
@@ -57,12 +60,27 @@ class RasterSurface:
     def __post_init__(self) -> None:
         if not (self.mesh[0] > 0 and self.mesh[1] > 0):
             raise InputError(f"terrain grid with mesh {self.mesh}; mesh widths must be positive (a north-up grid)")
+        if self.turn is not None and self.grid.size[0] >= round(self.turn / self.mesh[0]) and not self._is_round:
+            columns = round(self.turn / self.mesh[0])
+            if abs(columns * self.mesh[0] - self.turn) < self.mesh[0] / 10:
+                object.__setattr__(self, "grid", _Round(self.grid, columns))
+                object.__setattr__(self, "origin", (self.origin[0] - columns // 2 * self.mesh[0], self.origin[1]))
+                object.__setattr__(self, "store", None)
         object.__setattr__(self, "_ranges", GridRanges(self.grid, self.part, self.store))
+
+    @property
+    def _is_round(self) -> bool:
+        return isinstance(self.grid, _Round)
+
+    @property
+    def middle(self) -> float:
+        """X in the middle of the grid."""
+        return self.origin[0] + (self.grid.size[0] - 1) / 2 * self.mesh[0]
 
     def continued(self) -> RasterSurface:
         """The same terrain, going on with its slope instead of level for a mesh beyond its outer posts."""
         (x, y), (u, v) = self.origin, self.mesh
-        return replace(self, grid=_Continued(self.grid), origin=(x - 2 * u, y + 2 * v))
+        return replace(self, grid=_Continued(self.grid), origin=(x - 2 * u, y + 2 * v), turn=None)
 
     def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
         """Heights of the pixel centres of a window of a map target, shape (height, width); NaN: no surface."""
@@ -175,10 +193,13 @@ class RasterSurface:
         return RasterParts(self, side), self._kept.setdefault(side, OrderedDict())
 
     def _posts(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map coordinates to (column, row) of the posts."""
-        return np.stack(
-            [(XY[..., 0] - self.origin[0]) / self.mesh[0], (self.origin[1] - XY[..., 1]) / self.mesh[1]], axis=-1
-        )
+        """Map coordinates to (column, row) of the posts; what lies beside the grid may lie in it a turn further."""
+        column, row = (XY[..., 0] - self.origin[0]) / self.mesh[0], (self.origin[1] - XY[..., 1]) / self.mesh[1]
+        if self.turn is not None:
+            last = self.grid.size[0] - 0.5
+            beside = (column < -0.5) | (column > last)
+            column = np.where(beside, nearest_turn(column, (last - 0.5) / 2, self.turn / self.mesh[0]), column)
+        return np.stack([column, row], axis=-1)
 
     def _window(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> Window:
         """Posts that surround positions from `low` to `high`; empty if there are none."""
@@ -210,6 +231,31 @@ class RasterSurface:
             return np.full((window.height, window.width), np.nan, np.float32)
         flat = sample_points(part, (posts - offset).reshape(-1, 2))
         return flat.reshape(window.height, window.width)
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """A grid that goes round the earth, with half a turn more on each side: no place has a border beside it."""
+
+    grid: HeightGrid
+    turn: int
+    """Columns of a turn; the grid has as many or a few more, which repeat the first."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows."""
+        return self.turn // 2 + self.turn + self.turn // 2, self.grid.size[1]
+
+    def read(self, window: Window) -> NDArray[np.float32]:
+        """Heights of a window inside, shape (height, width); NaN where there is none."""
+        parts, column = [], window.col - self.turn // 2
+        stop = column + window.width
+        while column < stop or not parts:
+            first = column % self.turn
+            width = min(self.turn - first, stop - column)
+            parts.append(self.grid.read(Window(first, window.row, width, window.height)))
+            column += width
+        return np.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]
 
 
 @dataclass(frozen=True, eq=False)

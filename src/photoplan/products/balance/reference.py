@@ -82,5 +82,5 @@ def _source(reference: Reference) -> Source:
     placement = placement_of(reader.info)
     assert placement.crs is not None
     apart = not same_crs(placement.crs, reference.crs)
-    carry = crs_step(reference.crs, placement.crs, reference.bounds) if apart else None
+    carry = crs_step(reference.crs, placement.crs, reference.bounds, placement.middle[0]) if apart else None
     return Source(MapProjection(placement, carry), reader)

@@ -8,11 +8,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import shapely
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.crs import crs_step
+from photoplan.geometry.crs import crs_step, nearest_turn
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.names import safe_stem
 from photoplan.io.naming import write_atomically
@@ -129,7 +131,7 @@ def _item(product: OrthoProduct, result: ProductResult) -> str:
     clip = product.plan.clip
     outline = shapely.box(left, bottom, right, top) if not isinstance(clip, Regions) else clip.shapes[0][0]
     outline = shapely.segmentize(outline, max(right - left, top - bottom) / _POINTS)
-    degrees = shapely.transform(outline, crs_step(grid.crs, "EPSG:4326", grid.bounds))
+    geometry, box = _in_degrees(outline, grid.crs, grid.bounds)
     record = json.loads(result.path.with_suffix(".run.json").read_text(encoding="utf-8"))
     code = int(grid.crs.split(":")[1]) if grid.crs.upper().startswith("EPSG:") and grid.crs[5:].isdigit() else None
     properties = {
@@ -149,13 +151,31 @@ def _item(product: OrthoProduct, result: ProductResult) -> str:
         "stac_version": "1.0.0",
         "stac_extensions": ["https://stac-extensions.github.io/projection/v1.1.0/schema.json"],
         "id": result.path.stem,
-        "geometry": json.loads(shapely.to_geojson(shapely.set_precision(degrees, 1e-9))),
-        "bbox": [round(float(value), 9) for value in degrees.bounds],
+        "geometry": json.loads(shapely.to_geojson(shapely.set_precision(geometry, 1e-9))),
+        "bbox": [round(value, 9) for value in box],
         "properties": properties,
         "links": [],
         "assets": {"data": {"href": f"./{result.path.name}", "type": kind, "roles": ["data"]}},
     }
     return json.dumps(item, indent=1, ensure_ascii=False) + "\n"
+
+
+def _in_degrees(shape: Any, crs: str, bounds: tuple[float, float, float, float]) -> tuple[Any, list[float]]:
+    """Longitudes and latitudes of a shape, cut at 180° if it crosses that, and its west, south, east and north.
+
+    West is more than east in the bounds of a shape across 180° (RFC 7946, section 5.2).
+    """
+    first = float(crs_step(crs, "EPSG:4326", bounds)(np.array(bounds[:2]))[0])
+    degrees = shapely.transform(shape, crs_step(crs, "EPSG:4326", bounds, first))
+    west, south, east, north = (float(value) for value in degrees.bounds)
+    parts = [
+        shapely.transform(shapely.intersection(degrees, shapely.box(turn - 180.0, -90.0, turn + 180.0, 90.0)),
+                          lambda XY, turn=turn: XY - [turn, 0.0])
+        for turn in (-360.0, 0.0, 360.0)
+        if west < turn + 180.0 and east > turn - 180.0
+    ]  # fmt: skip
+    west, east = (float(nearest_turn(value, 0.0, 360.0)) for value in (west, east))
+    return shapely.union_all(parts), [west, south, east, north]
 
 
 def _number(value: float) -> str:

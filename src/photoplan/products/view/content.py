@@ -281,7 +281,11 @@ def _raster(path: Path, ground: ViewGround) -> ViewLayer:
         raise InputError(f"{path}: lies nowhere (no georeference); a content is a raster on the map, or photo:NAME")
     if placement.crs is None:
         raise InputError(f"{path}: no CRS; it is not guessed. That of the terrain is {crs_label(ground.crs)}")
-    carry = None if same_crs(placement.crs, ground.crs) else crs_step(ground.crs, placement.crs, ground.bounds)
+    carry = (
+        None
+        if same_crs(placement.crs, ground.crs)
+        else crs_step(ground.crs, placement.crs, ground.bounds, placement.middle[0])
+    )
     source = Source(MapProjection(placement, carry), reader)
     return Resampled((source,), (reader.path,), grey_span(reader), photos=False)
 
