@@ -5,13 +5,16 @@ Files, tables and options all ask here, so that what is refused in one is refuse
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pyproj import Transformer
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_utm_crs_info
 
-from photoplan.geometry.crs import crs_label, parse_crs
+from photoplan.geometry.crs import crs_label, nearest_turn, parse_crs, utm_codes
 from photoplan.geometry.rotation import ANGLE_UNITS
 
 #: Map coordinates beyond this lie on no map of the earth, metres.
@@ -20,8 +23,12 @@ _FAR = 1e8
 _LOW, MOST_HEIGHT, _ORBIT = -12_000.0, 10_000.0, 1_000_000.0
 #: Frame cameras fly lower than this above ground, metres; what is higher is in another unit.
 HIGHEST_FLIGHT = 60_000.0
-#: How far beyond the area of use of its CRS a place may lie, degrees: neighbouring zones are in use.
-_BESIDE = 12.0
+_KM_PER_DEGREE = 111.2
+#: How far beyond the area of use of its CRS a place may lie, kilometres: neighbouring zones are in use; and how far
+#: without a word: maps are used a little past their borders.
+_BESIDE, _NOTED = 900.0, 100.0
+#: What allows places beyond that.
+FORCE = "beyond_area = true in the project (init, convert, dtm build: `beyond_area`)"
 
 
 def odd_angles(angles: Sequence[float], unit: str, names: Sequence[str] = ()) -> str | None:
@@ -48,27 +55,98 @@ def odd_place(XYZ: Sequence[float], *, camera: bool) -> str | None:
     return None
 
 
-def outside_area(crs: str, XY: ArrayLike) -> NDArray[np.bool_]:
-    """Which places (n, 2) lie far outside the area in which a CRS is used, (n,); none where it states no area."""
-    XY = np.asarray(XY, float).reshape(-1, 2)
+def beyond_area(crs: str, XY: ArrayLike) -> NDArray[np.float64]:
+    """Kilometres by which places (n, 2) lie beyond the area of use of a CRS, (n,).
+
+    0 inside, and if it states no area; infinite for places that the CRS does not have.
+    """
+    XY = np.asarray(XY, float)[..., :2].reshape(-1, 2)
     parsed = parse_crs(crs)
-    area = parsed.area_of_use
+    area = _area_of_use(parsed)
     if area is None or parsed.geodetic_crs is None:
-        return np.zeros(len(XY), bool)
-    lon, lat = Transformer.from_crs(parsed, parsed.geodetic_crs, always_xy=True).transform(XY[:, 0], XY[:, 1])
-    lon, lat = np.asarray(lon, float), np.asarray(lat, float)
-    east = (area.east - area.west) % 360.0
-    off = (lon - area.west + _BESIDE) % 360.0 > east + 2 * _BESIDE if east + 2 * _BESIDE < 360.0 else lon != lon
-    return np.asarray(off | (lat < area.south - _BESIDE) | (lat > area.north + _BESIDE) | ~np.isfinite(lon + lat))
+        return np.zeros(len(XY))
+    west, south, east, north = area
+    lon, lat = _geographic(parsed, XY)
+    wide = (east - west) % 360.0 or 360.0
+    # From the middle of the area, whichever way round the earth is shorter.
+    from_middle = np.abs(nearest_turn(lon, west + wide / 2, 360.0) - (west + wide / 2))
+    beside = (from_middle - wide / 2) * np.cos(np.radians(lat))
+    beyond = np.maximum.reduce([beside, south - lat, lat - north, np.zeros(len(XY))]) * _KM_PER_DEGREE
+    return np.asarray(np.where(np.isfinite(lon + lat), beyond, np.inf))
 
 
-def area_fault(crs: str, center: ArrayLike) -> str | None:
-    """Why a place cannot be in a CRS; None if it can."""
-    if not outside_area(crs, np.asarray(center, float)[:2]).any():
+def _geographic(crs: CRS, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Longitude from Greenwich and latitude of map points (n, 2), degrees."""
+    assert crs.geodetic_crs is not None
+    meridian = crs.geodetic_crs.prime_meridian
+    first = 0.0 if meridian is None else np.degrees(meridian.longitude * meridian.unit_conversion_factor)
+    lon, lat = Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True).transform(XY[:, 0], XY[:, 1])
+    unit = np.degrees(crs.geodetic_crs.axis_info[0].unit_conversion_factor)
+    return np.asarray(lon, float) * unit + first, np.asarray(lat, float) * unit
+
+
+def _area_of_use(crs: CRS) -> tuple[float, float, float, float] | None:
+    """West, south, east and north of a CRS's area of use, degrees; that of a UTM zone also if it has no code."""
+    if crs.area_of_use is not None:
+        area = crs.area_of_use
+        return area.west, area.south, area.east, area.north
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        stated = crs.to_dict()
+    if stated.get("proj") != "utm":
         return None
-    area = parse_crs(crs).area_of_use
-    x, y = np.asarray(center, float)[:2]
+    east = 6.0 * float(stated["zone"]) - 180.0
+    return east - 6.0, *((-80.0, east, 0.0) if "south" in stated else (0.0, east, 84.0))
+
+
+def area_fault(crs: str, XY: ArrayLike, names: Sequence[str] = ()) -> str | None:
+    """Why places (n, 2 or more columns) cannot be in a CRS; None if they can. `names` are those of the places."""
+    return _told(crs, XY, names, _BESIDE, "; is it the right CRS, and are X and Y in the right order? If it is meant, "
+                 f"{FORCE} allows it")  # fmt: skip
+
+
+def area_note(crs: str, XY: ArrayLike, names: Sequence[str] = ()) -> str | None:
+    """A sentence on places that lie beyond the area of a CRS, but not so far that `area_fault` refuses them."""
+    return _told(crs, XY, names, _NOTED, "; is that the CRS of these coordinates?")
+
+
+def _told(crs: str, XY: ArrayLike, names: Sequence[str], most: float, asks: str) -> str | None:
+    XY = np.asarray(XY, float)[..., :2].reshape(-1, 2)
+    known = np.flatnonzero(np.isfinite(XY).all(axis=1))
+    beyond = beyond_area(crs, XY[known])
+    if not (beyond > most).any():
+        return None
+    worst = int(known[np.argmax(beyond)])
+    x, y = XY[worst]
+    parsed = parse_crs(crs)
+    what = f"{names[worst]!r} at X {x:.0f}, Y {y:.0f}" if len(names) else f"X {x:.0f}, Y {y:.0f}"
+    count = int((beyond > most).sum())
+    what = what if len(known) == 1 else f"{what} ({count} of {len(known)} places)"
+    area = parsed.area_of_use
+    of = f"{crs_label(crs)} ({area.name[:60]})" if area is not None else crs_label(crs)
+    lon, lat = (float(v[0]) for v in _geographic(parsed, XY[worst : worst + 1]))
+    if not np.isfinite(lon + lat):
+        return f"{what} has no place in {of}{asks}"
+    fits = f"; {fitting_utm(crs, lat, lon)} fits there"
+    if not (beyond_area(crs, XY[known][:, ::-1]) > _NOTED).any():
+        fits = f"; with X and Y exchanged {'it lies' if len(known) == 1 else 'they lie'} inside"
     return (
-        f"X {x:.0f}, Y {y:.0f} lies far outside the area of {crs_label(crs)} ({area.name[:60] if area else ''}); is it "
-        "the right CRS, and are X and Y in the right order?"
+        f"{what} lies {beyond.max():.0f} km outside the area of {of}, at latitude {lat:.4f}°, longitude {lon:.4f}°"
+        f"{fits}{asks}"
     )
+
+
+def fitting_utm(crs: str, latitude: float, longitude: float) -> str:
+    """Code of the UTM zone at a place (degrees), on the datum of a CRS if that has zones there, else on WGS 84."""
+    geographic = parse_crs(crs).geodetic_crs
+    here = AreaOfInterest(longitude, latitude, longitude, latitude)
+    known = [] if geographic is None else query_utm_crs_info(datum_name=geographic.name, area_of_interest=here)
+    zone = utm_codes(latitude, longitude)[0]
+    same = [f"{found.auth_name}:{found.code}" for found in known if found.name.endswith(f"zone {int(zone[-2:])}"
+            f"{'N' if latitude >= 0 else 'S'}")]  # fmt: skip
+    return same[0] if same else zone
+
+
+def is_no_fix(latitude: float, longitude: float) -> bool:
+    """Whether a latitude and a longitude are what receivers without a position write: both exactly 0."""
+    return latitude == 0.0 and longitude == 0.0
