@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import DIRECTIONS, PATH, ending, reading_options, table_format
+from photoplan.cli.options import DIRECTIONS, PATH, beyond_area_option, ending, reading_options, table_format
 from photoplan.cli.output import say, show, show_json
 
 
@@ -38,6 +38,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--list-readings", is_flag=True, help="Only list the readings of the file that fit measured points.")
 @click.option("--image-points", type=PATH, help="Measured image points, for --list-readings.")
 @click.option("--control", type=PATH, help="Their ground points, for --list-readings.")
+@beyond_area_option
 @ending("Say what would be written and what would be lost, and stop.")
 def command(
     orientation: Path,

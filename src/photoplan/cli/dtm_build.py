@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, POSITIVE, ending
+from photoplan.cli.options import PATH, POSITIVE, beyond_area_option, ending
 from photoplan.cli.output import can_draw, show, show_json
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ _SHOWN = 10
 @click.option("--nodata", type=float, help="Height that means none.")
 @click.option("--crs", help="CRS of files that state none.")
 @click.option("--height-system", help="Height system of files that state none: ellipsoidal or EPSG:nnnn.")
+@beyond_area_option
 @click.option("--report/--no-report", default=None, help="A page with plots beside the model [if matplotlib is there].")
 @ending("Read, clean and plan; print it and stop.", workers=True)
 def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
@@ -113,6 +114,7 @@ def _request(options: dict[str, Any]) -> BuildRequest:
         tin_points=options.pop("tin_points"),
         nodata=options.pop("nodata"),
         crs=options.pop("crs"),
+        beyond_area=options.pop("beyond_area"),
     )
     settings = BuildSettings(
         grid_width=options.pop("grid_width"),

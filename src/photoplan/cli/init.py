@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import FOLDER, LISTED, PATH, ending, reading_options, table_format
+from photoplan.cli.options import FOLDER, LISTED, PATH, beyond_area_option, ending, reading_options, table_format
 from photoplan.cli.output import show, show_json, talking
 
 
@@ -37,6 +37,7 @@ from photoplan.cli.output import show, show_json, talking
     "--earth-curvature", type=click.Choice(["none", "correction", "strict"]), default="none", show_default=True
 )
 @click.option("--refraction", is_flag=True, help="Correct for refraction by a standard atmosphere.")
+@beyond_area_option
 @ending()
 def command(folder: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Write DIR/project.toml from images, camera, orientation and terrain.

@@ -130,6 +130,11 @@ bounds_option = click.option(
 )
 
 
+beyond_area_option = click.option(
+    "--beyond-area", is_flag=True, help="Accept coordinates far outside the area of use of their CRS."
+)
+
+
 def dry_run_option(what: str) -> Callable[..., Any]:
     """`--dry-run`, with what happens instead."""
     return click.option("--dry-run", is_flag=True, help=what)

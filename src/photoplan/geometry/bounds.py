@@ -79,7 +79,7 @@ def _geographic(crs: CRS, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64],
     """Longitude from Greenwich and latitude of map points (n, 2), degrees."""
     assert crs.geodetic_crs is not None
     meridian = crs.geodetic_crs.prime_meridian
-    first = 0.0 if meridian is None else np.degrees(meridian.longitude * meridian.unit_conversion_factor)
+    first = 0.0 if meridian is None else np.degrees(meridian.longitude * float(meridian.unit_conversion_factor))
     lon, lat = Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True).transform(XY[:, 0], XY[:, 1])
     unit = np.degrees(crs.geodetic_crs.axis_info[0].unit_conversion_factor)
     return np.asarray(lon, float) * unit + first, np.asarray(lat, float) * unit
@@ -95,7 +95,7 @@ def _area_of_use(crs: CRS) -> tuple[float, float, float, float] | None:
         stated = crs.to_dict()
     if stated.get("proj") != "utm":
         return None
-    east = 6.0 * float(stated["zone"]) - 180.0
+    east = 6.0 * int(stated["zone"]) - 180.0
     return east - 6.0, *((-80.0, east, 0.0) if "south" in stated else (0.0, east, 84.0))
 
 
@@ -129,7 +129,7 @@ def _told(crs: str, XY: ArrayLike, names: Sequence[str], most: float, asks: str)
         return f"{what} has no place in {of}{asks}"
     fits = f"; {fitting_utm(crs, lat, lon)} fits there"
     if not (beyond_area(crs, XY[known][:, ::-1]) > _NOTED).any():
-        fits = f"; with X and Y exchanged {'it lies' if len(known) == 1 else 'they lie'} inside"
+        fits, asks = "; are X and Y exchanged? Exchanged they lie inside", ""
     return (
         f"{what} lies {beyond.max():.0f} km outside the area of {of}, at latitude {lat:.4f}°, longitude {lon:.4f}°"
         f"{fits}{asks}"

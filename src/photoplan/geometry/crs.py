@@ -86,8 +86,8 @@ def _axes_on_ground(crs: CRS) -> NDArray[np.float64]:
     lon, lat = (v.ravel() for v in np.meshgrid(np.arange(-180.0, 180.0, 15.0), np.arange(-75.0, 80.0, 25.0)))
     area = crs.area_of_use
     if area is not None:
-        east = (area.east - area.west) % 360.0 or 360.0
-        lon, lat = np.append(area.west + east / 2, lon), np.append((area.south + area.north) / 2, lat)
+        wide = (area.east - area.west) % 360.0 or 360.0
+        lon, lat = np.append(area.west + wide / 2, lon), np.append((area.south + area.north) / 2, lat)
     radius = 6378137.0 if crs.ellipsoid is None else crs.ellipsoid.semi_major_metre
     geodetic = crs.geodetic_crs
     unit = np.radians(1.0) / (1.0 if geodetic is None else geodetic.axis_info[0].unit_conversion_factor)
@@ -109,7 +109,11 @@ def _axes_on_ground(crs: CRS) -> NDArray[np.float64]:
 @lru_cache(maxsize=256)
 def is_left_handed(text: str) -> bool:
     """Whether X, Y and heights of a projected CRS are a left-handed system, such as X south and Y west."""
-    axes = _axes_on_ground(parse_crs(text))
+    crs = parse_crs(text)
+    crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    if not crs.is_projected:
+        return False
+    axes = _axes_on_ground(crs)
     turns = np.linalg.det(axes[np.isfinite(axes).all(axis=(1, 2))])
     return bool(len(turns) and turns[0] < 0)
 
@@ -182,8 +186,8 @@ def inexact_projection(crs: str, off: float) -> InputError:
     a, b = (0.0, 0.0) if ellipsoid is None else (ellipsoid.semi_major_metre, ellipsoid.semi_minor_metre)
     radii = f"{a / 1000:.6g} and {b / 1000:.6g} km"
     return InputError(
-        f"CRS {crs_label(crs)!r}: PROJ cannot invert this projection on a body with radii {radii}: there and back leads {off:.3g} m away; "
-        "choose another projection, such as +proj=eqc or +proj=lcc, or a sphere (+R=…)"
+        f"CRS {crs_label(crs)!r}: PROJ cannot invert this projection on a body with radii {radii}: there and back "
+        f"leads {off:.3g} m away; choose another projection, such as +proj=eqc or +proj=lcc, or a sphere (+R=…)"
     )
 
 
@@ -447,7 +451,15 @@ def grid_rotation(step: CrsStep, XY: ArrayLike) -> NDArray[np.float64]:
 
     It is the difference of the meridian convergences: the nearest rotation to the derivatives of the step, taken
     over ±50 metres. Heights keep their axis.
+
+    Raises
+    ------
+    InputError
+        One of the systems is left-handed.
     """
+    for crs in (step.source, step.target):
+        if is_left_handed(crs):
+            raise InputError(f"{crs_label(crs)} is left-handed with heights upwards: angles have no meaning in it")
     XY = np.asarray(XY, float)
     right, up = np.array([_REACH, 0.0]), np.array([0.0, _REACH])
     along_x = step(XY + right) - step(XY - right)

@@ -103,7 +103,7 @@ class ProjectedCrs:
         return (lon, lat) if self.sphere is None else self._inverted(XY, lon, lat)
 
     def map(self, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map points (..., 2) of longitude and latitude in radians; NaN if they do not lead back; raises as `radians`."""
+        """Map points (..., 2) of longitude and latitude in radians; NaN where they do not lead back."""
         out = self._forward(lon, lat)
         # Some inverse projections of PROJ are good to tenths of a millimetre only (LAEA); as `radians` uses them, the
         # difference is taken out here, so that the two are inverse to the last digit.

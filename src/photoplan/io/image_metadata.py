@@ -26,6 +26,7 @@ from typing import BinaryIO
 from xml.etree.ElementTree import Element
 
 from photoplan.errors import InputError
+from photoplan.geometry.bounds import is_no_fix
 from photoplan.io.markup_files import parse_xml
 
 _DJI = "dji.com/drone-dji"
@@ -44,6 +45,8 @@ class ImageMetadata:
     """Width and height in pixels."""
     position: tuple[float, float, float] | None = None
     """Latitude, longitude (degrees) and altitude (metres)."""
+    no_fix: bool = False
+    """Whether the receiver had no position: latitude and longitude are both 0."""
     datum: str | None = None
     """Datum that EXIF names; None: WGS 84 as it is customary."""
     sigma: tuple[float, float, float] | None = None
@@ -74,11 +77,14 @@ def read_image_metadata(path: str | Path) -> ImageMetadata:
     exif, packet = read_exif(path)
     dji, schema = _xmp(packet, path)
     size = _size(exif)
+    position = _position(exif, dji, path)
+    no_fix = position is not None and is_no_fix(*position[:2])
     names = [n for n in (_text(exif, "Make"), _text(exif, "Model")) if n]
     return ImageMetadata(
         file=path,
         size=size,
-        position=_position(exif, dji, path),
+        position=None if no_fix else position,
+        no_fix=no_fix,
         datum=_text(exif, "GPSMapDatum"),
         sigma=_sigma(exif, dji, schema),
         yaw_pitch_roll=_attitude(dji),
@@ -154,7 +160,7 @@ def _position(exif: dict[str, ExifValue], dji: dict[str, str], path: Path) -> tu
         altitude = -altitude  # below the reference: sea level, or (since EXIF 3.0) the ellipsoid
     # The maker's own numbers have more digits; one of DJI's names is misspelled in many drones.
     own = _float(dji.get("GpsLatitude")), _float(dji.get("GpsLongitude", dji.get("GpsLongtitude")))
-    if own[0] is not None and own[1] is not None and own != (0.0, 0.0):
+    if own[0] is not None and own[1] is not None and not is_no_fix(own[0], own[1]):
         lat, lon = own
     height = _float(dji.get("AbsoluteAltitude"))
     altitude = height if height is not None else altitude

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.errors import InputError, UsageError
+from photoplan.geometry.bounds import area_fault, area_note
 from photoplan.geometry.crs import canonical_crs, require_projected_metres
 from photoplan.geometry.earth_poses import enu_of_geodetic
 from photoplan.geometry.frames import triple
@@ -74,6 +75,8 @@ class ConvertRequest:
     """Angle by which images are turned against the camera's axes of the file, counter-clockwise, degrees."""
     matrix: Direction | None = None
     """What matrices of the written file do, where its format leaves that open."""
+    beyond_area: bool = False
+    """Whether places far outside the area of use of the CRS are meant."""
     drop_lens: bool = False
     """Whether a camera is written without its lens where the format has no such lens."""
     overwrite: bool = False
@@ -120,6 +123,7 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
     if request.camera is not None:
         block = with_cameras(block, request.camera)
     block = replace(_in_crs(_with_axes(block, request), request.crs), matrix=request.matrix)
+    outside = _judged_area(block.table, request.beyond_area)
     output = request.output or _beside(request.orientation, target.name, target.suffix)
     block = _files_from(block, output if not target.suffix else output.parent)
     block, lost = _without_lost_lenses(block, target.losses(block), request)
@@ -137,9 +141,21 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
         images=len(table.images),
         cameras=tuple(block.cameras),
         crs=table.crs,
-        notes=(*table.notes, *_against_positions(block, images)),
+        notes=(*table.notes, *outside, *_against_positions(block, images)),
         lost=lost,
     )
+
+
+def _judged_area(table: OrientationTable, beyond: bool) -> tuple[str, ...]:
+    """Notes on centres a little outside the area of their CRS; those far outside are refused unless they are meant."""
+    if table.crs is None or table.origin is not None or beyond:
+        return ()
+    names = [image.name for image in table.images]
+    fault = area_fault(table.crs, table.centers, names)
+    if fault is not None:
+        raise InputError(f"{table.file}: projection centre of {fault}")
+    note = area_note(table.crs, table.centers, names)
+    return () if note is None else (f"projection centre of {note}",)
 
 
 def _against_positions(block: OrientationBlock, files: Mapping[str, Path]) -> tuple[str, ...]:

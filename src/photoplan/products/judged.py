@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.agreement import agreement
-from photoplan.geometry.bounds import area_fault
+from photoplan.geometry.bounds import area_note
 from photoplan.geometry.crs import crs_step
 from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.orientation.exif import SUFFIXES
@@ -60,7 +60,7 @@ def judged(project: Project, image: ImageEntry, ground: Ground) -> tuple[JudgedV
     center = pose_of(project, image, ground).center
     view = view_of(image, project.cameras[image.camera], project.orientation, center)
     found = look(view, ground.bare.heights)
-    odd = area_fault(project.crs, center) or position_fault(project, image)
+    odd = project.area_fault(center) or position_fault(project, image)
     return view, found if odd is None else replace(found, fault=odd)
 
 
@@ -78,7 +78,7 @@ def _without_pose(project: Project, name: str, ground: Ground) -> ImagePlausibil
         gsd=nan,
         on_terrain=seen.on_surface,
         middle_on_terrain=seen.on_surface > 0,
-        fault=area_fault(project.crs, place),
+        fault=project.area_fault(place),
     )
     if seen.bounds is None:
         return found
@@ -163,7 +163,9 @@ def against_files(project: Project, names: Sequence[str]) -> tuple[str, ...]:
     """Sentences on how the oriented images of a project lie to the positions of their files, those far off left out."""
     images = [image for image in project.posed if image.name in names and image.center is not None]
     stated = on_map(geodetic_positions(project.resolve(image.file) for image in images), project.crs)
-    return common_differences(np.array([image.center for image in images], float).reshape(-1, 3), stated)
+    centers = np.array([image.center for image in images], float).reshape(-1, 3)
+    outside = None if project.area_fault(centers) else area_note(project.crs, centers, [i.name for i in images])
+    return (*([outside] if outside else []), *common_differences(centers, stated))
 
 
 def differences(names: Sequence[str], centers: ArrayLike, stated: ArrayLike) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from photoplan.cameras.base import Camera
 from photoplan.errors import GeometryError, UsageError
-from photoplan.geometry.bounds import HIGHEST_FLIGHT, area_fault, odd_place
+from photoplan.geometry.bounds import HIGHEST_FLIGHT, odd_place
 from photoplan.geometry.cylinder import CylinderFrame
 from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
 from photoplan.geometry.heights import HeightStep
@@ -93,7 +93,7 @@ def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | No
         if not good or (kind != "wall" and not _RADII[0] <= numbers[4] <= _RADII[1]):
             raise UsageError(f"target {text}: give {form}")
         x, y, z, *others = numbers
-        odd = odd_place((x, y, z), camera=False) or area_fault(project.crs, (x, y))
+        odd = odd_place((x, y, z), camera=False) or project.area_fault((x, y))
         if odd is not None:
             raise UsageError(f"target {text}: {odd}")
         z = float(ground_of(project).into_working(project.crs)((x, y, z)))

@@ -248,7 +248,8 @@ class _Round:
 
     def read(self, window: Window) -> NDArray[np.float32]:
         """Heights of a window inside, shape (height, width); NaN where there is none."""
-        parts, column = [], window.col - self.turn // 2
+        parts: list[NDArray[np.float32]] = []
+        column = window.col - self.turn // 2
         stop = column + window.width
         while column < stop or not parts:
             first = column % self.turn

@@ -55,22 +55,34 @@ def image_files(path: Path) -> list[Path]:
     return files
 
 
-def read_folder(path: Path) -> tuple[ImageMetadata, ...]:
-    """Metadata of the images of a folder, or of one image, that state a position.
+def read_folder(path: Path) -> tuple[tuple[ImageMetadata, ...], tuple[str, ...]]:
+    """Metadata of the images of a folder, or of one image, that state a position, and names of those without a fix.
 
     Raises
     ------
     InputError
         None does, or a file is damaged.
     """
-    stated = tuple(m for m in map(read_image_metadata, image_files(path)) if m.position is not None)
+    found = tuple(map(read_image_metadata, image_files(path)))
+    stated = tuple(m for m in found if m.position is not None)
+    unfixed = tuple(m.file.name for m in found if m.no_fix)
     if not stated:
-        raise InputError(f"{path}: no image states a GPS position (latitude, longitude and altitude)")
+        raise InputError(
+            f"{path}: no image states a GPS position (latitude, longitude and altitude)"
+            + (f"; {without_fix(unfixed)}" if unfixed else "")
+        )
     datums = {m.datum.upper().replace(" ", "").replace("-", "") for m in stated if m.datum}
     other = sorted(d for d in datums if not d.startswith("WGS84"))
     if other:
         raise InputError(f"{path}: positions refer to the datum {other[0]}; only WGS 84 is read from EXIF")
-    return stated
+    return stated, unfixed
+
+
+def without_fix(names: Sequence[str]) -> str:
+    """A note on images that state latitude and longitude 0."""
+    states = "1 image states" if len(names) == 1 else f"{len(names)} images state"
+    some = ", ".join(names[:3]) + (" …" if len(names) > 3 else "")
+    return f"{states} latitude 0 and longitude 0, which receivers write without a position: {some}"
 
 
 def map_positions(images: Sequence[ImageMetadata], crs: str) -> NDArray[np.float64]:
@@ -94,7 +106,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         No image states position and attitude, or a file is damaged.
     """
     files = image_files(path)
-    stated = read_folder(path)
+    stated, unfixed = read_folder(path)
     oriented = [m for m in stated if m.yaw_pitch_roll is not None and m.position is not None]
     if not oriented:
         raise InputError(
@@ -108,8 +120,9 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         posed(m.file.name, at, R @ rotation_from_gimbal(m.yaw_pitch_roll or (0, 0, 0)), m.camera if several else None)
         for m, at, R in zip(oriented, enu, axes)
     )
-    lost = len(files) - len(oriented)
-    notes = [f"{path.name}: {lost} images state no position or attitude; left out"] if lost else []
+    lost = len(files) - len(oriented) - len(unfixed)
+    notes = [f"{path.name}: {without_fix(unfixed)}; left out"] if unfixed else []
+    notes += [f"{path.name}: {lost} images state no position or attitude; left out"] if lost else []
     turned = sum(m.display != 1 for m in oriented)
     if turned:
         notes.append(

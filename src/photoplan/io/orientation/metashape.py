@@ -181,7 +181,7 @@ def _reference(camera: Element) -> list[float]:
 def _geodetic(references: _Floats, chunk: Element, path: Path) -> _Floats | None:
     """Latitude, longitude and height (n, 3) of receivers' positions; None: none, or in no CRS that leads there."""
     crs = (chunk.findtext("./reference") or "").strip()
-    there = np.isfinite(references[:, :2]).all(axis=1)
+    there = np.isfinite(references[:, :2]).all(axis=1) & (references[:, :2] != 0).any(axis=1)
     if not there.any() or not crs or is_local_crs(crs):
         return None
     try:

@@ -7,11 +7,12 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+from numpy.typing import ArrayLike
 from pydantic import Field, Strict, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.bounds import odd_angles, odd_place
+from photoplan.geometry.bounds import area_fault, odd_angles, odd_place
 from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import Entry, Name, NotNegative, Number, Positive, Restoration, Triple
 from photoplan.io.names import resolve_input, unique_stems
@@ -204,6 +205,8 @@ class Project(Entry):
 
     format: Literal[1] = 1
     crs: Annotated[str, Field(min_length=1, max_length=20_000)]
+    beyond_area: Annotated[bool, Strict()] = False
+    """Whether places far outside the area of use of the CRS are meant; they are refused otherwise."""
     terrain: StatedTerrain | None = None
     objects: tuple[Objects, ...] = ()
     orientation: Orientation = Orientation()
@@ -264,6 +267,10 @@ class Project(Entry):
         if self.terrain is None:
             raise InputError("the project states no [terrain]; give file or height there")
         return self.terrain
+
+    def area_fault(self, XY: ArrayLike, names: Sequence[str] = ()) -> str | None:
+        """Why places (n, 2 or more columns) cannot be in the project's CRS; None if they can, or are meant to be."""
+        return None if self.beyond_area else area_fault(self.crs, XY, names)
 
     def resolve(self, file: str) -> Path:
         """Absolute path of an entry `file`, relative ones from the project's folder."""

@@ -53,6 +53,7 @@ def project_text(project: Project) -> str:
         "",
         "# Horizontal CRS of everything in this file and of the products: projected, in metres.",
         f"crs = {toml_value(project.crs)}",
+        *(["beyond_area = true  # places far outside its area of use are meant"] if project.beyond_area else []),
         "",
         *(_terrain(project.terrain) if project.terrain is not None else ["# [terrain] is needed for products.", ""]),
         *(line for objects in project.objects for line in _objects(objects)),

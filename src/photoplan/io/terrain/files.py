@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.errors import GeometryError, HeightSystemError, InputError, UsageError
+from photoplan.geometry.bounds import area_fault, area_note
 from photoplan.geometry.crs import crs_label, parse_crs, require_projected_metres, same_crs, split_compound
 from photoplan.geometry.heights import height_label
 from photoplan.io.checks import check_plain_file
@@ -157,7 +158,21 @@ def _with_crs(part: MeasuredTerrain, options: ReadOptions) -> MeasuredTerrain:
     heights = part.height_system or declared_heights
     if heights is not None and heights.upper().startswith("EPSG:"):
         _check_height_unit(path, heights)
-    return replace(part, crs=declared or part.crs, height_system=heights)
+    crs = declared or part.crs
+    notes = part.notes if crs is None or options.beyond_area else (*part.notes, *_judged_area(path, part, crs))
+    return replace(part, crs=crs, height_system=heights, notes=notes)
+
+
+def _judged_area(path: Path, part: MeasuredTerrain, crs: str) -> tuple[str, ...]:
+    """A note on coordinates a little outside the area of their CRS; those far outside are refused."""
+    parts = [group.xyz for group in part.points] + [line.xyz for line in part.lines]
+    parts += [] if part.tin is None else [part.tin.xyz]
+    XY = np.concatenate([f(xyz[:, :2], axis=0)[None] for xyz in parts if len(xyz) for f in (np.nanmin, np.nanmax)])
+    fault = area_fault(crs, XY)
+    if fault is not None:
+        raise InputError(f"{path}: {fault}")
+    note = area_note(crs, XY)
+    return () if note is None else (f"{path.name}: {note}",)
 
 
 def _check_height_unit(path: Path, heights: str) -> None:

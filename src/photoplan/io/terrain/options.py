@@ -88,6 +88,8 @@ class ReadOptions:
     """Height that means "none": such points are left out."""
     crs: str | None = None
     """CRS of all files, declared; files that state another one are refused."""
+    beyond_area: bool = False
+    """Whether coordinates far outside the area of use of the CRS are meant."""
 
     def __post_init__(self) -> None:
         if self.las_classes is not None and not all(0 <= c <= 255 for c in self.las_classes):

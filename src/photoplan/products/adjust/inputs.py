@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
 from photoplan.errors import InputError
+from photoplan.geometry.bounds import area_note
 from photoplan.io.gcp_list import is_gcp_list, read_gcp_list
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import named_as, read_image_points
@@ -25,6 +26,7 @@ from photoplan.io.project.posed import Image
 from photoplan.products.init.match import some
 from photoplan.project.cameras import size_of
 
+Floats = NDArray[np.float64]
 #: Part of the measurements that may be wrong in a way that makes one think of the whole file.
 _FEW = 0.02
 
@@ -72,7 +74,7 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
             "hand or by `photoplan tie`"
         )
     notes: list[str] = []
-    ground_parts, parts, files = _control(project)
+    ground_parts, parts, files = _control(project, notes)
     for file in observations.image_points:
         path = project.resolve(file)
         if path not in files:
@@ -117,7 +119,19 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
     )
 
 
-def _control(project: Project) -> tuple[list[GroundPoints], list[tuple[Path, ImagePoints]], list[Path]]:
+def _judge_places(project: Project, path: Path, what: str, names: Sequence[str], XYZ: Floats, notes: list[str]) -> None:
+    """Refuse places of a file that are far outside the area of the project's CRS, and note those a little outside."""
+    fault = project.area_fault(XYZ, names)
+    if fault is not None:
+        raise InputError(f"{path}: {what} {fault}")
+    note = None if project.beyond_area else area_note(project.crs, XYZ, names)
+    if note is not None:
+        notes.append(f"{path.name}: {what} {note}")
+
+
+def _control(
+    project: Project, notes: list[str]
+) -> tuple[list[GroundPoints], list[tuple[Path, ImagePoints]], list[Path]]:
     """Ground points of all files, and the measurements that come with a gcp_list.txt."""
     grounds, points, files = [], [], []
     for file in project.observations.control:
@@ -130,6 +144,7 @@ def _control(project: Project) -> tuple[list[GroundPoints], list[tuple[Path, Ima
         else:
             columns, comma = project.observations.control_columns, bool(project.observations.decimal_comma)
             grounds.append(read_ground_points(path, crs=project.crs, columns=columns, decimal_comma=comma))
+        _judge_places(project, path, "control point", grounds[-1].names, grounds[-1].XYZ, notes)
     return grounds, points, files
 
 
@@ -232,6 +247,8 @@ def _positions(project: Project, names: Sequence[str], notes: list[str]) -> Posi
     orientation = project.orientation
     form = TableFormat(angle_unit=orientation.angle_unit, rotation=orientation.rotation)
     table = read_observed_positions(project.resolve(project.observations.positions), form, crs=project.crs)
+    notes += table.notes
+    _judge_places(project, table.path, "position of", table.images, table.XYZ, notes)
     known = {match_key(name): name for name in names}
     every = {match_key(image.name) for image in project.images}
     keep = [k for k, name in enumerate(table.images) if match_key(name) in known]

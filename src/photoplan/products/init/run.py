@@ -7,8 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.crs import crs_label
+from photoplan.geometry.bounds import area_fault, area_note
+from photoplan.geometry.crs import crs_label, crs_step
 from photoplan.geometry.frames import triple
 from photoplan.geometry.heights import height_label
 from photoplan.io.camera.file import CameraFile, read_cameras
@@ -113,6 +117,8 @@ class InitRequest:
     """Files of ground points, for [observations]."""
     positions: Path | None = None
     """Table of observed projection centres, for [observations]."""
+    beyond_area: bool = False
+    """Whether places far outside the area of use of the CRS are meant."""
     overwrite: bool = False
     """Whether an existing project file is replaced."""
 
@@ -176,8 +182,10 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
         pairs, lonely_files = unoriented(lonely_files), []
     infos = {file: read_info(file) for file, _ in pairs}
     terrain, terrain_info = terrain_entry(request)
-    place = next((each.place for each in own.values()), None)
+    places = [each.place for each in own.values()]
+    place = next(iter(places), None)
     crs, origin_of_crs = project_crs(request, table, terrain_info, place)
+    _judge_area(request, crs, [place[::-1] for place in places], "the middle of the images", talk, geographic=True)
     used = _cameras(pairs, _described(request, pairs), infos, table.file if table else None)
     where = f"{crs_label(crs)} ({origin_of_crs})"
     for line in _summary(used, pairs, len(own), where, lonely_files, lonely_names, table):
@@ -190,6 +198,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     if table is not None:
         centers, angles = placed(table, crs, systems[1])
         check_joined(*systems, crs, centers)
+        _judge_area(request, crs, centers, f"{table.file}: projection centre", talk)
         poses = {i.name: (triple(c), triple(a)) for i, c, a in zip(table.images, centers, angles)}
         stated = on_map(stated_positions(table, {oriented.name: file for file, oriented in pairs}), crs)
         for said in differences([i.name for i in table.images], centers, stated):
@@ -212,6 +221,30 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
         )
     project = _checked(request, terrain, *systems, crs, dict(used.values()), images)
     return InitResult(request.path, project, tuple(f.name for f in lonely_files), tuple(lonely_names))
+
+
+def _judge_area(
+    request: InitRequest,
+    crs: str,
+    places: ArrayLike,
+    what: str,
+    talk: Callable[[str], None],
+    geographic: bool = False,
+) -> None:
+    """Refuse places far outside the area of the CRS unless they are meant, and talk of those a little outside."""
+    XY = np.asarray(places, float)
+    if not len(XY):
+        return
+    if geographic:
+        XY = crs_step("EPSG:4326", crs).where_defined(XY[:, :2])
+        if np.isnan(XY).any() and not request.beyond_area:
+            raise InputError(f"{what} has no place in {crs_label(crs)}; is it the right CRS?")
+    fault = None if request.beyond_area else area_fault(crs, XY)
+    if fault is not None:
+        raise InputError(f"{what} {fault}")
+    note = None if request.beyond_area else area_note(crs, XY)
+    if note is not None:
+        talk(f"  warning: {what} {note}")
 
 
 def _described(request: InitRequest, pairs: Sequence[tuple[Path, object]]) -> CameraFile:
@@ -279,6 +312,7 @@ def _checked(
         orientation |= {"angle_unit": request.form.angle_unit, "rotation": request.form.rotation}
     contents: dict[str, Any] = {
         "crs": crs,
+        "beyond_area": request.beyond_area,
         "orientation": orientation,
         "observations": _observations(request),
         "cameras": {name: c.model_dump(exclude_none=True) for name, c in cameras.items()},
