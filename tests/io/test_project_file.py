@@ -106,7 +106,7 @@ def test_every_entry_has_a_comment_or_a_commented_place(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("size = [2000, 1125]", "size = [2000, 0]", r":38: cameras.*\.size\[2\]: 0 given; allowed is greater than 0"),
+        ("size = [2000, 1125]", "size = [2000, 0]", r":39: cameras.*\.size\[2\]: 0 given; allowed is greater than 0"),
         ("k1 = 0.0136", "kk1 = 0.0136", r"lens\.kk1: unknown entry"),
         ("center = [1.5, 2.5, 300.0]", "center = [1.5, nan, 300.0]", r"images\[1\]\.center\[2\]: nan given"),
         ("center = [1.5, 2.5, 300.0]", 'center = [1.5, "2", 300.0]', r"images\[1\]\.center\[2\]: '2' given"),

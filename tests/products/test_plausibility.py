@@ -250,8 +250,8 @@ def test_cameras_below_the_terrain_are_a_question_of_heights() -> None:
 
 
 def test_every_reading_has_a_sentence_and_the_declared_one_none() -> None:
-    assert DECLARED.sentence == ""
-    sentences = [r.sentence for r in readings("opk")]
+    assert DECLARED.sentence() == ""
+    sentences = [r.sentence() for r in readings("opk")]
     assert len(set(sentences)) == len(sentences)
     assert all(sentences)
     assert [r.changes for r in readings("pok")] == sorted(r.changes for r in readings("pok"))

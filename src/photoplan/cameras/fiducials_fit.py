@@ -301,8 +301,10 @@ def _turned_message(mirrored: bool, exchanged: list[str]) -> str:
     if mirrored:
         return f"the fiducial marks are not mirrored in the scan, but mirrored = true was stated{also}"
     return (
-        "the scan is mirrored: its fiducial marks run the other way round than the calibrated ones. Scan the film from "
-        f"its other side or mirror the image, or check that rows are counted downwards and y upwards{also}"
+        "the scan is mirrored: its fiducial marks run the other way round than the calibrated ones. If the film was "
+        "scanned through its back, set `mirrored = true`; if marks and angles are stated with the scene at z > 0 (ω is "
+        'then near half a circle for an aerial photograph), set `scene = "z > 0"` under [orientation] instead; else '
+        f"check that rows are counted downwards and y upwards{also}"
     )
 
 

@@ -36,6 +36,13 @@ from photoplan.cli.output import show, show_json, talking
 @click.option(
     "--earth-curvature", type=click.Choice(["none", "correction", "strict"]), default="none", show_default=True
 )
+@click.option(
+    "--scene",
+    type=click.Choice(["z<0", "z>0"]),
+    default="z<0",
+    show_default=True,
+    help="Side of the image on which the scene lies in the camera system of angles and fiducial marks.",
+)
 @click.option("--refraction", is_flag=True, help="Correct for refraction by a standard atmosphere.")
 @beyond_area_option
 @ending()
@@ -48,6 +55,7 @@ def command(folder: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     from photoplan.products.init.run import InitRequest, init_project
 
     form = table_format(options)
+    options["scene"] = {"z<0": "z < 0", "z>0": "z > 0"}[options["scene"]]
     talk = talking(quiet)
     result = init_project(InitRequest(folder=folder, form=form, **options), talk)
     if not as_json:

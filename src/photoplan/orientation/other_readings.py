@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -54,9 +54,21 @@ class OtherReading:
             )
         )
 
-    @property
-    def sentence(self) -> str:
-        """What the user would have to declare or repair."""
+    def sentence(self, mirrored: bool = False) -> str:
+        """Say what the user would have to declare or repair; `mirrored`: the scan is stated to be mirrored.
+
+        A film that was scanned the right way round but whose marks run the other way, with angles that look up, is
+        described with the scene at z > 0: turning the angles alone would mirror the ground.
+        """
+        if mirrored and (self.camera_flipped or self.ground_flipped):
+            scene = (
+                "the orientation looks like one with the scene at z > 0, whose marks and angles both run the other "
+                'way; set `scene = "z > 0"` under [orientation] and remove `mirrored` from the camera'
+            )
+            return "; ".join([*replace(self, camera_flipped=False, ground_flipped=False)._parts(), scene])
+        return "; ".join(self._parts())
+
+    def _parts(self) -> list[str]:
         parts = []
         if self.unit is not None:
             parts.append(
@@ -73,7 +85,7 @@ class OtherReading:
             parts.append("omega looks turned by 180°, as for ground axes Y south, Z down")
         if self.swapped:
             parts.append("X and Y of the projection centres look exchanged")
-        return "; ".join(parts)
+        return parts
 
     def apply(
         self, center: NDArray[np.float64], angles: NDArray[np.float64], order: str

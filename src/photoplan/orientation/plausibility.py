@@ -7,7 +7,7 @@ lines. A wrong rotation order that only turns a small tilt into another directio
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ CELL = 1000.0
 INNER = 10
 #: Images needed before tilts or flight lines say anything.
 ENOUGH = 3
+#: Slopes below the horizon (sines) from which a ray, and the middle of an image, may be expected to meet terrain.
+DOWNWARD, MIDDLE_DOWNWARD = 0.01, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,8 @@ class JudgedView:
     """Angle of a pixel in the middle, radians."""
     unit: str = "deg"
     """Unit of the angles in the project."""
+    mirrored: bool = False
+    """Whether the camera is stated to be scanned through the back of its film."""
 
     @property
     def R_ground_camera(self) -> NDArray[np.float64]:
@@ -73,14 +77,33 @@ class ImagePlausibility:
     on_terrain: float
     """Share of the image that sees the terrain."""
     middle_on_terrain: bool
-    """Whether the middle of the image does."""
+    """Whether the middle of the image does; for a level photograph, whether any part shows terrain or an object."""
     fault: str | None
     """What cannot be right; None if the image is plausible."""
+    level: bool = False
+    """Whether the image shows the horizon, and its middle lies near or above it: much of it cannot show terrain."""
 
 
-def look(view: JudgedView, heights: Heights) -> ImagePlausibility:
-    """Look at one image as its orientation is declared."""
-    return _look(view, view.center, view.R_ground_camera, heights)
+def look(view: JudgedView, heights: Heights, objects: NDArray[np.float64] | None = None) -> ImagePlausibility:
+    """Look at one image as its orientation is declared; `objects` (n, 3, 3) are triangles that it may show."""
+    found = _look(view, view.center, view.R_ground_camera, heights)
+    if found.level and found.on_terrain == 0 and objects is not None and _shows(view, objects):
+        return replace(found, fault=None, middle_on_terrain=True)
+    return found
+
+
+def _shows(view: JudgedView, triangles: NDArray[np.float64]) -> bool:
+    """Return whether the ray of any of the view's points meets one of the triangles (n, 3, 3)."""
+    a, b, c = np.moveaxis((triangles - view.center) @ view.R_ground_camera, 1, 0)
+    # A ray lies inside the three planes through the camera and the sides of a triangle.
+    sides = np.stack([np.cross(a, b), np.cross(b, c), np.cross(c, a)])
+    for t in view.tangents:
+        ray = np.array([*t, -1.0])
+        inside = np.sign(sides @ ray)
+        volume = np.sign(np.einsum("ij,ij->i", a, sides[1]))
+        if ((inside == volume).all(axis=0) & (volume != 0)).any():
+            return True
+    return False
 
 
 def _look(view: JudgedView, center: NDArray[np.float64], R: NDArray[np.float64], heights: Heights) -> ImagePlausibility:
@@ -90,9 +113,13 @@ def _look(view: JudgedView, center: NDArray[np.float64], R: NDArray[np.float64],
     below = float(heights(center[None, :2])[0])
     points = _footprint(center, R, view.tangents, below, heights)
     seen = np.isfinite(points[:, 2])
+    d = np.column_stack([view.tangents, -np.ones(len(view.tangents))]) @ R.T
+    slope = -d[:, 2] / np.linalg.norm(d, axis=1)
+    downward = slope > DOWNWARD
+    level = bool(slope[0] < MIDDLE_DOWNWARD and not downward.all())
     inner = np.argsort(np.linalg.norm(view.tangents - view.tangents[0], axis=1))[:INNER]
-    # A hole in the terrain under the very middle is not a sign of anything.
-    middle = bool(seen[0] or seen[inner].mean() > 0.5)
+    # A hole in the terrain under the very middle is not a sign of anything, nor is sky in a level photograph.
+    middle = bool(seen[0] or seen[inner].mean() > 0.5 or (level and seen.any()))
     distance = float(np.linalg.norm(points[inner[seen[inner]][0]] - center)) if seen[inner].any() else np.nan
     fault = None
     if center[2] <= below:
@@ -100,16 +127,18 @@ def _look(view: JudgedView, center: NDArray[np.float64], R: NDArray[np.float64],
     elif center[2] - below > HIGHEST_FLIGHT:
         fault = f"projection centre {center[2] - below:.3g} m above the terrain; are heights in millimetres?"
     elif not seen.any():
-        fault = f"sees nothing of the terrain (tilt {tilt:.1f}°)"
+        above = "looks above the horizon and " if level and not downward.any() else ""
+        fault = f"{above}sees nothing of the terrain (tilt {tilt:.1f}°)"
     return ImagePlausibility(
         name=view.name,
         tilt=tilt,
         azimuth=azimuth,
         height_above_ground=float(center[2] - below),
         gsd=distance * view.pixel,
-        on_terrain=float(seen.mean()),
+        on_terrain=float(seen[downward].mean()) if downward.any() else 0.0,
         middle_on_terrain=middle,
         fault=fault,
+        level=level,
     )
 
 
@@ -187,7 +216,8 @@ def other_reading(views: Sequence[JudgedView], images: Sequence[ImagePlausibilit
             ranked.sort(key=lambda r: r[0])
     if not ranked:
         return None
-    equal = [r.sentence for rank, r, _ in ranked if rank == ranked[0][0]]
+    mirrored = any(view.mirrored for view in sample)
+    equal = list(dict.fromkeys(r.sentence(mirrored) for rank, r, _ in ranked if rank == ranked[0][0]))
     lines = _alignment(views, DECLARED), _alignment(views, ranked[0][1])
     return _sentence(" — or: ".join(equal[:3]), (declared, ranked[0][2]), lines)
 
@@ -224,6 +254,8 @@ class _Evidence:
     largest: float
     """Largest declared angle, parts of a full circle."""
     count: int
+    level: float
+    """Share of level photographs, whose axes need not follow flight lines."""
 
     @classmethod
     def of(cls, views: list[JudgedView], images: list[ImagePlausibility], reading: OtherReading) -> _Evidence:
@@ -239,6 +271,7 @@ class _Evidence:
             offset=offset,
             largest=float(max(np.abs(v.angles).max() for v in views) / (2 * np.pi)),
             count=len(views),
+            level=float(np.mean([i.level for i in images])),
         )
 
     @property
@@ -248,7 +281,7 @@ class _Evidence:
     @property
     def astray(self) -> bool:
         """Image axes lie in no relation to the flight lines, in a block where that means something."""
-        return self.count >= 2 * ENOUGH and (self.alike < 0.85 or abs(self.offset) > 15)
+        return self.count >= 2 * ENOUGH and self.level < 0.5 and (self.alike < 0.85 or abs(self.offset) > 15)
 
     @property
     def doubtful(self) -> bool:

@@ -161,6 +161,7 @@ def _of_objects(project: Project, ground: Ground, names: Sequence[str]) -> tuple
 
 def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) -> ImageCheck:
     name, tilt, fault = looked.name, looked.tilt, looked.fault
+    sees_objects = looked.level and looked.on_terrain == 0 and fault is None
     image = project.any_image(name)
     file = project.resolve(image.file)
     if is_there(file):
@@ -173,7 +174,10 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
     seen = footprint(camera, ground.bare, ground.bounds)
     nan = float("nan")
     if seen.bounds is None:
-        fault = fault or "sees nothing of the terrain" + (f" (tilt {tilt:.1f}°)" if np.isfinite(tilt) else "")
+        if sees_objects:
+            notes = (*notes, "sees objects of the project, and nothing of the terrain")
+        else:
+            fault = fault or "sees nothing of the terrain" + (f" (tilt {tilt:.1f}°)" if np.isfinite(tilt) else "")
         return ImageCheck(
             image=name,
             tilt_deg=tilt,

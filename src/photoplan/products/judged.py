@@ -28,6 +28,7 @@ from photoplan.plan.footprint import footprint, mean_gsd
 from photoplan.project.cameras import camera_without_pixels, is_there
 from photoplan.project.ground import Ground
 from photoplan.project.posed import pose_of, view_of
+from photoplan.surfaces.objects import ObjectSurface
 
 _Floats = NDArray[np.float64]
 
@@ -59,9 +60,14 @@ def judged(project: Project, image: ImageEntry, ground: Ground) -> tuple[JudgedV
         return None, _without_pose(project, image.name, ground)
     center = pose_of(project, image, ground).center
     view = view_of(image, project.cameras[image.camera], project.orientation, center)
-    found = look(view, ground.bare.heights)
+    found = look(view, ground.bare.heights, _object_triangles(ground))
     odd = project.area_fault(center) or position_fault(project, image)
     return view, found if odd is None else replace(found, fault=odd)
+
+
+def _object_triangles(ground: Ground) -> _Floats | None:
+    """Return the triangles (n, 3, 3) of the project's objects; None if it has none."""
+    return ground.surface.faces.corners if isinstance(ground.surface, ObjectSurface) else None
 
 
 def _without_pose(project: Project, name: str, ground: Ground) -> ImagePlausibility:
@@ -106,7 +112,7 @@ def reading_of_block(
             view = view_of(
                 image, project.cameras[image.camera], project.orientation, pose_of(project, image, ground).center
             )
-            looked[image.name] = view, look(view, ground.bare.heights)
+            looked[image.name] = view, look(view, ground.bare.heights, _object_triangles(ground))
     views, looks = [view for view, _ in looked.values()], [found for _, found in looked.values()]
     return other_reading(views, looks, ground.bare.heights)
 

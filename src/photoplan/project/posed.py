@@ -94,4 +94,5 @@ def view_of(image: Image, camera: CameraEntry, orientation: Orientation, center:
         tangents=points,
         pixel=pixel,
         unit=orientation.angle_unit,
+        mirrored=camera.fiducial_system is not None and camera.fiducial_system.mirrored,
     )

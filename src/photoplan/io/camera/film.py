@@ -76,6 +76,22 @@ class FilmEntry(CameraEntry):
         return False
 
     @property
+    def odd_in_x(self) -> frozenset[str]:
+        """Name the values that change their sign when x of the image is counted the other way."""
+        return self.lens.odd_in_x | {"x0"}
+
+    def x_reversed(self) -> Self:
+        """Return the camera with x of marks, principal point and lens reversed."""
+        x, y = self.principal_point_mm
+        return self.model_copy(
+            update={
+                "fiducials_mm": {name: (-mark[0] + 0.0, mark[1]) for name, mark in self.fiducials_mm.items()},
+                "principal_point_mm": (-x + 0.0, y),
+                "lens": self.lens.x_reversed(),
+            }
+        )
+
+    @property
     def fiducial_system(self) -> FiducialSystem:
         """The fiducial marks."""
         return FiducialSystem(self.fiducials_mm, self.interior, self.mirrored, self.marks)

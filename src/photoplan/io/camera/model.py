@@ -56,6 +56,13 @@ class LensEntry(Entry, ABC):
     def made(self, camera: CameraEntry) -> Lens:
         """The lens that computes; raises InputError where the coefficients cannot be a lens's."""
 
+    odd_in_x: ClassVar[frozenset[str]] = frozenset()
+    """Coefficients that change their sign when x is counted the other way."""
+
+    def x_reversed(self) -> Self:
+        """Return the lens for image coordinates with the x axis reversed."""
+        return self.model_copy(update={name: -getattr(self, name) + 0.0 for name in self.odd_in_x})
+
 
 class IdealLens(LensEntry):
     """A lens without distortion."""
@@ -85,6 +92,7 @@ class BrownLens(LensEntry):
     b1: Number = 0.0
     b2: Number = 0.0
     k4: Number = 0.0
+    odd_in_x: ClassVar[frozenset[str]] = frozenset({"p1", "b2"})
 
     @property
     def needs(self) -> Literal["mm", "px"] | None:
@@ -118,6 +126,7 @@ class OpenCVLens(LensEntry):
     k4: Number = 0.0
     k5: Number = 0.0
     k6: Number = 0.0
+    odd_in_x: ClassVar[frozenset[str]] = frozenset({"p2"})
 
     def made(self, camera: CameraEntry) -> Lens:
         """OpenCV's lens."""
@@ -308,6 +317,15 @@ class CameraEntry(Entry, ABC):
         if self.camera_constant_mm is None:
             raise InputError("the lens is described in millimetres; give camera_constant_mm")
         return self.camera_constant_mm
+
+    @property
+    def odd_in_x(self) -> frozenset[str]:
+        """Names of stated values that change their sign when x of the image is counted the other way."""
+        return frozenset()
+
+    def x_reversed(self) -> Self:
+        """Return the camera with the x axis reversed in what it states about the image plane."""
+        return self
 
     def moved(self, change: Mapping[str, float], name: str) -> Self:
         """It, called `name`, with what its `sigma` lists changed.

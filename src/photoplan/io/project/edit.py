@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import tomlkit
+from pydantic import ValidationError
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Table
 
@@ -16,6 +17,7 @@ from photoplan.io.naming import write_atomically
 from photoplan.io.plain_files import MAX_BYTES, read_text
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project
+from photoplan.io.project.posed import turned_angles, turned_correlation
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ def edit_project(path: Path, changes: ProjectChanges) -> Project:
         document = tomlkit.parse(text)
     except TOMLKitError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from None
+    changes = _as_stated(document, changes)
     _set_images(document, changes.images, path)
     for name, entries in changes.cameras.items():
         cameras = _table(document.get("cameras", {}), f"{path}: cameras")
@@ -70,6 +73,38 @@ def edit_project(path: Path, changes: ProjectChanges) -> Project:
         write_atomically(path.with_suffix(".previous.toml"), before)
         write_atomically(path, changed.replace("\n", line_end).encode())
     return project
+
+
+def _as_stated(document: tomlkit.TOMLDocument, changes: ProjectChanges) -> ProjectChanges:
+    """Return the changes in the camera system of the file, whose scene may lie at z > 0; see `Orientation.scene`."""
+    orientation = document.get("orientation", {})
+    if not isinstance(orientation, Mapping) or orientation.get("scene", "z < 0") == "z < 0":
+        return changes
+    try:
+        stated = Project.model_validate({**document.unwrap(), "folder": Path()})
+    except ValidationError:  # parse_project names the entry that is wrong
+        return changes
+    unit, order = stated.orientation.angle_unit, stated.orientation.rotation
+    cameras = {}
+    for name, entries in changes.cameras.items():
+        cameras[name] = new = {**entries}
+        if "principal_point_mm" in new and "x0" in stated.cameras[name].odd_in_x:
+            x, y = new["principal_point_mm"]
+            new["principal_point_mm"] = [-x + 0.0, y]
+        if isinstance(new.get("lens"), Mapping):
+            odd = stated.cameras[name].odd_in_x
+            new["lens"] = {key: -value if key in odd else value for key, value in new["lens"].items()}
+    images = {}
+    for name, entries in changes.images.items():
+        images[name] = new = {**entries}
+        if new.get("angles"):
+            new["angles"] = list(turned_angles(new["angles"], unit, order))
+        if new.get("correlation"):
+            camera = stated.image(name).camera
+            sigma = changes.cameras.get(camera, {}).get("sigma", stated.cameras[camera].sigma)
+            of = stated.cameras[camera].model_copy(update={"sigma": sigma})
+            new["correlation"] = list(turned_correlation(new["correlation"], order, of))
+    return ProjectChanges(images, cameras, changes.tables)
 
 
 def _set_images(document: tomlkit.TOMLDocument, images: Mapping[str, Mapping[str, Any]], path: Path) -> None:

@@ -47,6 +47,7 @@ def parse_project(data: dict[str, Any], folder: Path, source: str, text: str = "
         project = Project.model_validate({**data, "folder": folder})
     except ValidationError as error:
         raise InputError(explain(error, data, source, text)) from None
+    project = project.in_standard_axes()
     require_projected_metres(project.crs, f"{source}: crs")
     terrain = None if project.terrain is None else project.terrain.height_system
     for table, name in (("terrain", terrain), ("orientation", project.orientation.height_system)):

@@ -88,6 +88,9 @@ class Orientation(Entry):
     height_system: Name | None = None
     angle_unit: Literal["deg", "gon", "rad"] = "deg"
     rotation: Literal["opk", "pok", "kpo", "kop", "okp", "pko"] = "opk"
+    scene: Literal["z < 0", "z > 0"] = "z < 0"
+    """Side of the image on which the scene lies in the camera system of the stated numbers. ``z > 0`` (Ecker 1991,
+    section 8.1): angles, and image coordinates in millimetres, are converted when the project is read."""
     earth_curvature: Literal["none", "correction", "strict"] = "none"
     refraction: Annotated[bool, Strict()] = False
 
@@ -254,6 +257,22 @@ class Project(Entry):
             odd = odd_angles(image.angles, self.orientation.angle_unit) or odd_place(image.center, camera=True)
             if odd is not None:
                 raise ValueError(f"{where}: {odd}")
+
+    def in_standard_axes(self) -> Self:
+        """Return the project with the scene at z < 0: angles and millimetres of the image are converted."""
+        if self.orientation.scene == "z < 0":
+            return self
+        unit, order = self.orientation.angle_unit, self.orientation.rotation
+        return self.model_copy(
+            update={
+                "orientation": self.orientation.model_copy(update={"scene": "z < 0"}),
+                "cameras": {name: camera.x_reversed() for name, camera in self.cameras.items()},
+                "images": tuple(
+                    image.scene_turned(unit, order, self.cameras[image.camera]) if isinstance(image, Image) else image
+                    for image in self.images
+                ),
+            }
+        )
 
     @property
     def ground(self) -> StatedTerrain:

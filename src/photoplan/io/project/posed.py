@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Self
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
 from photoplan.errors import InputError
+from photoplan.geometry.rotation import ANGLE_UNITS
 from photoplan.io.camera.model import CameraEntry, Fiducials, Name, NotNegative, Triple
 from photoplan.io.project.image import Deviation, ImageEntry
 
@@ -18,6 +19,34 @@ _MOST_DEVIATION = 1e6
 _ANGLES = {"o": "omega", "p": "phi", "k": "kappa"}
 
 Correlation = tuple[Annotated[float, Strict(), Field(ge=-1, le=1)], ...]
+
+
+def turned_angles(angles: Sequence[float], unit: str, order: str) -> Triple:
+    """Return angles of a camera system that is turned by half a circle about its x axis, within half a circle.
+
+    Half a turn about x adds to ω, and reverses the sense of the rotations between ω and the camera.
+    """
+    half = ANGLE_UNITS[unit] / 2
+    turned = [round(sign * angle, 12) + 0.0 for sign, angle in zip(_senses(order), angles)]
+    at = order.index("o")
+    turned[at] = round(angles[at] - half if angles[at] > 0 else angles[at] + half, 12) + 0.0
+    return (turned[0], turned[1], turned[2])
+
+
+def _senses(order: str) -> list[float]:
+    """Return −1 for each angle whose sense half a turn of the camera about x reverses, else 1."""
+    return [-1.0 if k > order.index("o") else 1.0 for k in range(3)]
+
+
+def turned_correlation(correlation: Sequence[float], order: str, camera: CameraEntry) -> tuple[float, ...]:
+    """Return the correlations after `turned_angles`: those of reversed angles and of what is odd in x change sign."""
+    signs = [1.0, 1.0, 1.0, *_senses(order)]
+    signs += [-1.0 if name in camera.odd_in_x else 1.0 for name in camera.sigma or {}]
+    size = int((1 + np.sqrt(1 + 8 * len(correlation))) / 2)
+    if size > len(signs):
+        raise InputError(f"correlation has {len(correlation)} numbers, more than orientation and camera have")
+    pairs = zip(*np.tril_indices(size, -1))
+    return tuple(float(r * signs[i] * signs[j]) for r, (i, j) in zip(correlation, pairs))
 
 
 class Image(ImageEntry):
@@ -105,6 +134,15 @@ class Image(ImageEntry):
         update = {"center": tuple(center + change[:3]), "angles": tuple(angles + change[3:6])}
         by_name = dict(zip(camera.sigma or {}, change[6:].tolist()))
         return self.model_copy(update=update), {**cameras, self.camera: camera.moved(by_name, self.camera)}
+
+    def scene_turned(self, unit: str, order: str, camera: CameraEntry) -> Image:
+        """Return the image with its angles for a scene on the other side of the image, see `turned_angles`."""
+        update: dict[str, object] = {}
+        if self.angles is not None:
+            update["angles"] = turned_angles(self.angles, unit, order)
+        if self.correlation:
+            update["correlation"] = turned_correlation(self.correlation, order, camera)
+        return self.model_copy(update=update) if update else self
 
     @property
     def pose_numbers(self) -> tuple[Triple, Triple]:

@@ -119,6 +119,7 @@ def _orientation(orientation: Orientation) -> list[str]:
                 ("height_system", orientation.height_system, "of every Z0 below"),
                 ("angle_unit", orientation.angle_unit, '"deg", "gon" or "rad"'),
                 ("rotation", orientation.rotation, "o = about X, p = about Y, k = about Z; the first is the primary"),
+                ("scene", orientation.scene, '"z < 0", or "z > 0" if angles and marks are stated with the scene there'),
                 ("earth_curvature", orientation.earth_curvature, '"none", "correction" (of image points) or "strict"'),
                 ("refraction", orientation.refraction, "correct image points for a standard atmosphere"),
             ]

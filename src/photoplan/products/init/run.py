@@ -111,6 +111,8 @@ class InitRequest:
     """none, correction or strict."""
     refraction: bool = False
     """Whether image points are corrected for refraction."""
+    scene: str = "z < 0"
+    """Side of the image on which the scene lies in the camera system of the files, "z < 0" or "z > 0"."""
     image_points: tuple[Path, ...] = ()
     """Files of measured image points, for [observations]."""
     control: tuple[Path, ...] = ()
@@ -306,6 +308,7 @@ def _checked(
         "height_system": height_system,
         "earth_curvature": request.earth_curvature,
         "refraction": request.refraction,
+        "scene": request.scene,
     }
     if request.orientation is None:
         # Angles will be written so; those of a file are turned into ω, φ, κ in degrees.
