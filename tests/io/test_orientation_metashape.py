@@ -306,3 +306,60 @@ def test_fault_10_hostile_and_broken_files(tmp_path: Path, change: Any, says: st
     (tmp_path / "cameras.xml").write_text(broken)
     with pytest.raises(InputError, match=says):
         read_orientation_block(tmp_path / "cameras.xml", format="metashape")
+
+
+def labels(change: str = "", groups: tuple[str, str] = ("100MEDIA", "101MEDIA"), second: str = "0") -> str:
+    """Two cameras of one label, in two groups, of two sensors of one label."""
+    sensors = "".join(
+        f'<sensor id="{k}" label="FC6310" type="frame"><resolution width="600" height="400"/><calibration type="frame" '
+        f'class="adjusted"><f>500</f><k1>{k1}</k1></calibration></sensor>'
+        for k, k1 in ((0, 0.01), (1, 0.02))
+    )
+    cameras = "".join(
+        f'<group id="{k}" label="{group}"><camera id="{k}" sensor_id="{sensor}" label="DJI_1"><transform>'
+        f"1 0 0 {k} 0 -1 0 0 0 0 -1 50 0 0 0 1</transform></camera></group>"
+        for k, (group, sensor) in enumerate(zip(groups, ("0", second)))
+    )
+    return f"<document><chunk><sensors>{sensors}</sensors><cameras>{cameras}{change}</cameras></chunk></document>"
+
+
+def test_equal_labels_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.xml"
+    path.write_text(labels(second="1"))
+    block = read_orientation_block(path)
+    assert [i.name for i in block.table.images] == ["100MEDIA/DJI_1", "101MEDIA/DJI_1"]
+    assert [block.camera(i).lens.k1 for i in block.table.images] == [0.01, 0.02]
+    assert list(read_cameras(path)) == ["FC6310 (sensor 0)", "FC6310 (sensor 1)"]
+    # One sensor is used: its name is the same as in the file of cameras.
+    path.write_text(labels())
+    assert list(read_orientation_block(path).cameras) == ["FC6310 (sensor 0)"]
+    # Groups of one label, and no groups.
+    for groups, name in ((("g", "g"), "g/DJI_1"), (("", ""), "DJI_1")):
+        path.write_text(labels(groups=groups))
+        images = read_orientation_block(path).table.images
+        assert [i.name for i in images] == [f"{name} (camera 0)", f"{name} (camera 1)"]
+
+
+def test_cameras_of_a_rig_follow_their_master(tmp_path: Path) -> None:
+    R = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+    slave = (
+        '<camera id="7" sensor_id="1" master_id="0" label="NIR"/><camera id="8" sensor_id="1" master_id="9" label="x"/>'
+    )
+    offset = f"<rotation>{text(R)}</rotation><location>0.5 0.1 -0.2</location></sensor></sensors>"
+    path = tmp_path / "cameras.xml"
+    path.write_text(labels(slave).replace("</sensor></sensors>", offset))
+    block = read_orientation_block(path)
+    assert [i.name for i in block.table.images][2:] == ["NIR"]
+    master = np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(block.table.centers[2], master @ [0.5, 0.1, -0.2] + [0, 0, 50], atol=1e-12)
+    np.testing.assert_allclose(block.table.rotations[2], master @ R @ np.diag([1.0, -1.0, -1.0]), atol=1e-12)
+    assert [n for n in block.table.notes if "not aligned" in n or "rigs" in n] == [
+        "cameras.xml: 1 cameras are not aligned; left out",
+        "cameras.xml: 1 cameras of rigs are placed by their master and the offset of the sensor",
+    ]
+
+
+def test_outsiders_labels_are_read(shared: Path) -> None:
+    blocks = [read_orientation_block(shared / f"cases/15_metashape_same_labels/{name}.xml") for name in "efg"]
+    assert [len(block.table.images) for block in blocks] == [2, 2, 2]
+    assert [len(block.cameras) for block in blocks] == [2, 1, 2]

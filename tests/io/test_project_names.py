@@ -10,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from photoplan.errors import InputError
-from photoplan.io.names import check_input_name, match_key, resolve_input, safe_stem, unique_stems
+from photoplan.io.names import (
+    ImageNames,
+    check_input_name,
+    match_key,
+    resolve_input,
+    safe_stem,
+    same_images,
+    unique_stems,
+)
 
 
 @pytest.mark.parametrize(
@@ -68,10 +76,47 @@ def test_fault_11_any_name_gives_a_plain_stem_or_an_error(name: str) -> None:
     assert (Path("/out") / f"{stem}_ortho.tif").resolve().parent == Path("/out")
 
 
-def test_fault_12_two_names_of_one_product_are_named() -> None:
-    with pytest.raises(InputError, match=r"'a/IMG_1\.tif' and 'b/img_1\.jpg'"):
-        unique_stems(["a/IMG_1.tif", "IMG_2.tif", "b/img_1.jpg"])
+def test_fault_12_equal_base_names_get_distinct_stems() -> None:
+    names = ["a/IMG_1.tif", "IMG_2.tif", "b/img_1.jpg", "x/b/img_1.jpg", "X 3", "X_3", "x_3"]
+    stems = unique_stems(names)
+    assert list(stems.values()) == ["a_IMG_1", "IMG_2", "b_img_1", "x_b_img_1", "X_3", "X_3_2", "x_3_3"]
     assert unique_stems(["x/1.tif", "2"]) == {"x/1.tif": "1", "2": "2"}
+
+
+@given(
+    st.lists(st.sampled_from(["a", "b/a", "c/a", "x/c/a", "a.tif", "A", "a_", "b_a", "c/a.jpg", "C:/c/a"]), unique=True)
+)
+def test_fault_12_stems_are_always_distinct(names: list[str]) -> None:
+    stems = [stem.casefold() for stem in unique_stems(names).values()]
+    assert len(set(stems)) == len(names)
+
+
+def test_images_are_found_by_any_spelling() -> None:
+    names = ImageNames(["100/DJI_1.JPG", "101/DJI_1.JPG", "b", "Ü.tif"])
+    assert names.find("b.TIF") == "b"
+    assert names.find("/any/where/B.jpg") == "b"
+    assert names.find("U\u0308") == "Ü.tif"
+    assert names.find("c") is None
+    assert names.find(r"D:\flight\101\dji_1.jpg") == "101/DJI_1.JPG"
+    for doubtful in ("DJI_1", "102/DJI_1.JPG"):
+        with pytest.raises(InputError, match=r"may be '100/DJI_1.JPG' or '101/DJI_1.JPG'"):
+            names.find(doubtful)
+    assert names.match(["x/b", "101/DJI_1"]) == ["b", "101/DJI_1.JPG"]
+    # The better of two spellings is the image; the other one is another image.
+    assert ImageNames(["p/b"]).match(["q/b", "p/b"]) == [None, "p/b"]
+    with pytest.raises(InputError, match=r"'q/b' and 'r/b' are both image 'b'"):
+        ImageNames(["b"]).match(["q/b", "r/b"])
+
+
+def test_spellings_within_one_file() -> None:
+    assert same_images(["a/1.tif", "1", "b/2", "c/2"]) == {
+        "a/1.tif": "a/1.tif",
+        "1": "a/1.tif",
+        "b/2": "b/2",
+        "c/2": "c/2",
+    }
+    with pytest.raises(InputError, match="'2' may be 'b/2' or 'c/2'"):
+        same_images(["b/2", "c/2", "2"])
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,7 @@ def test_fault_12_two_files_or_lines_with_one_base_name(files: dict[str, Any], t
     (tmp_path / "more").mkdir()
     raster(tmp_path / "more" / "a.tif")
     both = {**files, "images": (*files["images"], str(tmp_path / "more" / "*.tif"))}
-    with pytest.raises(InputError, match=r"images/a\.tif and .*more/a\.tif have one base name"):
+    with pytest.raises(InputError, match=r"images/a\.tif' and .*more/a\.tif' are both image 'a' by the base name"):
         init_project(InitRequest(**both))
     assert not files["folder"].exists()
     # The same file by two patterns is one file.
@@ -153,8 +153,21 @@ def test_fault_12_two_files_or_lines_with_one_base_name(files: dict[str, Any], t
     assert len(make_project(InitRequest(**twice)).project.images) == 2
     with files["orientation"].open("a") as table:
         table.write("left/a.tif,1,2,3,4,5,6\n")
-    with pytest.raises(InputError, match=r"'a' and 'left/a\.tif' are one image by their base name"):
-        init_project(InitRequest(**files))
+    assert make_project(InitRequest(**files)).without_image == ("left/a.tif",)
+
+
+def test_fault_12_equal_base_names_are_told_apart_by_folder(files: dict[str, Any], tmp_path: Path) -> None:
+    """Files of two folders go to the lines of their folders; names and products are distinct."""
+    for folder in ("100MEDIA", "101MEDIA"):
+        (tmp_path / folder).mkdir()
+        raster(tmp_path / folder / "a.tif")
+    text = files["orientation"].read_text().replace("\na,", "\n101MEDIA/a,")
+    files["orientation"].write_text(text + "D:\\\\flight\\100MEDIA\\A.JPG,7,2,3,4,5,6\n".replace("\\\\", "\\"))
+    images = (*(str(tmp_path / f / "a.tif") for f in ("100MEDIA", "101MEDIA")), str(tmp_path / "images" / "b.tif"))
+    project = make_project(InitRequest(**{**files, "images": images})).project
+    assert [i.name for i in project.images] == ["100MEDIA/a", "101MEDIA/a", "b"]
+    assert [project.image(n).center[0] == 7 for n in ("100MEDIA/a", "101MEDIA/a")] == [True, False]
+    assert project.stems == {"100MEDIA/a": "100MEDIA_a", "101MEDIA/a": "101MEDIA_a", "b": "b"}
 
 
 def test_fault_12_stems_that_differ_only_in_what_is_replaced(files: dict[str, Any], tmp_path: Path) -> None:
@@ -162,8 +175,8 @@ def test_fault_12_stems_that_differ_only_in_what_is_replaced(files: dict[str, An
     raster(tmp_path / "images" / "x_1.tif")
     with files["orientation"].open("a") as table:
         table.write("x 1,1,2,3,4,5,6\nx_1,1,2,3,4,5,6\n")
-    with pytest.raises(InputError, match=r"'x 1' and 'x_1' would both write"):
-        init_project(InitRequest(**files))
+    project = make_project(InitRequest(**files)).project
+    assert (project.stems["x 1"], project.stems["x_1"]) == ("x_1", "x_1_2")
 
 
 def test_fault_13_an_existing_project_is_kept(files: dict[str, Any]) -> None:
@@ -436,8 +449,8 @@ def test_fault_12_unoriented_files_with_one_base_name(files: dict[str, Any], tmp
     (tmp_path / "more").mkdir()
     raster(tmp_path / "more" / "a.tif")
     both = {**files, "orientation": None, "images": (*files["images"], str(tmp_path / "more" / "*.tif"))}
-    with pytest.raises(InputError, match=r"images/a\.tif and .*more/a\.tif have one base name"):
-        make_project(InitRequest(**both, crs="EPSG:32632"))
+    project = make_project(InitRequest(**both, crs="EPSG:32632")).project
+    assert [i.name for i in project.images] == ["images/a", "b", "more/a"]
 
 
 def test_film_without_marks_and_cameras_by_size(files: dict[str, Any], tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, crs_step, parse_crs, same_crs, split_compound
-from photoplan.io.names import match_key
+from photoplan.io.names import same_images
 from photoplan.io.plain_files import read_text
 from photoplan.io.table_lines import NUMBER, number
 
@@ -74,14 +74,15 @@ def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
     names = _names(rows)
     places: dict[str, _Line] = {}
     measured: dict[tuple[str, str], int] = {}
-    spelled: dict[str, str] = {}
+    try:
+        spelled = same_images(row.image for row in rows)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     for row, name in zip(rows, names):
         first = places.setdefault(name, row)
         if not np.array_equal(first.XYZ, row.XYZ, equal_nan=True):
             raise InputError(f"{path}:{row.number}: point {name!r} has other coordinates than in line {first.number}")
-        key = match_key(row.image)
-        spelled.setdefault(key, row.image)
-        at = measured.setdefault((name, key), row.number)
+        at = measured.setdefault((name, spelled[row.image]), row.number)
         if at != row.number:
             raise InputError(
                 f"{path}:{row.number}: point {name!r} is measured in image {row.image!r} in line {at} already; keep "
@@ -96,7 +97,7 @@ def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
             f"{path}: points are geographic ({crs_label(own)}); say which projected CRS they are wanted in"
         )
     ground = GroundPoints(tuple(places), XYZ, np.full((len(places), 3), np.nan), np.zeros(len(places), bool))
-    table = [(name, spelled[match_key(row.image)], *row.xy) for row, name in zip(rows, names)]
+    table = [(name, spelled[row.image], *row.xy) for row, name in zip(rows, names)]
     return GcpList(own, ground, ImagePoints.from_rows(table))
 
 

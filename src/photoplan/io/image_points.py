@@ -13,7 +13,7 @@ import numpy as np
 
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import InputError
-from photoplan.io.names import match_key
+from photoplan.io.names import ImageNames, same_images
 from photoplan.io.tables import Columns, Dialect, Table, read_table, write_table
 
 _ROLES = {
@@ -62,18 +62,15 @@ def read_image_points(
     """
     table = read_table(Path(path), _COLUMNS, Dialect(columns, decimal_comma=decimal_comma))
     points, images = table.names("point"), table.names("image")
-    keys = [match_key(name) for name in images]
-    spelled: dict[str, str] = {}
-    for key, name in zip(keys, images):
-        spelled.setdefault(key, name)
+    spelled = same_images(images)
     point_at = {name: k for k, name in enumerate(dict.fromkeys(points))}
-    image_at = {key: k for k, key in enumerate(spelled)}
-    image = np.array([image_at[key] for key in keys], np.int64)
+    image_at = {name: k for k, name in enumerate(dict.fromkeys(spelled.values()))}
+    image = np.array([image_at[spelled[name]] for name in images], np.int64)
     point = np.array([point_at[name] for name in points], np.int64)
     found = table.numbers("x", "y"), _sigma(table)
     keep = _once(table, image * len(point_at) + point, (points, images), doubtful)
     return ImagePoints(
-        images=tuple(spelled.values()),
+        images=tuple(image_at),
         points=tuple(point_at),
         image=image[keep],
         point=point[keep],
@@ -112,19 +109,23 @@ def _once(
 def named_as(points: ImagePoints, names: Sequence[str]) -> tuple[ImagePoints, tuple[str, ...]]:
     """The measurements with the images' names written as in `names`, and the images that are not among these.
 
-    Names are compared without folder and suffix. Images that are not known keep their name.
+    See `photoplan.io.names.ImageNames`. Images that are not known keep their name.
 
     Raises
     ------
     InputError
-        Two images of the points are one image of `names`.
+        Two images of the points are one image of `names`, or one may be several of them.
     """
-    known = {match_key(name): name for name in names}
-    renamed = [known.get(match_key(image), image) for image in points.images]
-    unknown = tuple(image for image in points.images if match_key(image) not in known)
-    if len(set(renamed)) < len(renamed):
-        twice = next(name for name in renamed if renamed.count(name) > 1)
-        raise InputError(f"image points: two images are called {twice!r} by their base name; rename one of them")
+    try:
+        found = ImageNames(names).match(points.images)
+    except InputError as error:
+        raise InputError(f"image points: {error}") from None
+    # An image that is not known must not take the name of one that is.
+    taken = set(names)
+    renamed = [
+        known or (f"{image} (unknown)" if image in taken else image) for known, image in zip(found, points.images)
+    ]
+    unknown = tuple(image for known, image in zip(found, points.images) if known is None)
     return ImagePoints(
         images=tuple(renamed),
         points=points.points,

@@ -6,7 +6,7 @@ import hashlib
 import os
 import re
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from photoplan.errors import InputError
@@ -48,27 +48,149 @@ def safe_stem(name: str) -> str:
 
 
 def unique_stems(names: Iterable[str]) -> dict[str, str]:
-    """Stem of every name; two names that would write the same files are an error before any work.
+    """File stem of every name; no two names have the same one.
 
-    Case is ignored in the comparison, since common file systems ignore it.
+    Names with one base name get their folders in front, as many as tell them apart, then a number. Capitals are ignored
+    in the comparison, since common file systems ignore them.
 
     Raises
     ------
     InputError
-        Two names share a stem; both are named.
+        Nothing usable is left of a name.
     """
-    stems: dict[str, str] = {}
-    first: dict[str, str] = {}
-    for name in names:
-        stem = safe_stem(name)
-        key = stem.casefold()
-        if key in first:
-            raise InputError(
-                f"images {first[key]!r} and {name!r} would both write {stem!r}; rename one of them in the project file"
-            )
-        first[key] = name
+    stems = {name: safe_stem(name) for name in names}
+    taken: set[str] = set()
+    for name, short in shortest_paths(stems).items():
+        stem = safe_stem("_".join(short)) if len(short) > 1 else stems[name]
+        plain, number = stem, 2
+        while stem.casefold() in taken:
+            stem, number = f"{plain}_{number}", number + 1
+        taken.add(stem.casefold())
         stems[name] = stem
     return stems
+
+
+def shortest_paths(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """The last folders and the base name of every name: as few folders as tell it from the others.
+
+    Names that no folder tells apart keep what is the same.
+    """
+    parts = {name: name_parts(name) for name in names}
+    short = dict.fromkeys(parts, 1)
+    while True:
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for name, count in short.items():
+            groups.setdefault(tuple(p.casefold() for p in parts[name][-count:]), []).append(name)
+        longer = [n for group in groups.values() if len(group) > 1 for n in group if short[n] < len(parts[n])]
+        if not longer:
+            return {name: parts[name][-count:] for name, count in short.items()}
+        for name in longer:
+            short[name] += 1
+
+
+def name_parts(name: str) -> tuple[str, ...]:
+    """Folders and base name of an image; no drive, no ``.`` and ``..``, no raster suffix."""
+    folders = re.split(r"[/\\]", unicodedata.normalize("NFC", name.strip()))[:-1]
+    return (*(f for f in folders if f not in ("", ".", "..") and not re.fullmatch(r"[A-Za-z]:", f)), match_key(name))
+
+
+class ImageNames:
+    """Images found by any spelling of their names: the one notion of which two names are one image.
+
+    Names are compared without folder and raster suffix. If several images have one base name, the folders decide, from
+    the last one upwards, then capitals, then the suffix.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._names = set(names := list(names))
+        self._by_key: dict[str, list[str]] = {}
+        for name in dict.fromkeys(names):
+            self._by_key.setdefault(match_key(name).casefold(), []).append(name)
+
+    def find(self, name: str) -> str | None:
+        """The image that is meant; None if no image has the base name.
+
+        Raises
+        ------
+        InputError
+            Several images fit equally well.
+        """
+        if name in self._names:
+            return name
+        known = self._by_key.get(match_key(name).casefold(), [])
+        scores = [_likeness(name, other) for other in known]
+        fitting = [other for other, score in zip(known, scores) if score == max(scores)]
+        if len(fitting) > 1:
+            raise InputError(
+                f"image {name!r} may be {' or '.join(map(repr, fitting[:4]))}; write its name with the folder"
+            )
+        return fitting[0] if fitting else None
+
+    def match(self, given: Sequence[str]) -> list[str | None]:
+        """The image of each of several names, no two of which are one image; None if no image has the base name.
+
+        Raises
+        ------
+        InputError
+            A name fits several images, or several names fit one image, equally well.
+        """
+        found = [self.find(name) for name in given]
+        best: dict[str, int] = {}
+        for k, known in enumerate(found):
+            if known is None:
+                continue
+            first = best.setdefault(known, k)
+            if first == k:
+                continue
+            scores = _likeness(given[first], known), _likeness(given[k], known)
+            if scores[0] == scores[1]:
+                raise InputError(
+                    f"{given[first]!r} and {given[k]!r} are both image {known!r} by the base name; rename one, or "
+                    "write the folder in all names"
+                )
+            lost, best[known] = (first, k) if scores[1] > scores[0] else (k, first)
+            found[lost] = None
+        return found
+
+
+def _likeness(name: str, other: str) -> tuple[int, bool, bool, bool]:
+    """How well two names of one base name fit: equal folders, no folder that differs, capitals, suffix."""
+    one, two = name_parts(name)[:-1], name_parts(other)[:-1]
+    pairs = list(zip(reversed([p.casefold() for p in one]), reversed([p.casefold() for p in two])))
+    equal = next((k for k, (a, b) in enumerate(pairs) if a != b), len(pairs))
+    ends = [re.split(r"[/\\]", n)[-1] for n in (name, other)]
+    alike = match_key(name) == match_key(other)
+    return equal, equal == len(pairs), alike, ends[0].casefold() == ends[1].casefold()
+
+
+def same_images(names: Iterable[str]) -> dict[str, str]:
+    """Each name of a file with the spelling that the file first gives the image.
+
+    An image may be written with or without folders and suffix; names whose folders differ are different images.
+
+    Raises
+    ------
+    InputError
+        A name without folder may be one of several images.
+    """
+    groups: dict[str, dict[str, tuple[str, ...]]] = {}
+    for name in dict.fromkeys(names):
+        groups.setdefault(match_key(name), {})[name] = name_parts(name)
+    found: dict[str, str] = {}
+    for group in groups.values():
+        parts = set(group.values())
+        # The full spellings: no other one goes on to the left of them.
+        full = [p for p in parts if not any(q != p and q[-len(p) :] == p for q in parts)]
+        first: dict[tuple[str, ...], str] = {}
+        for name, own in group.items():
+            fitting = [p for p in full if p[-len(own) :] == own]
+            if len(fitting) > 1:
+                raise InputError(
+                    f"image {name!r} may be {' or '.join(repr('/'.join(p)) for p in sorted(fitting)[:4])}; write its "
+                    "name with the folder"
+                )
+            found[name] = first.setdefault(fitting[0], name)
+    return found
 
 
 def match_key(name: str) -> str:

@@ -21,7 +21,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.io.names import match_key
+from photoplan.io.names import same_images
 from photoplan.io.orientation.exif import map_positions, read_folder, without_fix
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
@@ -134,8 +134,9 @@ def read_observed_positions(
     )
     names = table.names("name")
     first: dict[str, int] = {}
+    spelled = same_images(names)
     for k, name in enumerate(names):
-        at = first.setdefault(match_key(name), k)
+        at = first.setdefault(spelled[name], k)
         if at != k:
             raise InputError(
                 f"{table.where(k)}: image {name!r} is given in line {table.lines[at]} already; keep one of the lines"

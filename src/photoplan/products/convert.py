@@ -21,7 +21,7 @@ from photoplan.geometry.frames import triple
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import named_as, read_image_points
-from photoplan.io.names import match_key
+from photoplan.io.names import ImageNames
 from photoplan.io.orientation.block import Loss, OrientationBlock, without_lenses
 from photoplan.io.orientation.exif import SUFFIXES
 from photoplan.io.orientation.file import (
@@ -174,13 +174,16 @@ def _against_positions(block: OrientationBlock, files: Mapping[str, Path]) -> tu
 def _image_files(block: OrientationBlock) -> dict[str, Path]:
     """Image files that a file of orientations names, or that lie beside it under the names of its images."""
     folder = block.table.file if block.table.file.is_dir() else block.table.file.parent
+    names = [image.name for image in block.table.images]
     try:
-        beside = {match_key(path.name): path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES}
-    except OSError:  # a folder that may be entered, but not listed
-        beside = {}
-    found = {image.name: beside.get(match_key(image.name)) for image in block.table.images}
+        beside = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+        matched = ImageNames(names).match([path.as_posix() for path in beside])
+    except (OSError, InputError):  # a folder that may be entered, but not listed; names that fit several images
+        beside, matched = [], []
+    found = {name: path for path, name in zip(beside, matched) if name is not None}
+    found |= {name: folder / name for name in names if "/" in name and is_there(folder / name)}
     found |= {name: folder / file for name, file in block.files.items() if is_there(folder / file)}
-    return {name: file for name, file in found.items() if file is not None}
+    return found
 
 
 def read_block(path: Path, form: TableFormat, format: str | None) -> tuple[str, OrientationBlock]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import axes_of_angles
+from photoplan.io.names import ImageNames
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.polygons import check_vectors, read_features, write_features
 from photoplan.io.product import check_output
@@ -158,9 +159,7 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
 
 def _image_name(project: Project, name: str) -> str:
     """The project's name of an image that may be given with or without its suffix."""
-    names = [image.name for image in project.images]
-    fitting = [n for n in names if n == name] or [n for n in names if Path(n).stem == Path(name).stem]
-    return fitting[0] if len(fitting) == 1 else project.image(name).name
+    return ImageNames(image.name for image in project.images).find(name) or project.image(name).name
 
 
 def _mesh_and_sigma(

@@ -11,7 +11,7 @@ from photoplan.cameras.rpc_fit import fit_rpc
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.geodetic import GeodeticGround
 from photoplan.io.camera.rpc.text import rpc_text
-from photoplan.io.names import safe_stem
+from photoplan.io.names import unique_stems
 from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
@@ -83,7 +83,8 @@ def write_polynomials(request: PolynomialsRequest) -> PolynomialsReport:
     """
     project = load_project(request.project)
     folder = request.output or project.folder
-    outputs = {image.name: folder / f"{safe_stem(Path(image.file).stem)}_RPC.TXT" for image in project.images}
+    stems = unique_stems(image.file for image in project.images)
+    outputs = {image.name: folder / f"{stems[image.file]}_RPC.TXT" for image in project.images}
     inputs = [request.project, *input_files(project)]
     for path in outputs.values():
         check_output(path, inputs, overwrite=request.overwrite)

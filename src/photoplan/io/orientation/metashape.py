@@ -4,7 +4,9 @@ As its manual (Metashape User Manual, Professional Edition 2.1, appendix "Camera
 it: a camera's ``transform`` is a row-major 4 × 4 matrix from the camera's axes (x right, y down, z forwards) to the
 chunk's own system; the ``transform`` of a component (of the chunk, in files before version 1.5) takes these by scale,
 rotation and translation to the world: geocentric coordinates of the datum of the ``reference`` CRS if that is
-geographic or projected, else the local system. Pixels: u = w/2 + cx + x′ f + x′ B1 + y′ B2, v = h/2 + cy + y′ f with
+geographic or projected, else the local system. A camera of a multi-camera rig without a transform of its own has
+that of its master (``master_id``), followed by ``location`` and ``rotation`` of its sensor in the master's axes, in the
+units of the chunk. Pixels: u = w/2 + cx + x′ f + x′ B1 + y′ B2, v = h/2 + cy + y′ f with
 (0.5, 0.5) as the centre of the upper-left pixel; x′, y′ from Brown's polynomial with k1–k4, p1, p2, y down.
 
 Written (version 2.0.0) are transforms in a local system (east, north, up about the middle of the block), which the
@@ -13,10 +15,11 @@ component's transform places on the earth; a block without CRS is written in its
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, tostring
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -71,8 +74,11 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     sensors = {s.get("id", ""): s for s in chunk.findall("./sensors/sensor")}
     shared, by_component = _component_transforms(chunk, path)
     notes: list[str] = []
-    oriented = [c for c in chunk.iterfind("./cameras//camera") if c.find("transform") is not None]
-    unaligned = sum(1 for _ in chunk.iterfind("./cameras//camera")) - len(oriented)
+    every = list(chunk.iterfind("./cameras//camera"))
+    by_id = {c.get("id", ""): c for c in every}
+    poses = {c: pose for c in every if (pose := _pose_of(c, by_id, sensors, path)) is not None}
+    oriented = list(poses)
+    unaligned = len(every) - len(oriented)
     if not oriented:
         raise InputError(f"{path}: no camera has a transform; align the photos and export again")
     if unaligned > 0:
@@ -80,7 +86,14 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     rolling = sum(c.find("rolling_shutter") is not None for c in oriented)
     if rolling:
         notes.append(f"{path.name}: {rolling} cameras state a rolling shutter; its motion is not applied")
+    slaves = [c for c in oriented if c.find("transform") is None]
+    if slaves:
+        notes.append(
+            f"{path.name}: {len(slaves)} cameras of rigs are placed by their master and the offset of the sensor"
+        )
+    named = _image_names(chunk, oriented)
     names, centers, rotations, references = [], [], [], []
+    scaled: set[str] = set()
     placed = [by_component.get(c.get("component_id", ""), shared) for c in oriented]
     georeferenced = any(p is not None for p in placed)
     kept = [c for c, p in zip(oriented, placed) if p is not None or not georeferenced]
@@ -88,13 +101,15 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         notes.append(f"{path.name}: {len(oriented) - len(kept)} cameras of a component without position; left out")
     for camera in kept:
         world = by_component.get(camera.get("component_id", ""), shared) or _Similarity()
-        where = f"{path}: camera {camera.get('label')!r}"
-        R, t = _camera_pose(camera, where)
-        names.append((camera.get("label") or f"camera {camera.get('id')}", camera.get("sensor_id", "")))
+        R, t = poses[camera]
+        if camera in slaves and abs(world.scale - 1.0) > 1e-3 and (c := camera.get("sensor_id", "")) not in scaled:
+            scaled.add(c)
+            notes.append(f"sensor {c}: its offset in the rig is taken in units of the chunk, {world.scale:.4g} m each")
+        names.append((named[camera], camera.get("sensor_id", "")))
         centers.append(world.scale * world.R @ t + world.t)
         rotations.append(world.R @ R @ FLIP)
         references.append(_reference(camera))
-    cameras = {s: _sensor(sensors.get(s), s, path) for s in dict.fromkeys(s for _, s in names)}
+    cameras = _named(chunk, {s: _sensor(sensors.get(s), s, path) for s in dict.fromkeys(s for _, s in names)})
     placing = _place(chunk, np.array(centers), np.array(rotations), georeferenced, path)
     images = tuple(
         posed(name, at, R, cameras[s][0]) for (name, s), at, R in zip(names, placing.centers, placing.rotations)
@@ -109,7 +124,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         positions=_geodetic(np.array(references), chunk, path),
         notes=(*notes, *placing.notes),
     )
-    return OrientationBlock(table, _unique(cameras, path))
+    return OrientationBlock(table, dict(cameras.values()))
 
 
 def read_cameras(path: Path) -> dict[str, CameraEntry]:
@@ -122,7 +137,7 @@ def read_cameras(path: Path) -> dict[str, CameraEntry]:
     """
     chunk = _chunk(path)
     found = {s.get("id", ""): s for s in chunk.findall("./sensors/sensor") if s.find("calibration") is not None}
-    return _unique({key: _sensor(s, key, path) for key, s in found.items()}, path)
+    return dict(_named(chunk, {key: _sensor(s, key, path) for key, s in found.items()}).values())
 
 
 def _chunk(path: Path) -> Element:
@@ -158,6 +173,25 @@ def _similarity(element: Element | None, where: str) -> _Similarity | None:
     if scale <= 0:
         raise InputError(f"{where}: scale {scale}; a positive number is needed")
     return _Similarity(checked_rotation(R, where, _ROUNDED), t, scale)
+
+
+def _pose_of(
+    camera: Element, every: Mapping[str, Element], sensors: Mapping[str, Element], path: Path
+) -> tuple[_Floats, _Floats] | None:
+    """Rotation and centre in the chunk; None if neither the camera nor the master of its rig is aligned."""
+    where = f"{path}: camera {camera.get('label')!r}"
+    master = every.get(camera.get("master_id", ""))
+    if camera.find("transform") is None and master is not None and master is not camera:
+        sensor = sensors.get(camera.get("sensor_id", ""))
+        if master.find("transform") is None or sensor is None or sensor.find("rotation") is None:
+            return None
+        R_master, t_master = _camera_pose(master, f"{path}: camera {master.get('label')!r}")
+        where = f"{path}: sensor {sensor.get('label')!r}"
+        R = np.array(numbers(sensor.find("rotation"), f"{where}: rotation", 9)).reshape(3, 3)
+        stated = sensor.find("location")
+        t = np.zeros(3) if stated is None else np.array(numbers(stated, f"{where}: location", 3))
+        return R_master @ checked_rotation(R, where, _ROUNDED), R_master @ t + t_master
+    return None if camera.find("transform") is None else _camera_pose(camera, where)
 
 
 def _camera_pose(camera: Element, where: str) -> tuple[_Floats, _Floats]:
@@ -234,14 +268,27 @@ def _has(element: Element, name: str) -> bool:
     return element.find(name) is not None
 
 
-def _unique(cameras: Mapping[str, tuple[str, CameraEntry]], path: Path) -> dict[str, CameraEntry]:
-    by_name: dict[str, CameraEntry] = {}
-    for key, (label, camera) in cameras.items():
-        if by_name.setdefault(label, camera) != camera:
-            raise InputError(
-                f"{path}: two sensors are called {label!r} (the second has the id {key}); rename one in Metashape"
-            )
-    return by_name
+def _named(chunk: Element, cameras: Mapping[str, tuple[str, CameraEntry]]) -> dict[str, tuple[str, CameraEntry]]:
+    """Name and description by the sensor's id: its label, with the id if another calibration has the label."""
+    calibrations: dict[str, set[bytes]] = {}
+    for sensor in chunk.findall("./sensors/sensor"):
+        stated = b"".join(tostring(c) for c in sensor.findall("./calibration"))
+        if stated:
+            calibrations.setdefault(sensor.get("label") or f"sensor {sensor.get('id')}", set()).add(stated)
+    return {
+        key: (f"{label} (sensor {key})" if len(calibrations.get(label, ())) > 1 else label, camera)
+        for key, (label, camera) in cameras.items()
+    }
+
+
+def _image_names(chunk: Element, cameras: Sequence[Element]) -> dict[Element, str]:
+    """Name of every camera's image: its label, with the group, then the id, where labels are equal."""
+    groups = {c: g.get("label") or "" for g in chunk.iterfind("./cameras//group") for c in g.iter("camera")}
+    names = {c: c.get("label") or f"camera {c.get('id')}" for c in cameras}
+    count = Counter(names.values())
+    names = {c: f"{groups[c]}/{name}" if count[name] > 1 and groups.get(c) else name for c, name in names.items()}
+    count = Counter(names.values())
+    return {c: f"{name} (camera {c.get('id')})" if count[name] > 1 else name for c, name in names.items()}
 
 
 @dataclass(frozen=True, eq=False)

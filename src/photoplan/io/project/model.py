@@ -237,10 +237,15 @@ class Project(Entry):
         if unknown:
             raise ValueError(f"[adjustment] calibrate: camera {unknown[0]!r} is not described")
         try:
-            unique_stems(i.name for i in self.images)
+            unique_stems(names)
         except InputError as error:
             raise ValueError(str(error)) from None
         return self
+
+    @property
+    def stems(self) -> dict[str, str]:
+        """File stem of the products of every image, by its name; no two are equal."""
+        return unique_stems(image.name for image in self.images)
 
     def _check_posed(self, image: Image, where: str) -> None:
         """Refuse an image whose camera is not described, or whose marks or pose cannot be."""

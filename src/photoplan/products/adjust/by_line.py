@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -96,8 +95,8 @@ def _angles(image: CorrectableLine, correction: LineCorrection) -> tuple[_Floats
     return track.time(rows), np.stack([angles_from_rotation(each) for each in map_axes(track).T @ R])
 
 
-def _output(name: str) -> str:
-    return f"{Path(name).stem}.correction.toml"
+def _output(stem: str) -> str:
+    return f"{stem}.correction.toml"
 
 
 LINES = Geometry(group="lines", away=lambda image: image.away, correctable=_correctable, found=_found, output=_output)

@@ -57,4 +57,4 @@ class Geometry:
     found: Callable[[Any, Mapping[str, AdjustedCorrections]], FoundCorrection]
     """Of a correctable and its adjusted sets."""
     output: Callable[[str], str | None] = field(default=lambda name: None)
-    """Name of the file of corrections of an image, in the output folder."""
+    """Name of the file of corrections of an image, in the output folder, by the stem of its products."""

@@ -15,7 +15,7 @@ from photoplan.geometry.bounds import area_note
 from photoplan.io.gcp_list import is_gcp_list, read_gcp_list
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import named_as, read_image_points
-from photoplan.io.names import match_key
+from photoplan.io.names import ImageNames, match_key
 from photoplan.io.observed_positions import PositionTable, read_observed_positions
 from photoplan.io.orientation.exif import image_files
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
@@ -249,21 +249,24 @@ def _positions(project: Project, names: Sequence[str], notes: list[str]) -> Posi
     table = read_observed_positions(project.resolve(project.observations.positions), form, crs=project.crs)
     notes += table.notes
     _judge_places(project, table.path, "position of", table.images, table.XYZ, notes)
-    known = {match_key(name): name for name in names}
-    every = {match_key(image.name) for image in project.images}
-    keep = [k for k, name in enumerate(table.images) if match_key(name) in known]
-    unknown = [name for name in table.images if match_key(name) not in every]
+    try:
+        found = ImageNames(image.name for image in project.images).match(table.images)
+    except InputError as error:
+        raise InputError(f"{table.path}: {error}") from None
+    wanted = set(names)
+    keep = [k for k, name in enumerate(found) if name in wanted]
+    unknown = [name for name, known in zip(table.images, found) if known is None]
     if not keep:
         raise InputError(
             f"{table.path}: none of its images is in the project: it has {some(list(table.images))}; the project has "
-            f"{some(list(known.values()))}"
+            f"{some(list(names))}"
         )
     if unknown:
         notes.append(f"{table.path.name}: {len(unknown)} positions are of images that are not in the project")
     at: NDArray[np.int64] = np.array(keep, np.int64)
     return PositionTable(
         path=table.path,
-        images=tuple(known[match_key(table.images[k])] for k in keep),
+        images=tuple(found[k] or "" for k in keep),
         XYZ=table.XYZ[at],
         sigma=table.sigma[at],
         R_ground_camera=None if table.R_ground_camera is None else table.R_ground_camera[at],

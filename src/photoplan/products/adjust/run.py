@@ -149,7 +149,7 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     data = block_json(figures, result)
     if request.dry_run:
         return AdjustReport((), figures, 0, data)
-    return _write(request, result, figures, data)
+    return _write(request, project, result, figures, data)
 
 
 def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events: Events) -> tuple[Prepared, Adjusted]:
@@ -231,15 +231,15 @@ def _check_outputs(request: AdjustRequest, project: Project) -> None:
     if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
         raise UsageError(f"{request.folder}: cannot be made, as {there} cannot be written into; give another `output`")
     # What an earlier run has written of corrections is written again.
-    written = [request.folder.resolve() / n for i in project.images if (n := _correction_file(i)) is not None]
+    written = [request.folder.resolve() / n for i in project.images if (n := _correction_file(project, i)) is not None]
     inputs = [file for file in input_files(project) if file.resolve() not in written]
     _refuse_inputs(request, [request.project, *inputs])
     for file in written:
         check_output(file, inputs, overwrite=request.overwrite)
 
 
-def _correction_file(image: ImageEntry) -> str | None:
-    return None if isinstance(image, Image) else geometry_of(image).output(image.name)
+def _correction_file(project: Project, image: ImageEntry) -> str | None:
+    return None if isinstance(image, Image) else geometry_of(image).output(project.stems[image.name])
 
 
 def _refuse_inputs(request: AdjustRequest, inputs: Sequence[Path]) -> None:
@@ -261,7 +261,9 @@ def _used(prepared: Prepared) -> str:
     )
 
 
-def _write(request: AdjustRequest, result: MapResult, figures: AdjustFigures, data: dict[str, Any]) -> AdjustReport:
+def _write(
+    request: AdjustRequest, project: Project, result: MapResult, figures: AdjustFigures, data: dict[str, Any]
+) -> AdjustReport:
     folder, adjusted = request.folder, result.adjusted
     with recording("adjust", request, [request.project, *result.prepared.inputs.files]) as record:
         changes = _changes(result)
@@ -281,7 +283,7 @@ def _write(request: AdjustRequest, result: MapResult, figures: AdjustFigures, da
         write_atomically(folder / "report.json", json_text(data, indent=1).encode())
         files = []
         for name, kind, found in result.corrections:
-            file = kind.output(name)
+            file = kind.output(project.stems[name])
             if file is not None and found.file is not None:
                 files.append(folder / file)
                 write_atomically(files[-1], found.file.encode())

@@ -17,7 +17,6 @@ from photoplan.events import SILENT, Events
 from photoplan.io.balance_file import BalanceBand, write_balance_file
 from photoplan.io.disk import make_folder
 from photoplan.io.lock import lock_of
-from photoplan.io.names import safe_stem
 from photoplan.io.naming import locked, together
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
@@ -147,19 +146,21 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
         return BalanceReport(found, tuple(notes))
     make_folder(request.folder)
     with together(), locked(lock_of(request.table)):
-        report = _made(replace(request, workers=workers), found, fixed, notes, events)
+        report = _made(replace(request, workers=workers), project, found, fixed, notes, events)
         _keep(request, project, report, times())
     return report
 
 
-def _made(request: BalanceRequest, found: Survey, fixed: str | None, notes: list[str], events: Events) -> BalanceReport:
+def _made(
+    request: BalanceRequest, project: Project, found: Survey, fixed: str | None, notes: list[str], events: Events
+) -> BalanceReport:
     """Tables of the images of a survey."""
     reference = _reference(request, found, notes)
     cells = sample(found, reference, request.workers, request.executor, events, request.folder)
     if reference is not None and not np.isfinite(cells.reference).any():
         raise GeometryError(f"{reference.path}: shows nothing of the ground that the images show")
     made, pairs = _adjusted(request, cells, found, fixed, events, notes)
-    files = tuple(request.folder / f"{safe_stem(found.names[k])}.toml" for k in made.images.tolist())
+    files = tuple(request.folder / f"{project.stems[found.names[k]]}.toml" for k in made.images.tolist())
     return BalanceReport(survey=found, notes=tuple(notes), cells=cells, balanced=made, pairs=pairs, files=files)
 
 
@@ -241,7 +242,7 @@ def _check(request: BalanceRequest, project: Project, names: Sequence[str]) -> s
     if request.folder.exists() and not request.folder.is_dir():
         raise UsageError(f"{request.folder}: is a file; give the name of a folder")
     if not request.dry_run:
-        outputs = [request.table, *(request.folder / f"{safe_stem(name)}.toml" for name in names)]
+        outputs = [request.table, *(request.folder / f"{project.stems[name]}.toml" for name in names)]
         refuse_inputs(
             [request.project, *input_files(project), *([request.reference] if request.reference else [])], outputs
         )

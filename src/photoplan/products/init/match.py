@@ -8,7 +8,7 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.camera.file import CameraFile
-from photoplan.io.names import check_input_name, match_key
+from photoplan.io.names import ImageNames, check_input_name
 from photoplan.io.orientation.table import OrientationTable, OrientedImage
 
 #: Names that are listed; the rest is counted.
@@ -50,68 +50,28 @@ def match_images(
 ) -> tuple[list[tuple[Path, OrientedImage | Unoriented]], list[Path], list[str]]:
     """Image files with their orientation, files without, and names without a file.
 
-    Names are compared without folder and raster suffix, and without regard to capitals where that leaves one choice.
+    See `photoplan.io.names.ImageNames` for how names are compared.
 
     Raises
     ------
     InputError
-        Nothing matches, or two files or two lines have one base name.
+        Nothing matches, or a file fits several lines equally well.
     """
-    by_key: dict[str, OrientedImage] = {}
-    for image in table.images:
-        key = match_key(image.name)
-        if key in by_key:
-            raise InputError(
-                f"{table.file}: {by_key[key].name!r} and {image.name!r} are one image by their base name; rename one"
-            )
-        by_key[key] = image
-    loose: dict[str, list[str]] = {}
-    for key in by_key:
-        loose.setdefault(key.casefold(), []).append(key)
+    by_name = {image.name: image for image in table.images}
+    try:
+        found = ImageNames(by_name).match([file.as_posix() for file in files])
+    except InputError as error:
+        raise InputError(f"{table.file}: {error}; or narrow the pattern of image files") from None
+    taken = set(found)
     pairs: list[tuple[Path, OrientedImage | Unoriented]] = []
-    lonely: list[Path] = []
-    taken: dict[str, Path] = {}
-    for file in files:
-        key = match_key(file.name)
-        if key not in by_key and len(loose.get(key.casefold(), [])) == 1:
-            key = loose[key.casefold()][0]
-        if key not in by_key:
-            lonely.append(file)
-            continue
-        if key in taken:
-            raise InputError(_one_name(taken[key], file))
-        taken[key] = file
-        pairs.append((file, by_key[key]))
+    pairs += [(file, by_name[name]) for file, name in zip(files, found) if name is not None]
+    lonely = [file for file, name in zip(files, found) if name is None]
     if not pairs:
         raise InputError(
             f"no image file is named in {table.file}: files are {some([f.name for f in files])}; "
             f"names there are {some([i.name for i in table.images])}"
         )
-    return pairs, lonely, [image.name for key, image in by_key.items() if key not in taken]
-
-
-def unoriented(files: list[Path]) -> list[tuple[Path, OrientedImage | Unoriented]]:
-    """All image files, under their base names.
-
-    Raises
-    ------
-    InputError
-        Two files have one base name.
-    """
-    taken: dict[str, Path] = {}
-    for file in files:
-        key = match_key(file.name)
-        if key in taken:
-            raise InputError(_one_name(taken[key], file))
-        taken[key] = file
-    return [(file, Unoriented(key)) for key, file in taken.items()]
-
-
-def _one_name(first: Path, second: Path) -> str:
-    return (
-        f"{first} and {second} have one base name, so their products would too; "
-        "rename one of them or narrow the pattern"
-    )
+    return pairs, lonely, [name for name in by_name if name not in taken]
 
 
 def camera_by_size(file: Path, size: tuple[int, int], cameras: CameraFile) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from photoplan.io.camera.file import CameraFile, read_cameras
 from photoplan.io.camera.model import CameraEntry, Triple
 from photoplan.io.camera.opensfm import resized
 from photoplan.io.camera.rpc.file import read_rpc, rpc_beside, rpc_in
-from photoplan.io.names import check_input_name, match_key, relative_path
+from photoplan.io.names import check_input_name, relative_path, shortest_paths
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project.file import parse_project, write_project
@@ -35,7 +36,6 @@ from photoplan.products.init.match import (
     image_files,
     match_images,
     some,
-    unoriented,
 )
 from photoplan.products.init.systems import check_joined, height_systems, placed, project_crs, terrain_entry
 from photoplan.products.judged import differences, on_map, stated_positions
@@ -58,7 +58,15 @@ class OwnGeometry:
     """Latitude and longitude in the middle of what the polynomials hold for, degrees."""
 
 
-def own_geometry(files: Iterable[Path], folder: Path) -> dict[Path, OwnGeometry]:
+def project_names(files: Sequence[Path]) -> dict[Path, str]:
+    """Name of every image file in the project: its base name, with folders or the suffix if others have the same."""
+    short = shortest_paths(file.as_posix() for file in files)
+    names = {file: "/".join(short[file.as_posix()]) for file in files}
+    count = Counter(name.casefold() for name in names.values())
+    return {file: name if count[name.casefold()] == 1 else f"{name}{file.suffix}" for file, name in names.items()}
+
+
+def own_geometry(files: Iterable[Path], folder: Path, names: Mapping[Path, str]) -> dict[Path, OwnGeometry]:
     """Those of the files that have rational polynomials; tags come before a file beside the image.
 
     Raises
@@ -74,7 +82,7 @@ def own_geometry(files: Iterable[Path], folder: Path) -> dict[Path, OwnGeometry]
         if rpc is not None:
             source = TAGS if beside is None else relative_path(beside, folder)
             lon, lat, _ = rpc.functions.ground_offset
-            image = RpcImage(name=match_key(file.name), file=relative_path(file, folder), rpc=source)
+            image = RpcImage(name=names[file], file=relative_path(file, folder), rpc=source)
             found[file] = OwnGeometry(image, (lat, lon))
     return found
 
@@ -174,14 +182,15 @@ def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line
 def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line: None) -> InitResult:
     """The project of the given files, without writing anything; see `init_project`."""
     files = image_files(request.images)
+    names = project_names(files)
     table = None
     if request.orientation is not None:
         table = read_orientation(request.orientation, request.form, request.format)
     pairs, lonely_files, lonely_names = match_images(files, table) if table else ([], files, [])
-    own = own_geometry(lonely_files, request.folder)
+    own = own_geometry(lonely_files, request.folder, names)
     lonely_files = [file for file in lonely_files if file not in own]
     if table is None:
-        pairs, lonely_files = unoriented(lonely_files), []
+        pairs, lonely_files = [(file, Unoriented(names[file])) for file in lonely_files], []
     infos = {file: read_info(file) for file, _ in pairs}
     terrain, terrain_info = terrain_entry(request)
     places = [each.place for each in own.values()]
@@ -212,7 +221,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
         size = infos[file].size if described.size is None else None
         images.append(
             Image(
-                name=match_key(file.name),
+                name=names[file],
                 file=relative_path(file, request.folder),
                 camera=camera,
                 center=center,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,7 +15,6 @@ from photoplan.engine.execute import render as render_tile
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, refuse_absurd
-from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
 from photoplan.plan.choice import BestImage, Drawn
@@ -151,7 +150,7 @@ def plan_orthophotos(
     """
     chosen = chosen_settings(project, settings, changes)
     project = _painted(project, chosen)
-    names = project.select(images)
+    names, stems = project.select(images), project.stems
     # Each image is looked at twice: where it lies, and which tiles it needs.
     events.begin("planning", 2 * len(names), "steps")
     looked, blind = look_at(project, names, force, events)
@@ -162,14 +161,13 @@ def plan_orthophotos(
         check_storable(one.scene, one.name, grid, chosen)
         tiles = covered_tiles(one.scene.camera, painted_surface(one.scene.surface), grid, chosen.tile)
         if len(tiles):
-            plan = product_plan(product_name(one.name), (one.name,), grid, tiles, chosen, [one.look])
+            plan = product_plan(f"{stems[one.name]}_ortho", (one.name,), grid, tiles, chosen, [one.look])
             products.append(OrthoProduct(plan, (one.look,), keyed(project, plan, chosen)))
         else:
             seen = extent_text(one.look.footprint.bounds)
             blind.append(f"{one.name}: sees {seen}; the bounds are {extent_text(chosen.bounds)}")
         events.done()
     refuse_blind(chosen, products, blind)
-    _refuse_equal_names(products)
     return OrthoPlan(project, chosen, tuple(products), tuple(blind))
 
 
@@ -240,11 +238,6 @@ def _best(
     )
 
 
-def product_name(image: str) -> str:
-    """Name of an image's orthophoto, fit for a file in any system."""
-    return f"{safe_stem(image)}_ortho"
-
-
 def check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettings) -> None:
     """Refuse a product that cannot be written, before any is."""
     refuse_absurd((grid.width, grid.height), settings.tile, f"{name}: resolution {settings.resolution:g} m")
@@ -253,19 +246,6 @@ def check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettin
         raise UsageError(
             f"{name}: {scene.reader.bands} bands of {scene.reader.dtype}; compression jpeg takes one or three of uint8"
         )
-
-
-def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:
-    seen: dict[str, str] = {}
-    for product in products:
-        # Many file systems do not tell capitals from small letters.
-        name = product.plan.name.casefold()
-        if name in seen:
-            raise UsageError(
-                f"images {seen[name]} and {product.images[0]} would both be written as {product.plan.name}.tif; rename "
-                "one"
-            )
-        seen[name] = product.images[0]
 
 
 def painting(product: OrthoProduct, settings: OrthoSettings) -> Direct | None:

@@ -129,7 +129,7 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
     twice = [path for path in files if files.count(path) > 1]
     if twice:
         raise UsageError(f"image {twice[0]} is given twice")
-    stems = unique_stems(path.name for path in request.images)
+    stems = unique_stems(str(path.absolute()) for path in request.images)
     tools = [path for path in (given, request.chromatic, request.fall_off) if isinstance(path, Path)]
     tools += [] if request.linearisation in ("linear", "srgb") else [Path(request.linearisation)]
     jobs, failed = [], {}
@@ -140,7 +140,7 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
             _check_bands(path, source.bands, request.bands)
             chosen = _only(filter_, request.bands)
             reader = restored(source, chosen, light, out)
-            target = request.folder / f"{stems[path.name]}_restored.tif"
+            target = request.folder / f"{stems[str(path.absolute())]}_restored.tif"
             jobs.append(_job(request, reader, target, text, tuple(tools)))
         except InputError as error:
             failed[path.name] = str(error)

@@ -11,7 +11,6 @@ from typing import Any
 from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import make_folder
-from photoplan.io.names import safe_stem
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
@@ -149,7 +148,7 @@ def _works(
         )
 
     for name in names:
-        seen, path = scene.seen_by(name), folder / f"{safe_stem(name)}.tif"
+        seen, path = scene.seen_by(name), folder / f"{project.stems[name]}.tif"
         check_fit(seen, f"image {name!r}", model, request.model)
         settings = {"scene": _facts(project, name), "grain": grain, "oversampling": k, "seed": model.seed}
         yield Forming(

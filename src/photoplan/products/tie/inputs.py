@@ -19,7 +19,7 @@ from photoplan.cameras.build import oriented_camera
 from photoplan.engine.steps import Steps, Store
 from photoplan.errors import InputError
 from photoplan.io.fingerprint import fingerprint
-from photoplan.io.names import match_key
+from photoplan.io.names import ImageNames
 from photoplan.io.observed_positions import read_observed_positions
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.plain_files import read_text
@@ -109,7 +109,7 @@ def open_images(project_: Project, names: Sequence[str], use_orientation: bool) 
         calibration = _calibration(project_, image, reader.size)
         if calibration is None:
             notes.append(f"{image.name}: fiducial marks not measured, its pairs are verified without a camera")
-        position = positions.get(match_key(image.name)) if camera is None else camera.center
+        position = positions.get(image.name) if camera is None else camera.center
         grey = GreyImage(reader, _area(image, reader.size))
         opened.append(
             TieImage(
@@ -152,7 +152,8 @@ def _positions(project_: Project, use: bool) -> dict[str, NDArray[np.float64]]:
     orientation = project_.orientation
     form = TableFormat(angle_unit=orientation.angle_unit, rotation=orientation.rotation)
     table = read_observed_positions(project_.resolve(project_.observations.positions), form, crs=project_.crs)
-    return {match_key(name): XYZ for name, XYZ in zip(table.images, table.XYZ)}
+    found = ImageNames(image.name for image in project_.images).match(table.images)
+    return {name: XYZ for name, XYZ in zip(found, table.XYZ) if name is not None}
 
 
 def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[CentralCamera | None], list[float]]:
@@ -212,7 +213,8 @@ def _border(size: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def _listed(images: Sequence[TieImage], path: Path) -> list[tuple[int, int]]:
-    at = {match_key(image.name): k for k, image in enumerate(images)}
+    at = {image.name: k for k, image in enumerate(images)}
+    names = ImageNames(at)
     found = set()
     for number, line in enumerate(read_text(path, 50_000_000).split("\n"), 1):
         text = line.strip()
@@ -222,10 +224,14 @@ def _listed(images: Sequence[TieImage], path: Path) -> list[tuple[int, int]]:
         words = text.split() if len(words) == 1 else words
         if len(words) != 2:
             raise InputError(f"{path}:{number}: {len(words)} names; two images are needed in each line")
-        lost = [w for w in words if match_key(w) not in at]
+        try:
+            known = [names.find(w) for w in words]
+        except InputError as error:
+            raise InputError(f"{path}:{number}: {error}") from None
+        lost = [w for w, name in zip(words, known) if name is None]
         if lost:
             raise InputError(f"{path}:{number}: image {lost[0]!r} is not among the {len(images)} images of this run")
-        i, j = sorted(at[match_key(w)] for w in words)
+        i, j = sorted(at[name] for name in known if name is not None)
         if i == j:
             raise InputError(f"{path}:{number}: image {words[0]!r} is paired with itself")
         found.add((i, j))
