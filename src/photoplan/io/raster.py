@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import rasterio.io
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
@@ -73,7 +74,8 @@ class RasterReader:
     """A source image behind the engine's `Reader`; any side length, read by windows only.
 
     Safe to call from several threads (each has its own handle) and to pickle. Pixels keep their type and are used as
-    they are stored; a palette is expanded to its three colours. See `photoplan.io.validity` for the rule of validity.
+    they are stored; a palette is expanded to its three colours. See `photoplan.io.validity` for the rule of validity. A
+    band that is tagged as alpha is a colour band if its values are those of a picture, see `with_alpha_judged`.
 
     Raises
     ------
@@ -88,6 +90,8 @@ class RasterReader:
     """How much its header may promise."""
     allow_remote: bool = False
     """Follow virtual rasters, `/vsi…` paths and URLs."""
+    alpha: bool | None = None
+    """Whether bands that are tagged as alpha are masks; None: their values decide."""
     info: RasterInfo = field(init=False, repr=False)
     """Facts of the file."""
     _missing: MissingBlocks | None = field(init=False, repr=False)
@@ -95,6 +99,7 @@ class RasterReader:
     def __post_init__(self) -> None:
         info = read_info(self.path, limits=self.limits, allow_remote=self.allow_remote)
         _check_image(info)
+        info = with_alpha_judged(info, self.alpha)
         object.__setattr__(self, "path", info.path)
         object.__setattr__(self, "info", info)
         object.__setattr__(self, "_missing", missing_blocks(info))
@@ -130,6 +135,60 @@ class RasterReader:
         if self.info.nodata is None:
             refuse_undeclared(self.path, window, pixels, valid)
         return pixels, valid
+
+
+#: Places of an image whose alpha is judged (along each side), their side, and the width of soft borders, pixels.
+_LOOKS, _LOOK, _SOFT = 3, 256, 8
+#: Part of the pixels away from borders that a mask makes opaque; values besides 0 and opaque that a mask may have.
+_OPAQUE, _LEVELS = 0.75, 8
+
+
+def with_alpha_judged(info: RasterInfo, alpha: bool | None = None) -> RasterInfo:
+    """The facts of an image, with alpha bands that hold a picture among the colour bands.
+
+    Some programs tag the fourth band of every image as alpha, also near infrared. A mask is 0 or opaque (the highest
+    value there is), except at soft borders next to 0; it has few other values. A picture has many, in most pixels.
+
+    Parameters
+    ----------
+    alpha : bool, optional
+        True: the tag is right. False: it is wrong. None: the values decide.
+    """
+    if not info.alpha_bands or alpha is True or not info.colour_bands:
+        return info
+    width, height = info.size
+    looks = []
+    for row in range(_LOOKS):
+        for col in range(_LOOKS):
+            at = [max(0, int((k + 0.5) / _LOOKS * side - _LOOK / 2)) for k, side in ((col, width), (row, height))]
+            looks.append(Window(at[0], at[1], min(_LOOK, width - at[0]), min(_LOOK, height - at[1])))
+    as_colours = replace(info, colour_bands=info.alpha_bands, alpha_bands=(), nodata=None, has_mask=False)
+    wrong = set(info.alpha_bands)
+    if alpha is None:
+        seen = [read_pixels(as_colours, window)[0] for window in dict.fromkeys(looks)]
+        wrong = {band for k, band in enumerate(info.alpha_bands) if _is_picture([pixels[k] for pixels in seen])}
+    return replace(
+        info,
+        colour_bands=tuple(sorted({*info.colour_bands, *wrong})),
+        alpha_bands=tuple(band for band in info.alpha_bands if band not in wrong),
+        colours=tuple("undefined" if n in wrong else colour for n, colour in enumerate(info.colours, 1)),
+        colour_despite_tag=() if alpha is False else tuple(sorted(wrong)),
+    )
+
+
+def _is_picture(looks: list[NDArray[Any]]) -> bool:
+    """Whether parts of an alpha band (h, w) have many values away from soft borders."""
+    opaque = max(float(np.nanmax(part)) for part in looks)
+    inner, every = [], []
+    for part in looks:
+        near_zero = maximum_filter((part == 0).astype(np.uint8), 2 * _SOFT + 1) > 0
+        every.append(part[part != 0])
+        inner.append(part[(part != 0) & ~near_zero])
+    values = np.concatenate(inner)
+    # Zeros that are strewn all over leave nothing away from them.
+    values = values if 4 * len(values) > sum(map(len, every)) else np.concatenate(every)
+    between = values[values != opaque]
+    return len(between) > (1 - _OPAQUE) * len(values) and len(np.unique(between)) > _LEVELS
 
 
 def pixels_of_dataset(source: Any) -> RasterReader | np.ma.MaskedArray[Any, Any] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,8 @@ class RasterInfo:
     """Offset of every band from stored to true values."""
     white_is_zero: bool
     """Grey values are stored inverted (TIFF photometric interpretation 0)."""
+    colour_despite_tag: tuple[int, ...] = field(default=(), kw_only=True)
+    """Numbers (from 1) of the bands that are tagged as alpha and hold a picture: they count as colour bands."""
     orientation: int
     """Orientation of EXIF or TIFF, 1 to 8. Pixels are used as they are stored, whatever it says: the camera's
     geometry refers to the sensor."""
@@ -124,6 +126,11 @@ class RasterInfo:
             )
         if self.white_is_zero:
             found.append(f"{self.path.name}: white is stored as zero; grey values are used as stored")
+        for band in self.colour_despite_tag:
+            found.append(
+                f"{self.path.name}: band {band} is tagged as alpha but holds a picture, so it is used as a colour "
+                "band; if it is a mask, set `alpha = true` in [[images]]"
+            )
         if self.missing_blocks and self.nodata is None:
             found.append(f"{self.path.name}: {self.missing_blocks} blocks were never written; they count as invalid")
         return tuple(found)

@@ -2,7 +2,7 @@
 
 A pixel is used only when **every** statement of its file says so:
 
-* its alpha is above zero (in every alpha band),
+* its alpha is above zero (in every alpha band; a band that is tagged as alpha and holds a picture is a colour band),
 * its mask (mask band inside the file, or `.msk` beside it) is above zero,
 * it is not nodata: not *all* bands equal the nodata value,
 * it is finite in all bands (float data),

@@ -22,6 +22,7 @@ from photoplan.io.filter_file import is_filter
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project.file import load_project
 from photoplan.io.project.image import ImageEntry
+from photoplan.io.raster import with_alpha_judged
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.model_tables import GrossError
@@ -92,7 +93,7 @@ def describe(path: Path) -> dict[str, Any]:
         return _record(path)
     if is_rpc(path) or kind == ".xml":
         return {"file": str(path), **read_rpc(path).describe()}
-    return _raster(read_info(path))
+    return _raster(with_alpha_judged(read_info(path)))
 
 
 def _project(path: Path) -> dict[str, Any]:

@@ -206,7 +206,7 @@ def _open(address: SceneAddress) -> Scene:
 
 def _reader(project: Project, image: ImageEntry) -> SteppedReader:
     """The image's pixels, restored and balanced if the project says so."""
-    source = SteppedReader(RasterReader(project.resolve(image.file)))
+    source = SteppedReader(RasterReader(project.resolve(image.file), alpha=image.alpha))
     restoration = project.restoration(image)
     if restoration is not None:
         table = restoration.linearisation

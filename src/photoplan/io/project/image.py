@@ -9,7 +9,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field, Strict, field_validator
 
 from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry, Entry, Name, Pixels, Restore
@@ -33,6 +33,8 @@ class ImageEntry(Entry, ABC):
     file: InputName
     size: tuple[Pixels, Pixels] | None = None
     """Width and height of this image, where nothing else states them."""
+    alpha: Annotated[bool, Strict()] | None = None
+    """Whether bands that are tagged as alpha are masks (true) or colours (false); None: their values decide."""
     restore: Restore | None = None
     """Filter that it is restored with before anything is made of it; None: that of its camera, if there is one."""
     balance: InputName | None = None

@@ -105,7 +105,7 @@ def open_images(project_: Project, names: Sequence[str], use_orientation: bool) 
     cameras, levels = _placed(project_, images) if use_orientation else ([None] * len(images), [np.nan] * len(images))
     opened, notes = [], []
     for image, camera, level in zip(images, cameras, levels):
-        reader = RasterReader(project_.resolve(image.file))
+        reader = RasterReader(project_.resolve(image.file), alpha=image.alpha)
         calibration = _calibration(project_, image, reader.size)
         if calibration is None:
             notes.append(f"{image.name}: fiducial marks not measured, its pairs are verified without a camera")
