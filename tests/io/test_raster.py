@@ -348,6 +348,7 @@ def test_large_pictures_are_decoded_once(tmp_path: Path, name: str, monkeypatch:
     pixels = scene(bands, dtype, (400, 500))
     path = make(tmp_path / name, pixels, "JPEG" if name.endswith("jpg") else "PNG")
     if bands == 4:
+        pixels[3] = 255
         pixels[3, :50] = 0
         path = make(tmp_path / name, pixels, "PNG")
     direct = [RasterReader(path).read(window) for window in Window(0, 0, 500, 400).tiles(150)]
@@ -368,7 +369,9 @@ def test_large_pictures_are_decoded_once(tmp_path: Path, name: str, monkeypatch:
     top = RasterReader(make(tmp_path / f"other_{name}", pixels, "JPEG" if name.endswith("jpg") else "PNG"))
     found, _ = top.read(Window(100, 0, 40, 50))
     np.testing.assert_array_equal(found, direct[0][0][:, :50, 100:140])
-    assert calls[1:] == [(top.info, Window(100, 0, 40, 50))]
+    # Whether an alpha band is a mask is seen in the middle, too.
+    assert len(calls) == (3 if bands == 4 else 2)
+    assert calls[-1] == (top.info, Window(100, 0, 40, 50))
 
 
 def test_threads_share_one_decoding() -> None:

@@ -162,10 +162,14 @@ def with_alpha_judged(info: RasterInfo, alpha: bool | None = None) -> RasterInfo
         for col in range(_LOOKS):
             at = [max(0, int((k + 0.5) / _LOOKS * side - _LOOK / 2)) for k, side in ((col, width), (row, height))]
             looks.append(Window(at[0], at[1], min(_LOOK, width - at[0]), min(_LOOK, height - at[1])))
-    as_colours = replace(info, colour_bands=info.alpha_bands, alpha_bands=(), nodata=None, has_mask=False)
+    count = len(info.alpha_bands)
+    # In the order in which the file is read otherwise: a picture may be decoded once for all.
+    plain = replace(
+        info, colour_bands=info.colour_bands + info.alpha_bands, alpha_bands=(), nodata=None, has_mask=False
+    )
     wrong = set(info.alpha_bands)
     if alpha is None:
-        seen = [read_pixels(as_colours, window)[0] for window in dict.fromkeys(looks)]
+        seen = [read_pixels(plain, window)[0][-count:] for window in dict.fromkeys(looks)]
         wrong = {band for k, band in enumerate(info.alpha_bands) if _is_picture([pixels[k] for pixels in seen])}
     return replace(
         info,

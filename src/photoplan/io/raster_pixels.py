@@ -253,8 +253,8 @@ def read_pixels(
     if overview is not None:
         stored, valid = _from_file(info, window, overview[0])
     elif window.stop[1] > _TOP and _decode_once(info):
-        state = info.path.stat()
-        picture = decoded_picture((info.path, state.st_mtime_ns, state.st_ino), partial(_decode, info))
+        state, order = info.path.stat(), info.colour_bands + info.alpha_bands
+        picture = decoded_picture((info.path, state.st_mtime_ns, state.st_ino, order), partial(_decode, info))
         stored, valid = picture.read(window), None
     else:
         stored, valid = _from_file(info, window)
