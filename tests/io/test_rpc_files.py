@@ -67,7 +67,7 @@ def test_gdal_reads_the_same_from_files_beside_the_image(tmp_path: Path, name: s
     assert mine.image_offset == pytest.approx((theirs.samp_off, theirs.line_off), abs=1e-9)
     assert mine.coefficients[2] == pytest.approx(theirs.line_num_coeff, rel=1e-12)
     assert rpc_in(image) is None
-    assert rpc_beside(image) == tmp_path / name
+    assert rpc_beside(image) == [tmp_path / name]
     assert name in describe(image)["rational polynomials"]
 
 
@@ -93,9 +93,9 @@ def test_pleiades_neo_names_what_models_do_and_counts_from_zero(tmp_path: Path) 
 
 
 def test_a_delivery_of_pleiades_is_found_by_its_name(image: Path) -> None:
-    assert rpc_beside(image) is None
+    assert rpc_beside(image) == []
     (image.parent / "RPC_scene.XML").write_text(as_dimap(RPC))
-    assert rpc_beside(image) == image.parent / "RPC_scene.XML"
+    assert rpc_beside(image) == [image.parent / "RPC_scene.XML"]
 
 
 def changed(name: str, old: str, new: str) -> str:

@@ -7,9 +7,9 @@ section 8.2). Sample and line 0, 0 are the centre of the upper-left pixel, as ev
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,6 +39,25 @@ _POWERS = np.array(
 _ITERATIONS = 20
 #: A position is found again to this, pixels; what rounds map coordinates to 1e-9 m is below it.
 _FOUND = 1e-6
+
+
+#: An image was scaled if its sides differ by more than a part from those of the stated range, equally and from a
+#: common corner but for a part of that. It is the whole one if its borders lie near to the range's, and begins with it
+#: if it is this near. It may go on beyond the range without a word, in half ranges from the middle.
+_SCALED, _ALIKE, _SAME, _BEGINS, _LITTLE = 0.01, 0.04, 0.05, 0.02, 1.1
+
+
+@dataclass(frozen=True)
+class SizeFit:
+    """How an image lies in the range of sample and line that rational polynomials state."""
+
+    kind: Literal["whole", "scaled", "part", "corner", "beyond", "outside", "unknown"]
+    """``scaled``: it has the shape of the range and begins with it, but has another size. ``corner``: it begins with
+    the range and is a part of it. ``beyond``: it goes on a little behind the range; ``outside``: far."""
+    whole: tuple[int, int]
+    """Width and height of the range, pixels."""
+    scale: float = 1.0
+    """Pixels of a scaled image for one of the range."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +143,45 @@ class RationalFunctions:
                 f"the {what} at the border of its ground lies more than {_FAR:g} images away; one of its coefficients "
                 "is wrong: get a fresh copy"
             )
+
+    def scaled(self, scale: float) -> RationalFunctions:
+        """The functions of an image with so many pixels for one of theirs: pixel corners keep their places."""
+        offset = tuple(scale * (v + 0.5) - 0.5 for v in self.image_offset)
+        return replace(self, image_offset=offset, image_scale=tuple(scale * v for v in self.image_scale))
+
+    def apart(self, other: RationalFunctions) -> float:
+        """The largest distance of two functions' positions over the ground of this one, pixels."""
+        nodes = np.stack(np.meshgrid(*[(-0.8, 0.0, 0.8)] * 3), axis=-1).reshape(-1, 3)
+        ground = nodes * self.ground_scale + self.ground_offset
+        away = np.linalg.norm(self(ground) - other(ground), axis=1)
+        known = np.isfinite(self(ground)[:, 0])
+        return float(np.nan_to_num(away[known], nan=np.inf).max(initial=0.0))
+
+    def fit(self, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> SizeFit:
+        """How an image of a size lies in the range of sample and line that the offsets and scales state."""
+        centre = np.array(
+            [self.coefficients[0, 0] / self.coefficients[1, 0], self.coefficients[2, 0] / self.coefficients[3, 0]]
+        )
+        W, scale = np.array(size, float), np.array(self.image_scale)
+        first = np.array(self.image_offset) + shift - scale + 0.5
+        span = 2.0 * scale
+        ends = np.stack([first, first + span - W]) / span
+        whole = (round(float(span[0])), round(float(span[1])))
+        if (np.abs(centre) > 0.5).any():
+            # Scales that do not belong to the coefficients state no range.
+            return SizeFit("unknown", whole)
+        factor = W / span
+        change = float(np.abs(1.0 - factor).min())
+        if change > _SCALED and float(np.abs(ends[0]).max()) <= _ALIKE * change >= float(np.ptp(factor)):
+            return SizeFit("scaled", whole, float(np.sqrt(factor.prod())))
+        if (np.abs(ends) <= _SAME).all():
+            return SizeFit("whole", whole)
+        beyond = float(np.maximum(ends[0], -ends[1]).max()) * 2.0 + 1.0
+        if beyond > BOUND:
+            return SizeFit("outside", whole)
+        if beyond > _LITTLE:
+            return SizeFit("beyond", whole)
+        return SizeFit("corner" if (np.abs(ends[0]) <= _BEGINS).all() else "part", whole)
 
     @cached_property
     def _shares(self) -> NDArray[np.bool_]:
@@ -255,6 +313,19 @@ class RpcCamera:
     """All is in the first factor."""
     breaks: ClassVar[None] = None
     """Polynomials are smooth."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of how the polynomials fit the image, a sentence each."""
+        shift = (0.0, 0.0) if self.correction is None else (self.correction.a3, self.correction.a6)
+        fit = self.functions.fit(self.size, shift)
+        size = f"{self.size[0]} × {self.size[1]} pixels, and its polynomials hold for {fit.whole[0]} × {fit.whole[1]}"
+        if fit.kind == "corner":
+            return (
+                f"the image has {size} from its first pixel on; if it was cut out elsewhere, set shift = "
+                "[-COLUMN, -ROW] in [[images]]",
+            )
+        return (f"the image has {size}: it goes on beyond them",) if fit.kind == "beyond" else ()
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """Ground (..., 3) to (x, y, 1); NaN where the polynomials do not hold."""

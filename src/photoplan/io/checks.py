@@ -23,6 +23,7 @@ DRIVER_NAMES = {
     "PNG": "PNG",
     "JP2OpenJPEG": "JPEG 2000",
     "BMP": "BMP",
+    "NITF": "NITF",
     "AAIGrid": "ASCII grid",
 }
 """Formats that are read, by the name of GDAL's driver."""
@@ -37,6 +38,8 @@ _MAGIC: tuple[tuple[bytes, str], ...] = (
     (b"\x00\x00\x00\x0cjP  \r\n\x87\n", "JP2OpenJPEG"),
     (b"\xff\x4f\xff\x51", "JP2OpenJPEG"),
     (b"BM", "BMP"),
+    (b"NITF", "NITF"),
+    (b"NSIF", "NITF"),
 )
 _GRID_WORDS = (b"ncols", b"nrows", b"xllcorner", b"xllcenter", b"yllcorner", b"yllcenter", b"cellsize", b"dx ")
 

@@ -91,7 +91,7 @@ def describe(path: Path) -> dict[str, Any]:
         return _plan(path)
     if kind == ".json":
         return _record(path)
-    if is_rpc(path) or kind == ".xml":
+    if is_rpc(path) or kind in (".xml", ".geom"):
         return {"file": str(path), **read_rpc(path).describe()}
     return _raster(with_alpha_judged(read_info(path)))
 
@@ -163,8 +163,8 @@ def _raster(info: RasterInfo) -> dict[str, Any]:
     rpc, beside = rpc_in(info.path), rpc_beside(info.path)
     if rpc is not None:
         facts |= rpc.describe()
-    elif beside is not None:
-        facts["rational polynomials"] = f"in {beside.name} beside it"
+    elif beside:
+        facts["rational polynomials"] = f"in {', '.join(path.name for path in beside)} beside it"
     if info.warnings:
         facts["note"] = list(info.warnings)
     return facts

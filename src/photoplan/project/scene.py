@@ -106,6 +106,7 @@ class Scene:
     def notes(self) -> tuple[str, ...]:
         """What a user should know of the pixels, one sentence each."""
         found = self.reader.info.warnings
+        found += tuple(f"{self.reader.path.name}: {note}" for note in getattr(self.camera, "notes", ()))
         step = self.reader.step(RestoreStep)
         if step is not None:
             found += (f"{self.reader.path.name}: {step.describe()}",)

@@ -11,7 +11,7 @@ from pydantic import Field, field_validator
 
 from photoplan.cameras.plane import Affine2D
 from photoplan.errors import InputError
-from photoplan.io.camera.model import CameraEntry, Number, Pair
+from photoplan.io.camera.model import CameraEntry, Number, Pair, Positive
 from photoplan.io.project.image import Deviation, ImageEntry, InputName, plain_file
 
 #: What `rpc` says if the image file holds them itself.
@@ -28,6 +28,8 @@ class RpcImage(ImageEntry):
     """``tags``: the image file holds them; else the file that does."""
     shift: Pair | None = None
     """What is added to the polynomials' column and row, pixels."""
+    scale: Positive | None = None
+    """Pixels of the image file for one of the polynomials, before the shift; None: one, and sizes are compared."""
     drift: tuple[Number, Number, Number, Number] | None = None
     """What is added beside: to the column by column and row, to the row by column and row, per pixel."""
     covariance: Annotated[tuple[Number, ...], Field(max_length=21)] | None = None
@@ -60,13 +62,17 @@ class RpcImage(ImageEntry):
     @property
     def remarks(self) -> tuple[str, ...]:
         """Its correction."""
+        scaled = () if self.scale in (None, 1.0) else (f"polynomials are scaled by {self.scale:g}",)
         if self.shift is None:
-            return ()
+            return scaled
         known = "accuracy not stated"
         if self.covariance is not None:
             known = f"± {self.covariance[0] ** 0.5:.2g}, {self.covariance[2] ** 0.5:.2g} px"
         x, y = self.shift
-        return (f"polynomials are corrected by {x:+.2f}, {y:+.2f} px ({known})",)
+        return (
+            *scaled,
+            f"polynomials are corrected by {x:+.2f}, {y:+.2f} px ({known})",
+        )
 
     def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
         """See `ImageEntry.deviations`: of shift and drift."""

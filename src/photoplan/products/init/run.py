@@ -39,7 +39,10 @@ from photoplan.products.init.match import (
 )
 from photoplan.products.init.systems import check_joined, height_systems, placed, project_crs, terrain_entry
 from photoplan.products.judged import differences, on_map, stated_positions
+from photoplan.project.by_rpc import size_fault
 
+#: Polynomials that are written twice differ by rounding, pixels.
+_SAME_RPC = 0.5
 LENS_NAMES = {
     "none": "no distortion",
     "brown": "Brown lens",
@@ -56,6 +59,8 @@ class OwnGeometry:
     image: RpcImage
     place: tuple[float, float]
     """Latitude and longitude in the middle of what the polynomials hold for, degrees."""
+    fault: str | None
+    """What is wrong with the size of the image, so that products are refused; None: nothing is."""
 
 
 def project_names(files: Sequence[Path]) -> dict[Path, str]:
@@ -67,7 +72,7 @@ def project_names(files: Sequence[Path]) -> dict[Path, str]:
 
 
 def own_geometry(files: Iterable[Path], folder: Path, names: Mapping[Path, str]) -> dict[Path, OwnGeometry]:
-    """Those of the files that have rational polynomials; tags come before a file beside the image.
+    """Those of the files that have rational polynomials; tags and files beside the image must agree.
 
     Raises
     ------
@@ -77,13 +82,21 @@ def own_geometry(files: Iterable[Path], folder: Path, names: Mapping[Path, str])
     found = {}
     for file in files:
         rpc, beside = rpc_in(file), None
-        if rpc is None and (beside := rpc_beside(file)) is not None:
-            rpc = read_rpc(beside)
+        others = [read_rpc(other) for other in rpc_beside(file)]
+        if rpc is None and others:
+            rpc, beside = others[0], others[0].file
+        for other in others:
+            if rpc is not None and (apart := rpc.functions.apart(other.functions)) > _SAME_RPC:
+                raise InputError(
+                    f"{file}: {rpc.file.name if beside else 'its tags'} and {other.file.name} beside it state other "
+                    f"polynomials (up to {apart:.3g} px apart); move the wrong ones away"
+                )
         if rpc is not None:
+            fault = size_fault(rpc.functions, read_info(file).size, (0.0, 0.0), rpc.file, stated=False)
             source = TAGS if beside is None else relative_path(beside, folder)
             lon, lat, _ = rpc.functions.ground_offset
             image = RpcImage(name=names[file], file=relative_path(file, folder), rpc=source)
-            found[file] = OwnGeometry(image, (lat, lon))
+            found[file] = OwnGeometry(image, (lat, lon), fault)
     return found
 
 
@@ -201,6 +214,9 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     where = f"{crs_label(crs)} ({origin_of_crs})"
     for line in _summary(used, pairs, len(own), where, lonely_files, lonely_names, table):
         talk(line)
+    for file, each in own.items():
+        if each.fault is not None:
+            talk(f"  warning: {file.name}: {each.fault}")
     systems = height_systems(request, table, terrain_info, ellipsoidal=not pairs)
     of_terrain = f"terrain {height_label(systems[0])}, " if terrain is not None else ""
     of_others = "orientation" if table else "control" if pairs else "images"

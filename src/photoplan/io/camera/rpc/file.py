@@ -9,7 +9,7 @@ from pathlib import Path
 from photoplan.cameras.rpc import RationalFunctions
 from photoplan.errors import InputError
 from photoplan.io.appearance import looks_like
-from photoplan.io.camera.rpc import digitalglobe, dimap, rpb, tags, text
+from photoplan.io.camera.rpc import digitalglobe, dimap, geom, rpb, tags, text
 from photoplan.io.camera.rpc.model import MAX_BYTES, StatedRpc
 from photoplan.io.markup_files import read_xml
 from photoplan.io.plain_files import read_head
@@ -26,21 +26,27 @@ def _document(path: Path) -> StatedRpc:
     raise InputError(f"{path}: an XML document of <{root.tag}> without rational polynomials")
 
 
+def _text(path: Path) -> StatedRpc:
+    kind = geom if geom.is_it(read_head(path)) or path.suffix.lower() == ".geom" else text
+    return StatedRpc(path, kind.FORM, kind.read(path))
+
+
 def _plain(form: str, read: Callable[[Path], RationalFunctions]) -> Callable[[Path], StatedRpc]:
     return lambda path: StatedRpc(path, form, read(path))
 
 
 #: Reader of every format, by file suffix.
 RPC_FORMATS: dict[str, Callable[[Path], StatedRpc]] = {
-    ".txt": _plain(text.FORM, text.read),
-    ".rpc": _plain(text.FORM, text.read),
+    ".txt": _text,
+    ".rpc": _text,
     ".rpb": _plain(rpb.FORM, rpb.read),
+    ".geom": _text,
     ".xml": _document,
 }
 
 
 def read_rpc(path: Path) -> StatedRpc:
-    """Rational polynomials of a file: ``_RPC.TXT``, ``.RPB``, XML of DIMAP or DigitalGlobe, or an image's own.
+    """Rational polynomials of a file: ``_RPC.TXT``, ``.RPB``, ``.geom``, XML of DIMAP or DigitalGlobe, an image's own.
 
     Raises
     ------
@@ -71,15 +77,15 @@ def is_rpc(path: Path) -> bool:
     return path.suffix.lower() in RPC_FORMATS and _MARKS.search(read_head(path)) is not None
 
 
-_MARKS = re.compile(r"LINE_OFF\s*[:=]|lineOffset\s*=|<LINEOFFSET>|<Global_RFM>|<RPB>|<isd>")
+_MARKS = re.compile(r"LINE_OFF\s*[:=]|lineOffset\s*=|<LINEOFFSET>|<Global_RFM>|<RPB>|<isd>|line_num_coeff_00")
 
 
-def rpc_beside(image: Path) -> Path | None:
-    """The file of rational polynomials that belongs to an image by its name; None: there is none."""
+def rpc_beside(image: Path) -> list[Path]:
+    """The files of rational polynomials that belong to an image by their names."""
     stem = image.stem
     product = re.sub(r"^IMG_", "RPC_", re.sub(r"_R1C1$", "", stem))
-    names = {f"{stem}_rpc.txt", f"{stem}.rpc", f"{stem}.rpb", f"{stem}.xml"}
+    names = {f"{stem}_rpc.txt", f"{stem}.rpc", f"{stem}.rpb", f"{stem}.xml", f"{stem}.geom"}
     names |= {f"{product}.xml".casefold()} if product.startswith("RPC_") else set()
     wanted = {name.casefold() for name in names}
     beside = sorted(p for p in image.parent.iterdir() if p.name.casefold() in wanted and p.is_file())
-    return next((path for path in beside if is_rpc(path)), None)
+    return [path for path in beside if is_rpc(path)]
