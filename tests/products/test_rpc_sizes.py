@@ -135,9 +135,9 @@ def geom(rpc: RationalFunctions, form: str = "B", prefix: str = "") -> str:
     order = list(range(20))
     if form == "A":
         # RPC00A after STDI-0002: 1 L P H LP LH PH LPH L2 P2 H2 L3 L2P L2H LP2 P3 P2H LH2 PH2 H3.
-        powers_b = ["", *"L P H LP LH PH LL PP HH LPH LLL LPP LHH LLP PPP PHH LLH PPH HHH".split()]
-        powers_a = ["", *"L P H LP LH PH LPH LL PP HH LLL LLP LLH LPP PPP PPH LHH PHH HHH".split()]
-        order = [powers_b.index(p) for p in powers_a]
+        powers_b = "1 L P H LP LH PH LL PP HH LPH LLL LPP LHH LLP PPP PHH LLH PPH HHH"
+        powers_a = "1 L P H LP LH PH LPH LL PP HH LLL LLP LLH LPP PPP PPH LHH PHH HHH"
+        order = [powers_b.split().index(p) for p in powers_a.split()]
     lines = [f"{prefix}polynomial_format:  {form}", f"{prefix}type:  ossimRpcModel", "number_lines:  400"]
     names = ("samp", "line", "long", "lat", "height")
     for what, values in (

@@ -146,8 +146,9 @@ class RationalFunctions:
 
     def scaled(self, scale: float) -> RationalFunctions:
         """The functions of an image with so many pixels for one of theirs: pixel corners keep their places."""
-        offset = tuple(scale * (v + 0.5) - 0.5 for v in self.image_offset)
-        return replace(self, image_offset=offset, image_scale=tuple(scale * v for v in self.image_scale))
+        (x, y), (width, height) = self.image_offset, self.image_scale
+        offset = (scale * (x + 0.5) - 0.5, scale * (y + 0.5) - 0.5)
+        return replace(self, image_offset=offset, image_scale=(scale * width, scale * height))
 
     def apart(self, other: RationalFunctions) -> float:
         """The largest distance of two functions' positions over the ground of this one, pixels."""
