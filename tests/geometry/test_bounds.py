@@ -53,7 +53,7 @@ def test_places_lie_where_their_crs_is_used() -> None:
     assert area_fault("EPSG:32632", (500_000.0, 5_400_000.0, 0.0)) is None
     # A neighbouring zone's coordinates are in use; X and Y exchanged are not.
     assert area_fault("EPSG:32632", (1_100_000.0, 5_400_000.0, 0.0)) is None
-    assert "is it the right CRS" in (area_fault("EPSG:32632", (5_400_000.0, 500_000.0, 0.0)) or "")
+    assert "are X and Y exchanged" in (area_fault("EPSG:32632", (5_400_000.0, 500_000.0, 0.0)) or "")
     assert "EPSG:2154" in (area_fault("EPSG:2154", (500_000.0, 500_000.0, 0.0)) or "")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,6 +31,13 @@ class LazyGroup(click.Group):
             error.args = (spelled(str(error), verb, ctx.find_root().command), *error.args[1:])
             raise
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The verb and what follows it, with the numbers of options that take several written apart."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command, rest if command is None else apart(command, rest)
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         """The verbs, in the order of a job."""
         return list(self.verbs)
@@ -45,3 +53,51 @@ class LazyGroup(click.Group):
         """One line for each verb."""
         with formatter.section("Verbs"):
             formatter.write_dl(list(self.verbs.items()))
+
+
+#: What may stand between numbers of one option: blanks, commas, semicolons.
+_BETWEEN = re.compile(r"[,;\s]+")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*(e[-+]?\d+)?|\.\d+(e[-+]?\d+)?|nan|inf(inity)?)", re.IGNORECASE)
+_NUMBERS = (type(click.INT), type(click.FLOAT))
+
+
+def apart(command: click.Command, args: list[str]) -> list[str]:
+    """Arguments in which `1,2,3,4` and `1, 2, 3, 4` of an option of several numbers are four words."""
+    counts = {
+        word: option.nargs
+        for option in command.params
+        if isinstance(option, click.Option) and option.nargs > 1 and isinstance(option.type, _NUMBERS)
+        for word in option.opts
+    }
+    out: list[str] = []
+    k = 0
+    while k < len(args):
+        word, equals, value = args[k].partition("=")
+        k += 1
+        out.append(word if word in counts else args[k - 1])
+        if args[k - 1] == "--":
+            return out + args[k:]
+        if word not in counts:
+            continue
+        numbers = [value] if equals else []
+        while k < len(args) and (not numbers or len(_split(numbers)) < counts[word]) and _is_numbers(args[k]):
+            numbers.append(args[k])
+            k += 1
+        found = _split(numbers)
+        option = next(o for o in command.params if word in o.opts)
+        if len(found) != counts[word]:
+            named = f" ({option.metavar})" if isinstance(option, click.Option) and option.metavar else ""
+            given = " ".join(numbers) or "none"
+            needed = f"{word} takes {counts[word]} numbers{named}, with blanks or commas between"
+            raise click.UsageError(f"{needed}; found {len(found)}: {given}")
+        out += found
+    return out
+
+
+def _split(words: list[str]) -> list[str]:
+    return [part for word in words for part in _BETWEEN.split(word) if part]
+
+
+def _is_numbers(word: str) -> bool:
+    """Whether a word holds nothing but numbers and what separates them."""
+    return all(_NUMBER.fullmatch(part) for part in _split([word]))

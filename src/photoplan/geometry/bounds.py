@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
+from pyproj.exceptions import ProjError
 
 from photoplan.geometry.crs import crs_label, nearest_turn, parse_crs, utm_codes
 from photoplan.geometry.rotation import ANGLE_UNITS
@@ -150,3 +151,101 @@ def fitting_utm(crs: str, latitude: float, longitude: float) -> str:
 def is_no_fix(latitude: float, longitude: float) -> bool:
     """Whether a latitude and a longitude are what receivers without a position write: both exactly 0."""
     return latitude == 0.0 and longitude == 0.0
+
+
+#: Bounds that are wider than what they should meet by this in both directions may be in another order.
+_WIDE = 10.0
+Bounds = tuple[float, float, float, float]
+#: Orders in which four numbers of bounds are written elsewhere: places of xmin, ymin, xmax, ymax among them.
+_ORDERS = {
+    "xmin xmax ymin ymax": (0, 2, 1, 3),
+    "xmin ymax xmax ymin": (0, 3, 2, 1),
+    "xmax ymax xmin ymin": (2, 3, 0, 1),
+    "xmax ymin xmin ymax": (2, 1, 0, 3),
+    "ymin xmin ymax xmax": (1, 0, 3, 2),
+    "ymin ymax xmin xmax": (2, 0, 3, 1),
+    "ymax xmin ymin xmax": (1, 2, 3, 0),
+}
+
+
+def bounds_fault(bounds: Sequence[float], crs: str | None = None, covered: Bounds | None = None) -> str | None:
+    """Why bounds xmin, ymin, xmax, ymax cannot be meant, with what is probably meant; None if they can.
+
+    Parameters
+    ----------
+    crs : str, optional
+        CRS that they are in.
+    covered : tuple of float, optional
+        Bounds in it that they should meet. What does not meet them is a fault only if it does in another order or CRS.
+    """
+    try:
+        given = tuple(float(value) for value in bounds) if not isinstance(bounds, str) else ()
+    except (TypeError, ValueError):
+        given = ()
+    if len(given) != 4:
+        return f"bounds {str(bounds)[:80]}; needed are four numbers, xmin ymin xmax ymax"
+    told = "bounds " + bounds_text(given)
+    if not np.isfinite(given).all():
+        return f"{told}; needed are xmin ymin xmax ymax, finite numbers"
+    if max(map(abs, given)) > _FAR:
+        return f"{told}; beyond {_FAR:g} m there is no map"
+    ordered = given[0] < given[2] and given[1] < given[3]
+    wide = covered is not None and min(_extent(given) / _extent(covered)) > _WIDE
+    if ordered and (covered is None or (_meet(given, covered) and not wide)):
+        return None
+    needed = f"{told}; needed are xmin ymin xmax ymax with xmin < xmax and ymin < ymax"
+    likely = []
+    for name, order in _ORDERS.items():
+        b = tuple(given[k] for k in order)
+        size = _extent(b)
+        if (size > 0).all() and (covered is None or (_meet(b, covered) and (size / _extent(covered)).max() <= _WIDE)):
+            likely.append((float(size.prod()), name, bounds_text(b)))
+    if likely:
+        _, name, b_text = min(likely)
+        return f"{needed}. Given are probably {name}, so {b_text} is meant"
+    if not ordered:
+        return needed
+    assert covered is not None
+    if _meet(given, covered):
+        return None
+    there = None if crs is None else _bounds_elsewhere((given[0], given[1], given[2], given[3]), crs, covered)
+    if there is None:
+        return None
+    return f"{told} are in {there[0]}; needed is {crs_label(crs or '')}: {bounds_text(there[1])}"
+
+
+def _extent(bounds: Sequence[float]) -> NDArray[np.float64]:
+    return np.array([bounds[2] - bounds[0], bounds[3] - bounds[1]])
+
+
+def bounds_text(bounds: Sequence[float]) -> str:
+    """Bounds as they are given to options."""
+    return " ".join(f"{value:.10g}" for value in bounds)
+
+
+def _meet(a: Sequence[float], b: Sequence[float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _bounds_elsewhere(given: Bounds, crs: str, covered: Bounds) -> tuple[str, Bounds] | None:
+    """The CRS in which bounds meet others, and what they are in the CRS of these: degrees, Web Mercator, UTM."""
+    here = parse_crs(crs)
+    if here.geodetic_crs is None:
+        return None
+    lon, lat = (float(v[0]) for v in _geographic(here, np.array([[(covered[0] + covered[2]) / 2,
+                                                                  (covered[1] + covered[3]) / 2]])))  # fmt: skip
+    if not np.isfinite(lon + lat):
+        return None
+    others = {"longitudes and latitudes (EPSG:4326)": "EPSG:4326", "latitudes and longitudes (EPSG:4326)": "EPSG:4326"}
+    others |= {code: code for code in ("EPSG:3857", *utm_codes(lat, lon)) if code != crs}
+    for name, other in others.items():
+        b = (given[1], given[0], given[3], given[2]) if name.startswith("latitudes") else given
+        if other == "EPSG:4326" and not (max(abs(b[0]), abs(b[2])) <= 360 and max(abs(b[1]), abs(b[3])) <= 90):
+            continue
+        try:
+            found = Transformer.from_crs(other, here, always_xy=True).transform_bounds(b[0], b[1], b[2], b[3])
+        except ProjError:
+            continue
+        if np.isfinite(found).all() and _meet(found, covered) and max(_extent(found) / _extent(covered)) < _WIDE**2:
+            return name, tuple(round(float(value), 3) for value in found)  # type: ignore[return-value]
+    return None

@@ -228,11 +228,11 @@ class MapGrid:
         Grids of one resolution therefore share their pixels, whatever their bounds: a crop of a product is the
         product of the crop.
         """
+        from photoplan.geometry.bounds import bounds_fault  # noqa: PLC0415  (PROJ is not needed for pixels)
+
+        if (fault := bounds_fault(bounds)) is not None:
+            raise UsageError(fault)
         xmin, ymin, xmax, ymax = bounds
-        if not all(math.isfinite(b) for b in bounds) or xmin >= xmax or ymin >= ymax:
-            raise UsageError(f"bounds {bounds}; needed are xmin ymin xmax ymax with xmin < xmax and ymin < ymax")
-        if max(map(abs, bounds)) > _EARTH:
-            raise UsageError(f"bounds {bounds}; beyond {_EARTH:g} m there is no map")
         check_resolution(resolution)
         # A bound on a multiple stays there although the quotient carries rounding errors.
         col0 = math.floor(xmin / resolution + 1e-6)

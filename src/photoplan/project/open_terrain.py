@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from photoplan.errors import GeometryError, InputError
+from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.geometry.bounds import bounds_fault
 from photoplan.geometry.crs import (
     CrsStep,
     crs_label,
@@ -54,9 +55,13 @@ class OpenTerrain:
 
         Raises
         ------
+        UsageError
+            They are in another order or CRS.
         GeometryError
             They do not; the message states both.
         """
+        if (fault := bounds_fault(bounds, self.crs, self.bounds)) is not None and turn_of(self.crs) is None:
+            raise UsageError(f"{fault} ({self.path})")
         a, b = self.bounds, bounds
         turn = turn_of(self.crs) or 0.0
         if not any(

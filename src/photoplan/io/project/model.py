@@ -12,7 +12,7 @@ from pydantic import Field, Strict, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.bounds import area_fault, odd_angles, odd_place
+from photoplan.geometry.bounds import area_fault, bounds_fault, odd_angles, odd_place
 from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import Entry, Name, NotNegative, Number, Positive, Restoration, Triple
 from photoplan.io.names import resolve_input, unique_stems
@@ -198,8 +198,8 @@ class OrthoDefaults(Entry):
     @field_validator("bounds")
     @classmethod
     def _bounds(cls, b: tuple[float, float, float, float] | None) -> tuple[float, float, float, float] | None:
-        if b is not None and (b[0] >= b[2] or b[1] >= b[3]):
-            raise ValueError(f"bounds {list(b)}; needed are [xmin, ymin, xmax, ymax] with xmin < xmax and ymin < ymax")
+        if b is not None and (fault := bounds_fault(b)) is not None:
+            raise ValueError(fault)
         return b
 
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.contour_file import ContourRow, LabelRow, contour_files, write_contours
 from photoplan.io.product import check_output
@@ -183,8 +182,6 @@ def _bounds(request: ContourRequest, terrain: OpenTerrain) -> tuple[float, float
     if request.bounds is None:
         return terrain.bounds
     a, b = terrain.bounds, request.bounds
-    if not (b[0] < b[2] and b[1] < b[3]):
-        raise UsageError(f"bounds {b}; needed are xmin ymin xmax ymax with xmin < xmax and ymin < ymax")
     terrain.refuse_apart(b)
     return max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.heights import crs_with_heights
@@ -107,9 +107,7 @@ def _kind(request: ExportRequest) -> str:
 def _grid(request: ExportRequest, terrain: OpenTerrain) -> MapGrid:
     crs = crs_with_heights(terrain.crs, terrain.height_system)
     bounds = request.bounds or terrain.bounds
-    low, high = np.maximum(bounds[:2], terrain.bounds[:2]), np.minimum(bounds[2:], terrain.bounds[2:])
-    if not (low < high).all():
-        raise InputError(f"{terrain.path}: covers {_text(terrain.bounds)}, the bounds are {_text(bounds)}")
+    terrain.refuse_apart(bounds)
     if request.resolution is not None or request.bounds is not None:
         return MapGrid.covering((*bounds[:2], *bounds[2:]), request.resolution or terrain.resolution, crs)
     width = terrain.resolution
@@ -143,7 +141,3 @@ def _export_raster(request: ExportRequest, terrain: OpenTerrain, events: Events)
             paths.append(request.sigma)
     size = {"columns": grid.width, "rows": grid.height, "resolution": grid.resolution}
     return ExportReport(tuple(paths), {**size, "share_with_height": facts.valid_share})
-
-
-def _text(bounds: tuple[float, float, float, float]) -> str:
-    return " ".join(f"{v:.10g}" for v in bounds)

@@ -146,9 +146,8 @@ def make_picture(
 
 def _grid(request: PictureRequest, terrain: OpenTerrain) -> MapGrid:
     bounds = request.bounds or terrain.bounds
-    grid = MapGrid.covering(bounds, request.resolution or terrain.resolution, terrain.crs)
-    terrain.refuse_apart(grid.bounds)
-    return grid
+    terrain.refuse_apart(bounds)
+    return MapGrid.covering(bounds, request.resolution or terrain.resolution, terrain.crs)
 
 
 def shade_picture(light: Lighting) -> Callable[[OpenTerrain, MapGrid], Picture]:

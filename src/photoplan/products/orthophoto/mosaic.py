@@ -22,6 +22,7 @@ from photoplan.products.orthophoto.plan import (
     check_storable,
     chosen_settings,
     grid_of,
+    judge_bounds,
     product_plan,
     refuse_blind,
 )
@@ -64,6 +65,7 @@ def plan_mosaic(
     refuse_mixed(looked)
     chosen = with_resolution(chosen, looked, force)
     refuse_blind(chosen, looked, blind)
+    judge_bounds(project, chosen, [one.look.footprint for one in looked])
     grid = grid_of(project, chosen, [one.look.footprint for one in looked])
     looked = with_blur(looked, grid, chosen, events)
     assert chosen.choice is not None

@@ -25,6 +25,7 @@ from photoplan.products.orthophoto.plan import (
     check_storable,
     chosen_settings,
     grid_of,
+    judge_bounds,
     product_plan,
     refuse_blind,
 )
@@ -82,6 +83,7 @@ def plan_objects(
     refuse_mixed(looked)
     chosen = with_resolution(chosen, looked, force)
     refuse_blind(chosen, looked, blind)
+    judge_bounds(project, chosen, [one.look.footprint for one in looked])
     looked = with_blur(looked, grid_of(project, chosen, [one.look.footprint for one in looked]), chosen, events)
     surface = looked[0].scene.surface
     assert isinstance(surface, ObjectSurface)

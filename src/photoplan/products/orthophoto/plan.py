@@ -14,6 +14,7 @@ from photoplan.engine.execute import Painted, joined
 from photoplan.engine.execute import render as render_tile
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.geometry.bounds import bounds_fault
 from photoplan.geometry.grid import MapGrid, refuse_absurd
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
@@ -155,6 +156,7 @@ def plan_orthophotos(
     events.begin("planning", 2 * len(names), "steps")
     looked, blind = look_at(project, names, force, events)
     chosen = with_resolution(chosen, looked, force)
+    judge_bounds(project, chosen, [one.look.footprint for one in looked])
     products = []
     for one in looked:
         grid = grid_of(project, chosen, [one.look.footprint])
@@ -191,6 +193,16 @@ def grid_of(project: Project, settings: OrthoSettings, seen: Sequence[Footprint]
     extents = np.array([one.bounds for one in seen if one.bounds is not None])
     low, high = extents[:, :2].min(axis=0).tolist(), extents[:, 2:].max(axis=0).tolist()
     return MapGrid.covering(settings.bounds or (*low, *high), settings.resolution, project.crs)
+
+
+def judge_bounds(project: Project, settings: OrthoSettings, seen: Sequence[Footprint]) -> None:
+    """Refuse bounds that are in another order or CRS, by what the images see."""
+    extents = np.array([one.bounds for one in seen if one.bounds is not None])
+    if settings.bounds is None or not len(extents):
+        return
+    low, high = extents[:, :2].min(axis=0).tolist(), extents[:, 2:].max(axis=0).tolist()
+    if (fault := bounds_fault(settings.bounds, project.crs, (*low, *high))) is not None:
+        raise UsageError(fault)
 
 
 def refuse_blind(settings: OrthoSettings, products: Sequence[Any], blind: Sequence[str]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.geometry.bounds import bounds_fault
 from photoplan.geometry.frames import Frame, ImageFrame
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.fingerprint import fingerprint
@@ -199,7 +200,7 @@ def plan_surface(
         assert settings.bounds is not None
         looked, blind = over_frame(project, names, frame, settings.bounds, float(settings.start), events)
     check_bands(project, settings.bands, [one.name for one in looked])
-    bounds, seen_share = _bounds(settings, looked, blind)
+    bounds, seen_share = _bounds(settings, None if frame is not None else project.crs, looked, blind)
     gsd = float(np.median([one.gsd for one in looked]))
     if settings.resolution < _FINEST * gsd * 0.999:
         raise UsageError(
@@ -254,7 +255,9 @@ def _key(project: Project, images: tuple[str, ...], settings: SurfaceSettings, *
     return run_key("surface", stated, files)
 
 
-def _bounds(settings: SurfaceSettings, looked: Sequence[SeenTarget], blind: Sequence[str]) -> tuple[Bounds, float]:
+def _bounds(
+    settings: SurfaceSettings, crs: str | None, looked: Sequence[SeenTarget], blind: Sequence[str]
+) -> tuple[Bounds, float]:
     """The bounds that were chosen, or around all that two images see by their footprints; the part of them they see."""
     seen = [one.bounds for one in looked]
     common = []
@@ -273,6 +276,8 @@ def _bounds(settings: SurfaceSettings, looked: Sequence[SeenTarget], blind: Sequ
     if settings.bounds is None:
         return (xmin, ymin, xmax, ymax), 1.0
     b = settings.bounds
+    if (fault := bounds_fault(b, crs, (xmin, ymin, xmax, ymax))) is not None:
+        raise UsageError(fault)
     MapGrid.covering(b, settings.resolution, None)
     if not (b[0] < xmax and xmin < b[2] and b[1] < ymax and ymin < b[3]):
         together = extent_text((xmin, ymin, xmax, ymax))
