@@ -142,7 +142,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         ),
         (([image, image], [camera(), camera()], GRID, 0.0), "say which of them paints"),
         ((image.astype(np.int64), camera(), GRID, 0.0), "type int64"),
-        ((7, camera(), GRID, 0.0), "source of type int"),
+        ((7, camera(), GRID, 0.0), "source: int 7"),
     ):
         with pytest.raises(UsageError, match=message):
             photoplan.rectify(*arguments)

@@ -26,9 +26,10 @@ class ArrayReader:
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.dtype.name not in _TYPES or not self.image.size:
+            advice = "" if self.image.dtype.name in _TYPES else "; convert it, for instance with astype('float32')"
             raise UsageError(
                 f"image of shape {self.image.shape} and type {self.image.dtype}; needed are (bands, height, width) of "
-                f"{', '.join(_TYPES)}"
+                f"{', '.join(_TYPES)}{advice}"
             )
         if self.valid is not None and (self.valid.shape != self.image.shape[1:] or self.valid.dtype != bool):
             raise UsageError(f"validity of shape {self.valid.shape}; needed is bool of {self.image.shape[1:]}")

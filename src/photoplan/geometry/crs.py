@@ -389,7 +389,14 @@ def crs_step(
         )
     best = group.transformers[0]
     accuracy = best.accuracy if best.accuracy is not None and best.accuracy >= 0 else None
-    step = CrsStep(source, target, best.description, accuracy, best.definition, about)
+    step = CrsStep(
+        source=source,
+        target=target,
+        operation=best.description,
+        accuracy=accuracy,
+        definition=best.definition,
+        about=about,
+    )
     if bounds is not None and np.isfinite(bounds).all():
         x, y = np.linspace(bounds[0], bounds[2], 3), np.linspace(bounds[1], bounds[3], 3)
         places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -180,7 +180,7 @@ def projected_crs(crs: str) -> ProjectedCrs:
     unit = geographic.axis_info[0].unit_conversion_factor
     body = Ellipsoid(ellipsoid.semi_major_metre, flattening * (2.0 - flattening))
     sphere = _sphere_of(projected, body.a) if body.e2 > EARTHLIKE else None
-    return ProjectedCrs(transformer, unit, body, crs, sphere)
+    return ProjectedCrs(to_geographic=transformer, unit=unit, ellipsoid=body, crs=crs, sphere=sphere)
 
 
 def _sphere_of(crs: CRS, radius: float) -> Transformer:

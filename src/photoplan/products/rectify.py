@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,8 +17,8 @@ from photoplan.engine.arrays import ArrayReader
 from photoplan.engine.base import Reader, Source
 from photoplan.engine.execute import Painted, joined, render
 from photoplan.engine.executors import Outcome, Workers, executor_factory, run_tiles
-from photoplan.errors import PhotoplanError, UsageError
-from photoplan.geometry.crs import parse_crs
+from photoplan.errors import PhotoplanError, PhotoplanWarning, UsageError
+from photoplan.geometry.crs import crs_label, parse_crs, require_projected_metres
 from photoplan.geometry.grid import MapGrid, Placement
 from photoplan.io.product import ProductFile
 from photoplan.io.raster import RasterReader, pixels_of_dataset
@@ -28,6 +29,7 @@ from photoplan.plan.owner import GivenOwners
 from photoplan.plan.product import ProductPlan
 from photoplan.plan.tiles import Tiles
 from photoplan.project.open_terrain import open_terrain
+from photoplan.public import described, file_of
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.level import LevelSurface
 from photoplan.targets.base import Target
@@ -181,8 +183,16 @@ def rectify(
     """
     if kernel not in KERNELS:
         raise UsageError(f"kernel {kernel!r}; allowed are {', '.join(KERNELS)}")
+    if not (tolerance > 0 and tile >= 1 and workers >= 1):
+        given = f"tolerance {tolerance}, tile {tile}, workers {workers}"
+        raise UsageError(f"{given}; needed are a positive number of pixels and whole numbers from 1")
     sources = _sources(source, camera)
     place = MapTarget(target) if isinstance(target, MapGrid) else target
+    if not all(hasattr(place, name) for name in ("window", "to_ground", "placement")):
+        raise UsageError(f"target: {described(target)}; give a MapGrid, such as MapGrid.covering(bounds, 0.1, crs), or "
+                         "another target")  # fmt: skip
+    if isinstance(target, MapGrid) and target.crs is not None:
+        require_projected_metres(target.crs, "target: CRS")
     names = tuple(f"source {k}" for k in range(1, len(sources) + 1))
     plan = ProductPlan(
         name="rectified",
@@ -190,10 +200,26 @@ def rectify(
         target=place,
         rule=AnchorRule.of(kernel, tolerance),
         tiles=Tiles.every(place.window, tile, len(names)),
-        owners=None if owner is None else GivenOwners(_owners(owner, len(names))),
+        owners=None if owner is None else GivenOwners(_owners(owner, len(names), place.placement.size)),
     )
-    work = partial(render, plan, sources=sources, surface=_surface(surface, place.placement.crs), kernel=kernel)
-    return _collected(plan, sources[0].reader, work, workers)
+    work = partial(render, plan, sources=sources, surface=_surface(surface, place), kernel=kernel)
+    made = _collected(plan, sources[0].reader, work, workers)
+    if not made.valid.any():
+        warnings.warn(PhotoplanWarning(_why_empty(sources, place)), stacklevel=2)
+    return made
+
+
+def _why_empty(sources: Sequence[Source], target: Target) -> str:
+    """A sentence for a result without a valid pixel: where the target lies, and where cameras stand."""
+    uv = np.array([(0.0, 0.0), (target.window.width - 1.0, target.window.height - 1.0)])
+    ends = np.asarray(target.to_ground(np.column_stack([uv, np.zeros(2)])), float)[:, :2]
+    center = getattr(sources[0].camera, "center", None)
+    stands = "" if center is None else f"; the first camera stands at X {center[0]:.0f}, Y {center[1]:.0f}"
+    return (
+        "no pixel of the result is valid: no source shows the surface there. The target reaches from "
+        f"{ends[0, 0]:.0f}, {ends[0, 1]:.0f} to {ends[1, 0]:.0f}, {ends[1, 1]:.0f}{stands}; are both in one CRS and "
+        "height system?"
+    )
 
 
 def _collected(plan: ProductPlan, reader: Reader, work: Any, workers: int) -> Raster:
@@ -215,13 +241,27 @@ def _painted(outcome: Outcome) -> Painted:
 
 
 def _sources(source: Any, camera: Projection | Sequence[Projection]) -> list[Source]:
-    cameras = list(camera) if isinstance(camera, Sequence) else [camera]
-    given = list(source) if isinstance(camera, Sequence) else [source]
+    several = isinstance(camera, list | tuple)
+    cameras: list[Any] = list(camera) if isinstance(camera, list | tuple) else [camera]
+    if several and not isinstance(source, list | tuple):
+        raise UsageError(f"{len(cameras)} cameras and one source, {described(source)}; give a list of sources, too")
+    given = list(source) if several else [source]
     if not cameras or len(given) != len(cameras):
         raise UsageError(f"{len(given)} sources and {len(cameras)} cameras; each source needs its own camera")
+    for each in cameras:
+        if not (hasattr(each, "project_homogeneous") and hasattr(each, "size")):
+            raise UsageError(
+                f"camera: {described(each)}; give a camera with its orientation, such as photoplan.FrameCamera, or a "
+                "list of them (images of a project are rectified by photoplan.plan_orthophotos)"
+            )
     sources = [Source(c, _reader(s)) for s, c in zip(given, cameras)]
     for number, each in enumerate(sources, 1):
         if tuple(each.reader.size) != tuple(each.camera.size):
+            if isinstance(each.reader, ArrayReader) and each.reader.image.shape[:2] == tuple(each.camera.size)[::-1]:
+                raise UsageError(
+                    f"source {number} has the shape {each.reader.image.shape}; needed is (bands, height, width): give "
+                    "array.transpose(2, 0, 1)"
+                )
             raise UsageError(
                 f"source {number} has {each.reader.size[0]} × {each.reader.size[1]} pixels, its camera has "
                 f"{each.camera.size[0]} × {each.camera.size[1]}; a cropped or scaled image needs a camera of its own"
@@ -244,22 +284,58 @@ def _reader(source: Any) -> Reader:
         return ArrayReader.of(pixels)
     if pixels is not None:
         return pixels
+    if hasattr(source, "dims") and hasattr(source, "values") and not hasattr(source, "data_vars"):
+        return ArrayReader.of(_of_xarray(source))
     if isinstance(source, Reader):
         return source
-    raise UsageError(f"source of type {type(source).__name__}; give an array, a path, a rasterio dataset or a reader")
+    if hasattr(source, "__array__") and not hasattr(source, "data_vars"):
+        return ArrayReader.of(np.asarray(source))
+    raise UsageError(
+        f"source: {described(source)}; give an array or xarray.DataArray, a path, a rasterio dataset or a reader"
+    )
 
 
-def _owners(owner: ArrayLike, count: int) -> NDArray[np.uint16]:
+def _of_xarray(source: Any) -> NDArray[Any]:
+    """Pixels (bands, height, width) of an xarray.DataArray; its values for none are masked."""
+    if not {"y", "x"} <= set(source.dims) or source.ndim > 3:
+        raise UsageError(f"source: DataArray with dimensions {source.dims}; needed are (band, y, x) or (y, x)")
+    values = np.asarray(source.transpose(..., "y", "x").values)
+    nodata = source.attrs.get("_FillValue", source.attrs.get("nodata", source.encoding.get("_FillValue")))
+    return values if nodata is None else np.ma.masked_equal(values, nodata)
+
+
+def _owners(owner: ArrayLike, count: int, size: tuple[int, int]) -> NDArray[np.uint16]:
     numbers = np.asarray(owner)
     if numbers.dtype.kind not in "iub" or (numbers.size and not (numbers.min() >= 0 and numbers.max() <= count)):
         raise UsageError(f"owners of type {numbers.dtype}; whole numbers from 0 to {count}, the number of sources")
+    if numbers.shape != size[::-1]:
+        raise UsageError(f"owners of shape {numbers.shape}; needed is that of the target, {size[::-1]}")
     return numbers.astype(np.uint16)
 
 
-def _surface(surface: Surface | Path | str | float, crs: str | None) -> Surface:
-    if isinstance(surface, int | float):
+def _surface(surface: Any, target: Target) -> Surface:
+    """The surface in the target's CRS; a file that the target does not meet is refused."""
+    if hasattr(surface, "relief"):
+        found: Surface = surface
+        return found
+    if isinstance(surface, int | float | np.integer | np.floating) and not isinstance(surface, bool):
+        if not np.isfinite(surface):
+            raise UsageError(f"surface: height {surface}; give a finite number")
         return LevelSurface(float(surface))
-    if isinstance(surface, Path | str):
-        terrain = open_terrain(Path(surface), crs)
+    file = file_of(surface)
+    if file is None:
+        raise UsageError(
+            f"surface: {described(surface)}; give the path of a height raster or terrain model, a dataset that is open "
+            "from a file, one height, or a surface such as photoplan.RasterSurface"
+        )
+    crs = target.placement.crs
+    terrain = open_terrain(Path(file), crs)
+    if crs is None or not isinstance(target, MapTarget):
         return (terrain if crs is None else terrain.in_crs(crs)[0]).surface
-    return surface
+    own = terrain.crs
+    placed = terrain.in_crs(crs)[0]
+    try:
+        placed.refuse_apart(target.grid.bounds)
+    except PhotoplanError as error:
+        raise type(error)(f"{error}. The target's CRS is {crs_label(crs)}, the surface's {crs_label(own)}") from None
+    return placed.surface

@@ -312,7 +312,7 @@ class Project(Entry):
         if patterns is None:
             return names
         chosen: set[str] = set()
-        for pattern in patterns:
+        for pattern in (patterns,) if isinstance(patterns, str) else patterns:
             found = [n for n in names if n == pattern or fnmatchcase(n, pattern)]
             if not found:
                 raise UsageError(
