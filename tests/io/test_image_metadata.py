@@ -160,8 +160,58 @@ BOMB = b'<!DOCTYPE d [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]><x>&b;</x
     ],
 )
 def test_fault_08_damaged_exif(tmp_path: Path, raw: Any, says: str) -> None:
-    with pytest.raises(InputError, match=says):
-        read_image_metadata(jpeg(tmp_path / "a.jpg", raw(exif(MAIN, OWN, gps(1, 2, 3)))))
+    found = read_image_metadata(jpeg(tmp_path / "a.jpg", raw(exif(MAIN, OWN, gps(1, 2, 3)))))
+    assert says in found.faults[0]
+    assert found.position is None
+
+
+BROKEN = {
+    "ampersand": lambda packet: packet.replace(b"DJI Meta Data", b"R&D Meta"),
+    "control character": lambda packet: packet.replace(b"DJI Meta Data", b"DJI\x07Data"),
+    "undeclared prefix": lambda packet: packet.replace(b"xmlns:drone-dji=", b"xmlns:other="),
+    "cut off": lambda packet: packet[: len(packet) // 2],
+    "two roots": lambda packet: packet.replace(b"   <?xpacket", b"<more/><?xpacket"),
+    "no XML": lambda packet: b"\xff\x00\x01 not a packet",
+}
+ATTITUDE = {"GimbalYawDegree": 10, "GimbalPitchDegree": -90, "GimbalRollDegree": 0}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_malformed_xmp_packet_costs_that_packet(tmp_path: Path, how: str) -> None:
+    packet = BROKEN[how](xmp(**ATTITUDE))
+    found = read_image_metadata(jpeg(tmp_path / "b.jpg", exif(MAIN, OWN, gps(47.0, 9.0, 500.0)), packet))
+    assert found.position == pytest.approx((47.0, 9.0, 500.0), abs=1e-6)
+    assert found.yaw_pitch_roll is None
+    assert "its XMP packet is damaged" in found.faults[0]
+
+
+def test_damaged_exif_leaves_xmp(tmp_path: Path) -> None:
+    packet = xmp(GpsLatitude=47.5, GpsLongitude=9.5, AbsoluteAltitude=400, **ATTITUDE)
+    found = read_image_metadata(jpeg(tmp_path / "a.jpg", exif(MAIN, OWN, gps(1, 2, 3))[:60], packet))
+    assert found.position == (47.5, 9.5, 400.0)
+    assert found.yaw_pitch_roll == (10.0, -90.0, 0.0)
+    assert "EXIF header is damaged" in found.faults[0]
+
+
+def test_one_bad_image_of_a_folder_is_listed_and_counted(tmp_path: Path) -> None:
+    for k in range(4):
+        jpeg(tmp_path / f"{k}.jpg", exif(MAIN, OWN, gps(47.0 + k * 1e-4, 9.0, 500.0)), xmp(**ATTITUDE))
+    jpeg(tmp_path / "broken.jpg", exif(MAIN, OWN, gps(47.0, 9.0, 500.0)), b"<x:xmpmeta R&D>")
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    (tmp_path / "text.tif").write_text("no image")
+    jpeg(tmp_path / "far.jpg", exif({}, {}, gps(91.0, 0, 0)))
+    jpeg(tmp_path / "bomb.jpg", exif(MAIN, OWN, gps(47.0, 9.0, 500.0)), BOMB)
+    jpeg(tmp_path / "cut.jpg", exif(MAIN, OWN, gps(47.0, 9.0, 500.0))[:60], xmp(**ATTITUDE))
+    notes = " | ".join(read_orientation_block(tmp_path).table.notes)
+    assert "4 of 10 images cannot be used and are left out: bomb.jpg" in notes
+    assert "2 of 10 images have damaged metadata, which are left out: broken.jpg: its XMP packet is damaged" in notes
+    assert len(read_orientation_block(tmp_path).table.images) == 4
+    table = read_observed_positions(tmp_path, crs="EPSG:32632")
+    assert table.images == ("0.jpg", "1.jpg", "2.jpg", "3.jpg", "broken.jpg")
+    assert "4 of 10 images cannot be used" in table.notes[0]
+    # A single image that cannot be read is refused.
+    with pytest.raises(InputError, match="neither JPEG nor TIFF"):
+        read_orientation_block(tmp_path / "text.tif", format="exif")
 
 
 def test_fault_10_xml_bomb_in_xmp(tmp_path: Path) -> None:

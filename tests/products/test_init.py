@@ -170,6 +170,19 @@ def test_fault_12_equal_base_names_are_told_apart_by_folder(files: dict[str, Any
     assert project.stems == {"100MEDIA/a": "100MEDIA_a", "101MEDIA/a": "101MEDIA_a", "b": "b"}
 
 
+def test_fault_08_an_unreadable_image_among_many_is_left_out_and_listed(files: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "images" / "broken.tif").write_bytes(b"II*\0 and no more")
+    (tmp_path / "images" / "empty.tif").write_bytes(b"")
+    said: list[str] = []
+    result = make_project(InitRequest(**files), said.append)
+    assert [i.name for i in result.project.images] == ["a", "b"]
+    assert len(result.unusable) == 2
+    assert any("left out, 2 files cannot be read: " in line and "broken.tif" in line for line in said)
+    alone = {**files, "images": (str(tmp_path / "images" / "broken.tif"),)}
+    with pytest.raises(InputError, match=r"broken\.tif"):
+        make_project(InitRequest(**alone))
+
+
 def test_fault_12_stems_that_differ_only_in_what_is_replaced(files: dict[str, Any], tmp_path: Path) -> None:
     raster(tmp_path / "images" / "x 1.tif")
     raster(tmp_path / "images" / "x_1.tif")

@@ -27,7 +27,7 @@ from xml.etree.ElementTree import Element
 
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import is_no_fix
-from photoplan.io.markup_files import parse_xml
+from photoplan.io.markup_files import NotWellFormed, parse_xml
 
 _DJI = "dji.com/drone-dji"
 _CAMERA = "pix4d.com/camera"
@@ -60,6 +60,8 @@ class ImageMetadata:
     """Maker and model."""
     time: float | None = None
     """Seconds since 1970 by the camera's clock (taken as UTC)."""
+    faults: tuple[str, ...] = ()
+    """What of its metadata is damaged and was left out: EXIF or the XMP packet, a clause each."""
     display: int = 1
     """EXIF's Orientation: how a viewer turns the image (1: not at all, 3: by 180°). Pixels are read as stored, and
     attitudes are those of the sensor; only programs that turned the pixels make a difference."""
@@ -71,11 +73,14 @@ def read_image_metadata(path: str | Path) -> ImageMetadata:
     Raises
     ------
     InputError
-        The file is neither, its header is damaged, or it states a position that is not on the earth.
+        The file is neither, it states a position that is not on the earth, or its XMP holds entities.
     """
     path = Path(path)
-    exif, packet = read_exif(path)
-    dji, schema = _xmp(packet, path)
+    exif, packet, faults = read_exif(path)
+    try:
+        dji, schema = _xmp(packet, path)
+    except NotWellFormed as error:
+        (dji, schema), faults = ({}, {}), (*faults, f"its XMP packet is damaged ({str(error).partition(': ')[2]})")
     size = _size(exif)
     position = _position(exif, dji, path)
     no_fix = position is not None and is_no_fix(*position[:2])
@@ -91,6 +96,7 @@ def read_image_metadata(path: str | Path) -> ImageMetadata:
         sensor_size_mm=_sensor(exif, size, _number(exif, "FocalLength")),
         camera=" ".join(names) or None,
         time=_time(exif),
+        faults=faults,
         display=int(_number(exif, "Orientation") or 1),
     )
 
@@ -267,23 +273,23 @@ _NAMES = {
 }
 
 
-def read_exif(path: Path) -> tuple[dict[str, ExifValue], str | None]:
-    """EXIF entries by their standard names, and the XMP packet as text (None: there is none).
+def read_exif(path: Path) -> tuple[dict[str, ExifValue], str | None, tuple[str, ...]]:
+    """EXIF entries by their standard names, the XMP packet as text (None: there is none), and what is damaged.
 
     Raises
     ------
     InputError
-        The file is neither JPEG nor TIFF, or its header is damaged.
+        The file is neither JPEG nor TIFF, or the header of a TIFF is damaged.
     """
     try:
         with path.open("rb") as file:
             start = file.read(4)
             if start[:2] == b"\xff\xd8":
-                return _of_jpeg(file, path)
+                return _of_jpeg(file)
             if start in (b"II*\0", b"MM\0*"):
-                return _of_tiff(_window(file), path)
+                return *_of_tiff(_window(file)), ()
             if start in (b"II+\0", b"MM\0+"):
-                return {}, None  # BigTIFF: no camera writes it
+                return {}, None, ()  # BigTIFF: no camera writes it
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (struct.error, ValueError, OverflowError) as error:
@@ -291,9 +297,10 @@ def read_exif(path: Path) -> tuple[dict[str, ExifValue], str | None]:
     raise InputError(f"{path}: neither JPEG nor TIFF; positions are read from EXIF of these")
 
 
-def _of_jpeg(file: BinaryIO, path: Path) -> tuple[dict[str, ExifValue], str | None]:
+def _of_jpeg(file: BinaryIO) -> tuple[dict[str, ExifValue], str | None, tuple[str, ...]]:
     file.seek(2)
     entries: dict[str, ExifValue] = {}
+    faults: tuple[str, ...] = ()
     xmp: str | None = None
     for _ in range(MAX_SEGMENTS):
         head = file.read(4)
@@ -305,10 +312,13 @@ def _of_jpeg(file: BinaryIO, path: Path) -> tuple[dict[str, ExifValue], str | No
             break
         segment = file.read(length - 2)
         if head[1] == 0xE1 and segment.startswith(b"Exif\0\0") and not entries:
-            entries, _ = _of_tiff(_buffer(segment[6:]), path)
+            try:
+                entries, _ = _of_tiff(_buffer(segment[6:]))
+            except (struct.error, ValueError, OverflowError) as error:
+                faults = (f"its EXIF header is damaged ({error})",)
         elif head[1] == 0xE1 and segment.startswith(_XMP_HEAD):
             xmp = segment[len(_XMP_HEAD) :].decode("utf-8", "replace")
-    return entries, xmp
+    return entries, xmp, faults
 
 
 _Reader = Callable[[int, int], bytes]
@@ -334,7 +344,7 @@ def _window(file: BinaryIO) -> _Reader:
     return read
 
 
-def _of_tiff(read: _Reader, path: Path) -> tuple[dict[str, ExifValue], str | None]:
+def _of_tiff(read: _Reader) -> tuple[dict[str, ExifValue], str | None]:
     mark = read(0, 4)
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(mark)
     if order is None:
@@ -344,7 +354,8 @@ def _of_tiff(read: _Reader, path: Path) -> tuple[dict[str, ExifValue], str | Non
     xmp: str | None = None
     pending = [(0, first)]
     for directory, offset in pending:
-        for tag, value in _directory(read, order, offset):
+        wanted = {*_NAMES[directory], *((EXIF_DIRECTORY, GPS_DIRECTORY, XMP_TAG) if directory == 0 else ())}
+        for tag, value in _directory(read, order, offset, wanted):
             if directory == 0 and tag in (EXIF_DIRECTORY, GPS_DIRECTORY) and not isinstance(value, str):
                 pending.append((tag, int(value[0])))
             elif directory == 0 and tag == XMP_TAG:
@@ -354,7 +365,7 @@ def _of_tiff(read: _Reader, path: Path) -> tuple[dict[str, ExifValue], str | Non
     return entries, xmp
 
 
-def _directory(read: _Reader, order: str, offset: int) -> list[tuple[int, ExifValue]]:
+def _directory(read: _Reader, order: str, offset: int, wanted: set[int]) -> list[tuple[int, ExifValue]]:
     (count,) = struct.unpack(order + "H", read(offset, 2))
     if count > MAX_ENTRIES:
         raise ValueError(f"a directory of {count} entries")
@@ -363,7 +374,7 @@ def _directory(read: _Reader, order: str, offset: int) -> list[tuple[int, ExifVa
         entry = read(offset + 2 + 12 * k, 12)
         tag, kind, number = struct.unpack(order + "HHI", entry[:8])
         letter = _RATIONAL.get(kind) or _TYPES.get(kind)
-        if letter is None or not number:
+        if letter is None or not number or tag not in wanted:
             continue
         each = struct.calcsize(order + letter) * (2 if kind in _RATIONAL else 1)
         size = each * number

@@ -63,6 +63,10 @@ def _refuse_repeated_keys(node: Any, path: Path) -> None:
             _refuse_repeated_keys(child, path)
 
 
+class NotWellFormed(InputError):
+    """Text that is not XML, as against XML that is not read for its content."""
+
+
 def read_xml(path: Path, max_bytes: int) -> Element:
     """Root of an XML file.
 
@@ -85,9 +89,9 @@ def parse_xml(text: str, where: str) -> Element:
             "write the file again without them"
         ) from None
     except ParseError as error:
-        raise InputError(f"{where}:{error.position[0]}: not valid XML ({error}); get a fresh copy") from None
+        raise NotWellFormed(f"{where}:{error.position[0]}: not valid XML ({error}); get a fresh copy") from None
     except (ValueError, LookupError) as error:
-        raise InputError(f"{where}: cannot be read ({error})") from None
+        raise NotWellFormed(f"{where}: cannot be read ({error})") from None
     _refuse_deep(root, where)
     return root
 

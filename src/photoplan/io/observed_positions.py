@@ -22,7 +22,7 @@ from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.names import same_images
-from photoplan.io.orientation.exif import map_positions, read_folder, without_fix
+from photoplan.io.orientation.exif import map_positions, read_folder
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
 from photoplan.io.plain_files import crs_beside
@@ -218,7 +218,8 @@ def _same(path: Path, own: str, crs: str) -> None:
 
 def _from_images(path: Path, crs: str) -> PositionTable:
     """Positions that drones write into their images, with the receiver's standard deviations and times."""
-    images, unfixed = read_folder(path)
+    folder = read_folder(path)
+    images = folder.placed
     n = len(images)
     sigma = np.array([m.sigma or (np.nan,) * 3 for m in images], float).reshape(n, 3)
     times = [m.time for m in images]
@@ -233,7 +234,7 @@ def _from_images(path: Path, crs: str) -> PositionTable:
         sigma_angle=np.full(n, np.nan),
         strip=("all",) * n,
         time=time,
-        notes=(f"{path.name}: {without_fix(unfixed)}; left out",) if unfixed else (),
+        notes=folder.notes,
     )
 
 

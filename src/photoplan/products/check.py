@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.cameras.base import Camera, tremor_told, tremors_of
+from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.io.project.model import Project
@@ -129,25 +130,52 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
     Raises
     ------
     PhotoplanError
-        The first input that cannot be used at all.
+        An input of all images, or every image, cannot be used. One of several images has a fault instead.
     """
     names = project.select(images)
     ground = ground_of(project)
     looked: dict[int, tuple[JudgedView | None, ImagePlausibility, ImageCheck]] = {}
+    failed: dict[int, InputError] = {}
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
-        view, found = judged(project, project.any_image(names[place]), ground)
-        looked[place] = view, found, _check_image(project, ground, found)
-    views, looks, checks = zip(*(looked[place] for place in range(len(names))))
+        try:
+            view, found = judged(project, project.any_image(names[place]), ground)
+            looked[place] = view, found, _check_image(project, ground, found)
+        except InputError as error:
+            failed[place] = error
+    if not looked:
+        raise next(iter(failed.values()))
+    views, looks, good = zip(*(looked[place] for place in sorted(looked)))
+    known = [names[place] for place in sorted(looked)]
+    checks = tuple(
+        looked[place][2] if place in looked else _unusable(name, failed[place]) for place, name in enumerate(names)
+    )
     gsds = [c.gsd for c in checks if np.isfinite(c.gsd)]
     return ProjectCheck(
         images=checks,
         sensible_resolution=two_figures(float(np.mean(gsds))) if gsds else float("nan"),
         heights=(*ground.height_systems, ground.working_system),
         crs=project.crs,
-        alternative=reading_of_block(project, dict(zip(names, zip(views, looks))), ground),
-        angles=any(view is not None for view, check in zip(views, checks) if check.fault),
-        advice=_advice(project, checks) + _of_objects(project, ground, names),
+        alternative=reading_of_block(project, dict(zip(known, zip(views, looks))), ground),
+        angles=any(view is not None for view, check in zip(views, good) if check.fault),
+        advice=_advice(project, good) + _of_objects(project, ground, known),
+    )
+
+
+def _unusable(name: str, error: InputError) -> ImageCheck:
+    """The line of an image that cannot be opened or used."""
+    nan = float("nan")
+    return ImageCheck(
+        image=name,
+        tilt_deg=nan,
+        gsd=nan,
+        footprint=(nan, nan),
+        on_terrain=nan,
+        relief_px=nan,
+        admissible_height_error=nan,
+        curvature_px=nan,
+        fault=f"cannot be used: {error}",
+        notes=(),
     )
 
 

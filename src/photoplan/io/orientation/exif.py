@@ -12,6 +12,7 @@ project's CRS with the convergence of meridians.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -55,27 +56,63 @@ def image_files(path: Path) -> list[Path]:
     return files
 
 
-def read_folder(path: Path) -> tuple[tuple[ImageMetadata, ...], tuple[str, ...]]:
-    """Metadata of the images of a folder, or of one image, that state a position, and names of those without a fix.
+@dataclass(frozen=True)
+class Folder:
+    """Images of a folder, or one image, by what they state."""
+
+    placed: tuple[ImageMetadata, ...]
+    """Those that state a position."""
+    count: int
+    """All images."""
+    notes: tuple[str, ...]
+    """Images that were left out, or parts of their metadata that are damaged."""
+
+
+def read_folder(path: Path) -> Folder:
+    """Metadata of the images of a folder, or of one image.
 
     Raises
     ------
     InputError
-        None does, or a file is damaged.
+        No image states a position, or a single image cannot be read.
     """
-    found = tuple(map(read_image_metadata, image_files(path)))
-    stated = tuple(m for m in found if m.position is not None)
+    files, found, unread = image_files(path), [], []
+    for file in files:
+        try:
+            found.append(read_image_metadata(file))
+        except InputError as error:
+            if len(files) == 1:
+                raise
+            unread.append(str(error).removeprefix(f"{path}/"))
+    notes = []
     unfixed = tuple(m.file.name for m in found if m.no_fix)
+    damaged = tuple(f"{m.file.name}: {fault}" for m in found for fault in m.faults)
+    lost = sum(m.position is None and not m.no_fix and not m.faults for m in found)
+    for many, what in (
+        (unread, "cannot be used and are left out"),
+        (damaged, "have damaged metadata, which are left out"),
+    ):
+        if many:
+            notes.append(f"{path.name}: {len(many)} of {len(files)} images {what}: {listed(many)}")
+    if unfixed:
+        notes.append(f"{path.name}: {without_fix(unfixed)}; left out")
+    if lost:
+        notes.append(f"{path.name}: {lost} images state no position; left out")
+    stated = tuple(m for m in found if m.position is not None)
     if not stated:
         raise InputError(
-            f"{path}: no image states a GPS position (latitude, longitude and altitude)"
-            + (f"; {without_fix(unfixed)}" if unfixed else "")
+            "; ".join([f"{path}: no image states a GPS position (latitude, longitude and altitude)", *notes])
         )
     datums = {m.datum.upper().replace(" ", "").replace("-", "") for m in stated if m.datum}
     other = sorted(d for d in datums if not d.startswith("WGS84"))
     if other:
         raise InputError(f"{path}: positions refer to the datum {other[0]}; only WGS 84 is read from EXIF")
-    return stated, unfixed
+    return Folder(stated, len(files), tuple(notes))
+
+
+def listed(texts: Sequence[str]) -> str:
+    """The first texts of many."""
+    return "; ".join(texts[:3]) + (" …" if len(texts) > 3 else "")
 
 
 def without_fix(names: Sequence[str]) -> str:
@@ -105,8 +142,8 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     InputError
         No image states position and attitude, or a file is damaged.
     """
-    files = image_files(path)
-    stated, unfixed = read_folder(path)
+    folder = read_folder(path)
+    stated = folder.placed
     oriented = [m for m in stated if m.yaw_pitch_roll is not None and m.position is not None]
     if not oriented:
         raise InputError(
@@ -120,9 +157,8 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         posed(m.file.name, at, R @ rotation_from_gimbal(m.yaw_pitch_roll or (0, 0, 0)), m.camera if several else None)
         for m, at, R in zip(oriented, enu, axes)
     )
-    lost = len(files) - len(oriented) - len(unfixed)
-    notes = [f"{path.name}: {without_fix(unfixed)}; left out"] if unfixed else []
-    notes += [f"{path.name}: {lost} images state no position or attitude; left out"] if lost else []
+    notes, lost = list(folder.notes), len(stated) - len(oriented)
+    notes += [f"{path.name}: {lost} images state no attitude; left out"] if lost else []
     turned = sum(m.display != 1 for m in oriented)
     if turned:
         notes.append(

@@ -264,9 +264,13 @@ def _number(key: str, value: float | str, where: str, file: Path) -> float:
 def _exif_time(file: Path, where: str) -> float:
     from photoplan.io.image_metadata import read_image_metadata  # noqa: PLC0415 - rarely needed
 
-    time = read_image_metadata(file).time
+    stated = read_image_metadata(file)
+    time = stated.time
     if time is None:
-        raise InputError(f"{where}: {file.name} holds no time in EXIF; give time_s, a field {{time}} or a table")
+        damaged = f" ({'; '.join(stated.faults)})" if stated.faults else ""
+        raise InputError(
+            f"{where}: {file.name} holds no time in EXIF{damaged}; give time_s, a field {{time}} or a table"
+        )
     return time
 
 

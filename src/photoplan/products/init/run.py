@@ -162,6 +162,8 @@ class InitResult:
     """Image files that no line of the orientation names; they are left out."""
     without_image: tuple[str, ...]
     """Names of the orientation that no image file has; they are left out."""
+    unusable: tuple[str, ...] = ()
+    """Why files could not be opened; they are left out."""
 
 
 def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line: None) -> InitResult:
@@ -194,7 +196,8 @@ def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line
 
 def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line: None) -> InitResult:
     """The project of the given files, without writing anything; see `init_project`."""
-    files = image_files(request.images)
+    infos, unusable = _readable(image_files(request.images))
+    files = list(infos)
     names = project_names(files)
     table = None
     if request.orientation is not None:
@@ -204,7 +207,6 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     lonely_files = [file for file in lonely_files if file not in own]
     if table is None:
         pairs, lonely_files = [(file, Unoriented(names[file])) for file in lonely_files], []
-    infos = {file: read_info(file) for file, _ in pairs}
     terrain, terrain_info = terrain_entry(request)
     places = [each.place for each in own.values()]
     place = next(iter(places), None)
@@ -214,6 +216,8 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     where = f"{crs_label(crs)} ({origin_of_crs})"
     for line in _summary(used, pairs, len(own), where, lonely_files, lonely_names, table):
         talk(line)
+    if unusable:
+        talk(f"  warning: left out, {len(unusable)} files cannot be read: {some(unusable)}")
     for file, each in own.items():
         if each.fault is not None:
             talk(f"  warning: {file.name}: {each.fault}")
@@ -247,7 +251,27 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
             )
         )
     project = _checked(request, terrain, *systems, crs, dict(used.values()), images)
-    return InitResult(request.path, project, tuple(f.name for f in lonely_files), tuple(lonely_names))
+    return InitResult(request.path, project, tuple(f.name for f in lonely_files), tuple(lonely_names), tuple(unusable))
+
+
+def _readable(files: Sequence[Path]) -> tuple[dict[Path, RasterInfo], list[str]]:
+    """Facts of the images that can be opened, and why others cannot.
+
+    Raises
+    ------
+    InputError
+        None can be opened.
+    """
+    infos: dict[Path, RasterInfo] = {}
+    unusable: list[str] = []
+    for file in files:
+        try:
+            infos[file] = read_info(file)
+        except InputError as error:
+            unusable.append(str(error))
+            if len(unusable) == len(files):
+                raise
+    return infos, unusable
 
 
 def _judge_area(
