@@ -198,7 +198,8 @@ class TestOverItsBody:
         ("optical_distortion", {"cahvor": {"coefficients": [0] * 5}}, "'cahvor' is not known; radial, transverse"),
         ("optical_distortion", {"lunarorbiter": {"perspective_x": 0}}, "'lunarorbiter' is not known"),
         ("optical_distortion", {"kaguyalism": {"x": [0] * 4}}, "'kaguyalism' is not known"),
-        ("optical_distortion", {"radial": {"coefficients": [-2.5e-5]}}, "has 1 numbers, not 3"),
+        ("optical_distortion", {"radial": {"coefficients": []}}, "has 0 numbers; 1 to 3 are known"),
+        ("optical_distortion", {"radial": {"coefficients": [0, 1e-5, 0, 1e-9]}}, "has 4 numbers; .* more must be 0"),
         ("optical_distortion", {"radtan": {"coefficients": [0.0, -1e9, 0, 0, 0]}}, "folds back"),
         ("optical_distortion", {"transverse": {"x": [0, 1] + [0] * 8}}, "transverse.y is missing"),
         ("jitter", {"lineExposureTimes": [0, 1]}, "one after the other"),
@@ -210,6 +211,22 @@ def test_what_is_wrong_in_a_file_is_named(entry: str, value: object, told: str) 
     with pytest.raises(InputError, match=told) as error:
         read(support_data("mercury_transverse") | {entry: value}, Path("some.json"))
     assert str(error.value).startswith("some.json: ")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
+def test_radial_coefficients_that_are_not_there_are_zero(count: int) -> None:
+    """As in usgscsm: the first is the constant part, then r² and r⁴."""
+    full = [-2.5e-3, 1e-5, -2e-9]
+    given = [*full, 0.0, 0.0][:count]
+    expected = [*full[:count], 0.0, 0.0][:3]
+    xy = np.stack(np.meshgrid([0.0, 300.0, 900.0], [10.0, 500.0]), axis=-1).reshape(-1, 2)
+    rays = [
+        read(
+            support_data("dione_radial") | {"optical_distortion": {"radial": {"coefficients": c}}}, Path("a.json")
+        ).frame.rays(xy)[1]
+        for c in (given, expected)
+    ]
+    np.testing.assert_array_equal(*rays)
 
 
 def test_a_camera_that_looks_away_is_refused() -> None:

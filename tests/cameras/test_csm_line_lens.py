@@ -55,6 +55,37 @@ def test_image_to_ground_and_back_are_those_of_the_reference_implementation(name
     assert back < 2e-9
 
 
+def turned_over(isd: dict[str, Any], tables: bool) -> dict[str, Any]:
+    """The support data of the image with its last line first; `tables`: those of poses run backwards, too."""
+    lines, (line, began, lasts) = isd["image_lines"], isd["line_scan_rate"][0]
+    found = isd | {"line_scan_rate": [[line, began + lasts * (lines + 1 - 2 * line), -lasts]]}
+    if tables:
+        for name in ("instrument_position", "instrument_pointing", "body_rotation"):
+            rows = ("ephemeris_times", "positions", "velocities", "quaternions", "angular_velocities")
+            entry = found[name]
+            found[name] = entry | {k: entry[k][::-1] for k in rows if k in entry}
+    return found
+
+
+@pytest.mark.parametrize("tables", [False, True])
+@pytest.mark.parametrize("name", ["kaguya_tc", "kaguya_mi"])
+def test_lines_may_run_backwards(name: str, tables: bool) -> None:
+    isd = support_data(name)
+    camera, other = camera_of(isd), camera_of(turned_over(isd, tables))
+    xy = np.loadtxt(DATA / f"{name}.points.txt")[:, 1::-1] - 0.5
+    flipped = np.column_stack([xy[:, 0], isd["image_lines"] - 1 - xy[:, 1]])
+    (S, d), (S_other, d_other) = camera.body_rays(xy), other.body_rays(flipped)
+    assert np.linalg.norm(d - d_other, axis=1).max() < 1e-6 * camera.look.pitch
+    assert np.abs(S - S_other).max() < 1e-5
+    ground = np.loadtxt(DATA / f"{name}.points.txt")[:, 3:6]
+    np.testing.assert_allclose(project(other, ground), flipped, atol=1e-5)
+    # A record that goes to and fro is refused.
+    table = isd["instrument_position"]["ephemeris_times"]
+    mixed = isd | {"instrument_position": isd["instrument_position"] | {"ephemeris_times": [table[1], *table[1:]]}}
+    with pytest.raises(InputError, match="neither rise nor fall throughout"):
+        camera_of(mixed)
+
+
 def distorted(kind: str, entries: dict[str, Any], base: str = "kaguya_tc") -> dict[str, Any]:
     return support_data(base) | {"optical_distortion": {kind: entries}}
 

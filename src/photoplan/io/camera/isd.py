@@ -116,26 +116,37 @@ class Isd:
         return found
 
     def moments(self, name: str) -> _Floats:
-        """Times of a table, seconds of the ephemeris."""
+        """Times of a table, seconds of the ephemeris; rising, in whichever direction the file states them."""
         found = self.numbers(f"{name}.ephemeris_times", (-1,))
-        if len(found) < 1 or not (np.diff(found) > 0).all():
-            raise InputError(f"{self._path}: the times of {name} do not grow")
-        return np.asarray(found)
+        steps = np.diff(found)
+        if len(found) < 1 or not ((steps > 0).all() or (steps < 0).all()):
+            raise InputError(f"{self._path}: the times of {name} neither rise nor fall throughout")
+        return np.sort(found)
+
+    def _of_moments(self, name: str, values: _Floats) -> _Floats:
+        """Rows of a table in the order of its `moments`."""
+        found = self.numbers(f"{name}.ephemeris_times", (-1,))
+        return values[::-1] if len(found) > 1 and found[0] > found[-1] else values
 
     def positions(self) -> tuple[_Floats, _Floats | None]:
         """Positions and velocities of the camera in the inertial frame, metres."""
         unit = self._unit("instrument_position")
-        positions = unit * self.numbers("instrument_position.positions", (len(self.moments("instrument_position")), 3))
+        count = len(self.moments("instrument_position"))
+        positions = self._of_moments(
+            "instrument_position", unit * self.numbers("instrument_position.positions", (count, 3))
+        )
         if len(positions) > 2 and (odd := odd_step(self.moments("instrument_position"), positions)) is not None:
             raise InputError(f"{self._path}: instrument_position: {odd}")
         stated = self.has("instrument_position.velocities")
-        speeds = unit * self.numbers("instrument_position.velocities", positions.shape) if stated else None
-        return positions, speeds
+        if not stated:
+            return positions, None
+        speeds = unit * self.numbers("instrument_position.velocities", positions.shape)
+        return positions, self._of_moments("instrument_position", speeds)
 
     def turns(self, name: str, t: _Floats) -> _Floats:
         """Quaternions (n, 4) from the inertial frame by a table and its constant rotation, at times (n,)."""
         moments = self.moments(name)
-        table = self.numbers(f"{name}.quaternions", (len(moments), 4))
+        table = self._of_moments(name, self.numbers(f"{name}.quaternions", (len(moments), 4)))
         length = np.linalg.norm(table, axis=1)
         if (np.abs(length - 1) > 1e-3).any():
             raise InputError(

@@ -38,7 +38,14 @@ def not_known(kind: str, known: list[str]) -> InputError:
 
 
 def _radial(isd: Isd, f: float) -> tuple[float, Lens]:
-    k0, k1, k2 = isd.coefficients("radial.coefficients", 3)
+    # As usgscsm reads them: the first is the constant part, and those that are not there are 0.
+    found = [float(v) for v in isd.numbers("optical_distortion.radial.coefficients", (-1,))]
+    if not found or any(found[3:]):
+        raise InputError(
+            f"optical_distortion.radial.coefficients has {len(found)} numbers; 1 to 3 are known (k0, k1, k2), and more "
+            "must be 0"
+        )
+    k0, k1, k2 = (*found, 0.0, 0.0)[:3]
     if not k0 < 1.0:
         raise InputError(f"radial distortion with a constant part of {k0:g}")
     # The constant part changes the scale of the image, and nothing else.

@@ -64,14 +64,22 @@ def _track(isd: Isd) -> LineTrack:
         raise InputError("instrument_pointing holds a single moment; a trajectory has two at least")
     q = times(isd.turns("body_rotation", when), conjugate(isd.turns("instrument_pointing", when)))
     even = np.linspace(when[0], when[-1], len(when))
-    courses = [EvenTable.over(t, fixed), EvenTable.over(even, continuous(between(when, q, even)))]
-    courses = [replace(each, start=each.start - isd.numbers("center_ephemeris_time", ())) for each in courses]
+    attitudes = continuous(between(when, q, even))
+    rows, began, lasts = _clock(isd)
+    centre = isd.numbers("center_ephemeris_time", ())
+    sense = -1.0 if (lasts < 0).all() else 1.0
+    if sense < 0:
+        # Later lines were taken earlier, as in images that were turned over. Poses belong to lines: time may run
+        # backwards, too.
+        t, fixed, even, attitudes = -t[::-1], fixed[::-1], -even[::-1], attitudes[::-1]
+    courses = [EvenTable.over(t, fixed), EvenTable.over(even, attitudes)]
+    courses = [replace(each, start=each.start - sense * centre) for each in courses]
     known = max(each.start for each in courses), min(each.end for each in courses)
     # Of attitudes there are two tables; where one has ended nothing is known (of a single value: it holds always).
     for name in ("instrument_pointing", "body_rotation"):
-        its = isd.moments(name) - isd.numbers("center_ephemeris_time", ())
+        its = np.sort(sense * (isd.moments(name) - centre))
         known = (max(known[0], its[0]), min(known[1], its[-1])) if len(its) > 1 else known
-    return LineTrack(isd.lines, *_clock(isd), courses[0], courses[1], known)
+    return LineTrack(isd.lines, rows, sense * began, sense * lasts, courses[0], courses[1], known)
 
 
 def _clock(isd: Isd) -> tuple[_Floats, _Floats, _Floats]:
