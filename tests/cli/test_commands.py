@@ -185,7 +185,7 @@ def test_info_knows_rasters_projects_plans_and_records(
     project = photoplan("info", pristine.project).out
     assert all(f"{name}: images/{name}.tif" in project for name in NAMES)
     record = json.loads(photoplan("info", undisturbed.folder / "one_ortho.run.json", "--json").out)
-    assert json.loads(record["settings"])["kernel"] == "bicubic"
+    assert record["settings"]["kernel"] == "bicubic"
     plan = tmp_path / "p.gpkg"
     assert photoplan("ortho", pristine.project, *OPTIONS, "--plan", plan).code == 0
     facts = json.loads(photoplan("info", plan, "--json").out)
@@ -218,9 +218,9 @@ def test_run_executes_a_plan_and_nothing_else(photoplan: Here, small: Block, und
     [
         ("a.tif", b"not a raster", "not a raster that is read here"),
         ("a.gpkg", b"SQLite format 3\0 no more", "not a plan of photoplan"),
-        ("a.json", b'{"a": 1}', "no run record of photoplan"),
-        ("a.json", b"{", "no readable JSON"),
-        ("deep.json", b"[" * 200_000, "no readable JSON"),
+        ("a.json", b'{"a": 1}', "neither a run record of photoplan"),
+        ("a.json", b"{", "not valid JSON"),
+        ("deep.json", b"[" * 200_000, "nested far too deep"),
         ("a.toml", b"= 3", "a.toml"),
         ("absent.tif", None, "no such file"),
     ],

@@ -15,8 +15,8 @@ from photoplan.cli.output import show, show_json
 @click.option("--plot", type=PATH, metavar="PICTURE", help="Draw a restoration filter as PNG.")
 @ending()
 def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool, quiet: bool) -> None:
-    """Show what FILE holds: a raster, a terrain model, a project, a plan, a run record or a restoration filter."""
-    from photoplan.products.describe import describe
+    """Show what FILE holds: any file that a command takes or makes, or a folder of images."""
+    from photoplan.products.describe import describe, readable
 
     if plot is not None:
         from photoplan.report.restore.filters import draw_filter
@@ -30,6 +30,7 @@ def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool, quiet
         return
     width = max(len(key) for key in facts)
     for key, value in facts.items():
+        value = readable(value)
         lines = value if isinstance(value, list) else [value]
         for i, line in enumerate(lines):
             show(f"{key if i == 0 else '':<{width}}  {line}")

@@ -2,31 +2,50 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from photoplan.errors import InputError
+from photoplan.errors import InputError, PhotoplanError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.appearance import looks_like
+from photoplan.io.balance_file import read_balance_file
 from photoplan.io.camera.csm_frame import is_frame, read_frame
+from photoplan.io.camera.file import read_cameras
+from photoplan.io.camera.line.correction import read_line_correction
 from photoplan.io.camera.line.file import describe_line, is_line
 from photoplan.io.camera.rpc.file import is_rpc, read_rpc, rpc_beside, rpc_in
+from photoplan.io.checks import raster_driver
+from photoplan.io.chromatic_file import read_chromatic
+from photoplan.io.fall_off_file import read_fall_off_entry
 from photoplan.io.filter_file import is_filter
+from photoplan.io.gcp_list import is_gcp_list, read_gcp_list
+from photoplan.io.ground_points import read_ground_points
+from photoplan.io.image_points import read_image_points
+from photoplan.io.mtf_file import read_mtf_table
+from photoplan.io.objects.file import read_objects
+from photoplan.io.observed_positions import read_observed_positions
+from photoplan.io.orientation.file import choose_format, read_orientation_block
+from photoplan.io.orientation.table import TableFormat
+from photoplan.io.plain_files import read_json, read_toml
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project.file import load_project
 from photoplan.io.project.image import ImageEntry
 from photoplan.io.raster import with_alpha_judged
 from photoplan.io.raster_info import RasterInfo, read_info
+from photoplan.io.sensor_file import read_sensor
+from photoplan.io.series.file import read_series
+from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.model_tables import GrossError
+from photoplan.io.vector_layer import layers_of, read_layer
 from photoplan.plain import pick
+from photoplan.products.simulate.form import stated_model
 from photoplan.project.filter_files import load_filter
 from photoplan.quality.restoration.borders import Convolution
 from photoplan.quality.restoration.filters import FilterKernel
@@ -69,11 +88,18 @@ def place_of(kernel: FilterKernel) -> str:
 def describe(path: Path) -> dict[str, Any]:
     """Facts of a file by name, as plain values; lists have a line each.
 
+    Parameters
+    ----------
+    path : Path
+        Any file that a command takes or makes; a folder of images or of a COLMAP model, too.
+
     Raises
     ------
     InputError
         The file is missing, damaged, or of no kind that is known.
     """
+    if path.is_dir():
+        return _oriented(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     kind = path.suffix.lower()
@@ -81,19 +107,187 @@ def describe(path: Path) -> dict[str, Any]:
         return {"file": str(path), **describe_line(path), **(read_rpc(path).describe() if is_rpc(path) else {})}
     if is_frame(path):
         return {"file": str(path), **read_frame(path).describe()}
-    if kind == ".csv" or (kind == ".toml" and is_filter(path)):
-        return describe_filter(path)
-    if kind == ".toml":
-        return _project(path)
     if is_terrain_model(path):
         return describe_model(ModelReader(path))
-    if kind == ".gpkg":
-        return _plan(path)
-    if kind == ".json":
-        return _record(path)
-    if is_rpc(path) or kind in (".xml", ".geom"):
+    if is_rpc(path) or kind == ".geom":
         return {"file": str(path), **read_rpc(path).describe()}
+    if kind == ".toml":
+        return _toml(path)
+    if kind == ".gpkg":
+        try:
+            return _plan(path)
+        except InputError:
+            if (found := _first(path, (_vectors,))) is None:
+                raise
+            return found
+    if kind == ".json" and (record := _record(path)) is not None:
+        return record
+    try:
+        raster_driver(path)
+    except InputError as not_a_raster:
+        found = _first(path, _READERS.get(kind, _TEXTS))
+        if found is None and kind == ".json":
+            raise InputError(
+                f"{path}: JSON of no kind that is known: neither a run record of photoplan nor orientations, cameras, "
+                f"objects or vectors{looks_like(path)}"
+            ) from None
+        if found is None:
+            raise not_a_raster from None
+        return found
     return _raster(with_alpha_judged(read_info(path)))
+
+
+def _first(path: Path, readers: Sequence[Callable[[Path], dict[str, Any]]]) -> dict[str, Any] | None:
+    """What the first reader that understands a file says of it; None: none does."""
+    for reader in readers:
+        try:
+            return reader(path)
+        except PhotoplanError:
+            continue
+    return None
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    """Facts of a TOML file of any kind."""
+    contents, _ = read_toml(path)
+    if "images" in contents:
+        try:
+            return _project(path)
+        except InputError:
+            # Orientations alone are images without files.
+            if (found := _first(path, (_oriented,))) is None:
+                raise
+            return found
+    if is_filter(path):
+        return describe_filter(path)
+    if "cameras" in contents:
+        return _cameras(path)
+    for title, read in _TOMLS.items():
+        try:
+            read(path)
+        except PhotoplanError:
+            continue
+        return {title: str(path), **contents}
+    raise InputError(
+        f"{path}: TOML of no kind that is known, with the entries {', '.join(list(contents)[:8]) or '(none)'}; known "
+        f"are projects, cameras, filters, {', '.join(_TOMLS)}"
+    )
+
+
+def readable(value: Any) -> Any:
+    """A value of a file as text; tables and lists of tables have a line for each entry, long ones their first lines."""
+    if isinstance(value, dict):
+        lines = [f"{name}: {_short(each)}" for name, each in value.items()]
+    elif isinstance(value, list):
+        lines = [_short(each) for each in value]
+        if not any(isinstance(each, dict | list) for each in value) and len(value) > _MOST_LINES:
+            return _short(value)
+    else:
+        return _short(value)
+    return lines if len(lines) <= _MOST_LINES else [*lines[: _MOST_LINES - 1], f"… {len(lines)} entries in all"]
+
+
+def _short(value: Any) -> str:
+    """A value in one line."""
+    if isinstance(value, dict):
+        text = ", ".join(f"{name} {_short(each)}" for name, each in value.items() if each not in (None, [], {}))
+    elif isinstance(value, list):
+        text = ", ".join(_short(each) for each in value[:6]) + (f" … ({len(value)})" if len(value) > 6 else "")
+    elif isinstance(value, bool) or value is None:
+        text = {True: "yes", False: "no", None: "none"}[value]
+    else:
+        text = f"{value:.10g}" if isinstance(value, float) else str(value)
+    text = text or "none"
+    return text if len(text) <= _MOST_LETTERS else text[: _MOST_LETTERS - 1] + "…"
+
+
+def _cameras(path: Path) -> dict[str, Any]:
+    found = read_cameras(path)
+    lines = []
+    for name, camera in found.cameras.items():
+        size = "size of each image" if camera.size is None else f"{camera.size[0]} × {camera.size[1]} pixels"
+        lines.append(f"{name}: {camera.type}, {size}, lens {camera.lens.type}")
+    return {"cameras": str(path), "count": len(lines), "list": lines}
+
+
+def _oriented(path: Path) -> dict[str, Any]:
+    form = choose_format(path, TableFormat())
+    block = read_orientation_block(path, format=form.name)
+    table = block.table
+    facts: dict[str, Any] = {
+        "orientations": str(path),
+        "format": form.title,
+        "images": f"{len(table.images)}: {', '.join(i.name for i in table.images[:3])}{' …' * (len(table.images) > 3)}",
+        "crs": "not stated" if table.crs is None else crs_label(table.crs),
+        "cameras": [f"{name}: {camera.type}, lens {camera.lens.type}" for name, camera in block.cameras.items()]
+        or "none",
+    }
+    return facts | ({"note": list(table.notes)} if table.notes else {})
+
+
+def _image_points(path: Path) -> dict[str, Any]:
+    points = read_image_points(path)
+    return {
+        "image points": str(path),
+        "measurements": f"{len(points)} of {len(points.points)} points in {len(points.images)} images",
+    }
+
+
+def _ground_points(path: Path) -> dict[str, Any]:
+    points = read_ground_points(path)
+    return {
+        "ground points": str(path),
+        "points": f"{len(points)}: {', '.join(points.names[:5])}",
+        "extent": _extent(points.XYZ),
+    }
+
+
+def _positions(path: Path) -> dict[str, Any]:
+    table = read_observed_positions(path)
+    return {"positions": str(path), "images": len(table.images), "extent": _extent(table.XYZ)}
+
+
+def _control_list(path: Path) -> dict[str, Any]:
+    if not is_gcp_list(path):
+        raise InputError(f"{path}: not a control list")
+    found = read_gcp_list(path)
+    return {
+        "control list": str(path),
+        "crs": crs_label(found.crs),
+        "points": f"{len(found.ground)}, measured {len(found.points)} times in {len(found.points.images)} images",
+    }
+
+
+def _measured(path: Path) -> dict[str, Any]:
+    found = read_measured([path])
+    counts = Counter(getattr(line, "kind", "lines") for line in found.lines)
+    return {
+        "terrain data": str(path),
+        "crs": "not stated" if found.crs is None else crs_label(found.crs),
+        "points": len(found.points),
+        "lines": readable(dict(counts)) if counts else "none",
+    }
+
+
+def _objects(path: Path) -> dict[str, Any]:
+    found = read_objects(path)
+    return {"objects": str(path), "count": len(found.names), "triangles": len(found.corners)}
+
+
+def _vectors(path: Path) -> dict[str, Any]:
+    lines = []
+    for name in layers_of(path):
+        layer = read_layer(path, name)
+        kinds = Counter("no geometry" if shape is None else shape.geom_type for shape in layer.shapes)
+        told = ", ".join(f"{count} {kind}" for kind, count in kinds.items()) or "empty"
+        fields = ", ".join(list(layer.fields)[:8]) or "none"
+        lines.append(f"{name}: {told}; fields {fields}; {'no CRS' if layer.crs is None else crs_label(layer.crs)}")
+    return {"vectors": str(path), "layers": lines or "none"}
+
+
+def _extent(XYZ: Any) -> str:
+    low, high = np.nanmin(XYZ, axis=0), np.nanmax(XYZ, axis=0)
+    return ", ".join(f"{name} {a:.3f} to {b:.3f}" for name, a, b in zip("XYZ", low, high))
 
 
 def _project(path: Path) -> dict[str, Any]:
@@ -129,16 +323,12 @@ def _plan(path: Path) -> dict[str, Any]:
     }
 
 
-def _record(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: no readable JSON ({error}){looks_like(path)}") from None
-    if not isinstance(content, dict) or "product" not in content:
-        raise InputError(f"{path}: no run record of photoplan{looks_like(path)}")
-    return {
-        str(key): value if isinstance(value, (str, int, float)) else json.dumps(value) for key, value in content.items()
-    }
+def _record(path: Path) -> dict[str, Any] | None:
+    """Facts of a run record; None: the file is another JSON."""
+    content = read_json(path)
+    if not isinstance(content, dict) or not {"key", "versions"} <= content.keys():
+        return None
+    return {"run record": str(path), **content}
 
 
 def _raster(info: RasterInfo) -> dict[str, Any]:
@@ -332,3 +522,62 @@ def dtm_info(path: Path) -> TerrainFacts:
 def _flagged(g: GrossError) -> dict[str, Any]:
     x, y, z = g.xyz
     return {"x": x, "y": y, "z": z, **pick(g, "name", "kind", "residual", "redundancy", "normalised")}
+
+
+#: Lines of a table and letters of a line that are printed.
+_MOST_LINES, _MOST_LETTERS = 24, 160
+#: A table of larger numbers without a header holds coordinates.
+_LARGEST_WEIGHT = 1000.0
+#: Readers of TOML files that are neither projects nor cameras nor filters.
+_TOMLS: dict[str, Callable[[Path], Any]] = {
+    "balance": read_balance_file,
+    "fall-off": read_fall_off_entry,
+    "chromatic displacements": read_chromatic,
+    "sensor": read_sensor,
+    "series": read_series,
+    "corrections of a line camera": read_line_correction,
+    "image formation": lambda path: stated_model(path, None, None),
+}
+
+
+def _filter(path: Path) -> dict[str, Any]:
+    if max(float(np.abs(kernel.values).max()) for kernel in load_filter(path).kernels) > _LARGEST_WEIGHT:
+        raise InputError(f"{path}: not a filter but a table of numbers")
+    return describe_filter(path)
+
+
+def _mtf(path: Path) -> dict[str, Any]:
+    read_mtf_table(path)
+    return {"modulation transfer": str(path)}
+
+
+#: Readers of texts without a mark of their own, in the order in which they are tried.
+_TEXTS = (
+    _filter,
+    _control_list,
+    _oriented,
+    _cameras,
+    _image_points,
+    _ground_points,
+    _positions,
+    _mtf,
+    _measured,
+    _vectors,
+)
+_READERS: dict[str, Sequence[Callable[[Path], dict[str, Any]]]] = {
+    ".json": (_oriented, _cameras, _objects, _vectors),
+    ".xml": (_oriented, _cameras, _measured),
+    ".yaml": (_cameras,),
+    ".yml": (_cameras,),
+    ".cam": (_cameras,),
+    ".bin": (_oriented, _cameras),
+    ".obj": (_objects,),
+    ".ply": (_objects,),
+    ".las": (_measured,),
+    ".laz": (_measured,),
+    ".geojson": (_vectors,),
+    ".shp": (_vectors,),
+    ".dxf": (_vectors,),
+    ".fgb": (_vectors,),
+    ".kml": (_vectors,),
+}
