@@ -34,7 +34,9 @@ from photoplan.cli.output import show, show_json, talking
 @click.option("--orientation-height-system", metavar="NAME", help="The orientation's alone.")
 @reading_options
 @click.option(
-    "--earth-curvature", type=click.Choice(["none", "correction", "strict"]), default="none", show_default=True
+    "--earth-curvature",
+    type=click.Choice(["none", "correction", "strict"]),
+    help="Curved earth and map scale [strict for poses in true metres, such as OpenSfM's; else none].",
 )
 @click.option(
     "--scene",

@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 
 from photoplan.cameras.base import Camera, tremor_told, tremors_of
+from photoplan.cameras.base import project as image_points
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
+from photoplan.io.project.cameras import image_size
 from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.orientation.plausibility import ImagePlausibility, JudgedView
 from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint, footprint, mean_gsd
@@ -21,11 +24,12 @@ from photoplan.products.judged import against_files, judged, reading_of_block
 from photoplan.products.orthophoto.look import heights_in_feet, two_figures
 from photoplan.project.cameras import camera_without_pixels, is_there
 from photoplan.project.ground import Ground, ground_of
+from photoplan.project.posed import posed_camera
 from photoplan.project.scene import map_order, open_scene
 from photoplan.surfaces.intersect import intersect
 
-#: Terrain displacements of curvature above this deserve a strict model, pixels.
-_CURVATURE_MATTERS = 0.3
+#: Displacements by the choice of earth curvature above this are reported, pixels.
+_CHOICE_MATTERS = 0.1
 
 #: Pixels that are so many times longer than wide on the ground are none of a scanner.
 _LONGEST = 50.0
@@ -54,6 +58,8 @@ class ImageCheck:
     """Largest displacement in the image by an error of 1 m in height, pixels (Behr 1989, section 6.1.2)."""
     admissible_height_error: float
     """Height error that displaces the most sensitive point by one pixel, metres (Behr 1989, fig. 6.4)."""
+    choice_px: float
+    """Largest displacement between `earth_curvature` none and strict, pixels; NaN: there is no choice."""
     curvature_px: float
     """Largest displacement by the earth's curvature if it were ignored, pixels (Ecker 1991, eq. 4.17)."""
     fault: str | None
@@ -214,6 +220,7 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
             on_terrain=seen.on_surface,
             relief_px=nan,
             admissible_height_error=nan,
+            choice_px=nan,
             curvature_px=nan,
             fault=fault,
             notes=notes,
@@ -237,6 +244,7 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
         on_terrain=_on_terrain(camera, ground, seen),
         relief_px=relief,
         admissible_height_error=1 / relief if relief > 0 else nan,
+        choice_px=_choice(project, name, ground, seen),
         curvature_px=curvature,
         fault=fault,
         notes=notes,
@@ -287,13 +295,35 @@ def _sensitivity(camera: Camera, seen: Footprint) -> tuple[float, float]:
     return float(np.nanmax(per_metre)), float(np.nanmax(per_metre * drop))
 
 
+def _choice(project: Project, name: str, ground: Ground, seen: Footprint) -> float:
+    """Largest distance between an image's points by `earth_curvature` none and by strict, over the footprint; pixels.
+
+    Heights are taken as they are: an undulation of 100 m changes the scale by 2e-5.
+    """
+    image = project.any_image(name)
+    points = seen.outline[np.isfinite(seen.outline).all(axis=1)]
+    if not isinstance(image, Image) or not len(points):
+        return float("nan")
+    stated = project.orientation.earth_curvature
+    found = []
+    for curvature in ("strict", stated if stated != "strict" else "none"):
+        orientation = project.orientation.model_copy(update={"earth_curvature": curvature})
+        size = image_size(project.cameras[image.camera], image)
+        camera = posed_camera(project.model_copy(update={"orientation": orientation}), image, ground, size)
+        found.append(image_points(camera, points))
+    return float(np.nanmax(np.linalg.norm(found[0] - found[1], axis=1), initial=0.0))
+
+
 def _advice(project: Project, checks: Sequence[ImageCheck]) -> tuple[str, ...]:
     lines = list(against_files(project, [check.image for check in checks]))
-    curvature = np.nanmax([c.curvature_px for c in checks] + [0.0])
-    if project.orientation.earth_curvature == "none" and curvature > _CURVATURE_MATTERS:
+    choice = float(np.nanmax([c.choice_px for c in checks] + [0.0]))
+    if choice > _CHOICE_MATTERS:
+        stated = project.orientation.earth_curvature
         lines.append(
-            f"the earth's curvature displaces up to {curvature:.1f} px: if the orientation was computed with it, "
-            'set earth_curvature = "strict" in [orientation]'
+            f"earth_curvature {stated} in [orientation] displaces image points by up to {choice:.2g} px against "
+            f"{'none' if stated == 'strict' else 'strict'} (map scale and curvature): none is right for orientations "
+            "adjusted in map coordinates (PATB, BINGO, Inpho, Pix4D), strict for those computed in true metres "
+            "(OpenSfM, ODM, Metashape)"
         )
     if not any(check.fault for check in checks) and (colours := colour_advice(project, [c.image for c in checks])):
         lines.append(colours)

@@ -50,6 +50,9 @@ from photoplan.products.init.run import placed
 from photoplan.products.judged import differences, on_map, stated_positions
 from photoplan.project.cameras import is_there
 
+#: Formats whose poses are read as those of a system in true metres.
+_CARTESIAN = ("colmap", "metashape", "odm", "opensfm", "opk")
+
 
 @dataclass(frozen=True)
 class ConvertRequest:
@@ -124,6 +127,11 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
         block = with_cameras(block, request.camera)
     block = replace(_in_crs(_with_axes(block, request), request.crs), matrix=request.matrix)
     outside = _judged_area(block.table, request.beyond_area)
+    if block.table.true_metres and target.name not in _CARTESIAN:
+        outside += (
+            f"the poses are in true metres, and {target.name} does not say so: use them with earth_curvature strict "
+            "(`photoplan init` with `earth_curvature`)",
+        )
     output = request.output or _beside(request.orientation, target.name, target.suffix)
     block = _files_from(block, output if not target.suffix else output.parent)
     block, lost = _without_lost_lenses(block, target.losses(block), request)
@@ -237,7 +245,7 @@ def _in_crs(block: OrientationBlock, crs: str | None) -> OrientationBlock:
     centers, opk = placed(table, crs, table.height_system or "same")
     if centers is not table.centers:
         table = _with_poses(table, centers, opk)
-    return replace(block, table=replace(table, crs=crs, crs_file=None, origin=None))
+    return replace(block, table=replace(table, crs=crs, crs_file=None, origin=None, true_metres=block.table.cartesian))
 
 
 def _beside(path: Path, name: str, suffix: str) -> Path:

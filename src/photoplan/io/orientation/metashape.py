@@ -119,6 +119,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         path,
         images,
         crs=placing.crs,
+        true_metres=placing.crs is not None,
         height_system=heights,
         origin=placing.origin,
         positions=_geodetic(np.array(references), chunk, path),

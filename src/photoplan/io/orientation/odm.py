@@ -52,7 +52,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         notes.append(f"{path.name}: cameras from {file}")
     else:
         notes.append(f"{path.name}: states focal lengths but no lens; the project's cameras.json describes the cameras")
-    table = OrientationTable(path, tuple(s[1] for s in shots), crs=crs, notes=tuple(notes))
+    table = OrientationTable(path, tuple(s[1] for s in shots), crs=crs, true_metres=True, notes=tuple(notes))
     return OrientationBlock(table, cameras, sizes={s[1].name: s[0] for s in shots} if not cameras else {})
 
 

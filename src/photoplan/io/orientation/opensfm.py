@@ -312,6 +312,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         path,
         images,
         crs=world.crs,
+        true_metres=world.crs is not None,
         origin=origin if world.crs is None else None,
         positions=geodetic_of_enu(origin, shots.gps) if known else None,
         notes=tuple(notes),

@@ -57,7 +57,14 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         if is_wgs84_geographic(crs, f"{path}: CoordinateSystem"):
             return OrientationBlock(_in_tangential_system(OrientationTable(path, tuple(images), notes=tuple(notes))))
     return OrientationBlock(
-        OrientationTable(path, tuple(images), crs=crs, height_system=height_system, notes=tuple(notes))
+        OrientationTable(
+            path,
+            tuple(images),
+            crs=crs,
+            height_system=height_system,
+            true_metres=crs is not None,
+            notes=tuple(notes),
+        )
     )
 
 

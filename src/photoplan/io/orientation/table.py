@@ -116,6 +116,9 @@ class OrientationTable:
     origin: tuple[float, float, float] | None = None
     """Latitude, longitude (degrees, WGS 84) and height of a local tangential system (east, north, up), where positions
     and rotations refer to one; None where they refer to `crs`."""
+    true_metres: bool = False
+    """Whether the poses were computed in a Cartesian system of true metres (geocentric, or about a point) and brought
+    into `crs` place by place; else they were adjusted in map coordinates, whose scale and curvature they absorbed."""
     positions: NDArray[np.float64] | None = None
     """Latitude, longitude (degrees, WGS 84) and height that a receiver measured, shape (n, 3), where the file states
     them beside the poses; NaN for images without. They were not used to place the poses."""
@@ -138,6 +141,11 @@ class OrientationTable:
             if odd is not None:
                 line = f":{image.line}" if image.line is not None else ""
                 raise InputError(f"{self.file}{line}: image {image.name!r}: {odd}")
+
+    @property
+    def cartesian(self) -> bool:
+        """Whether the poses are right in true metres, so that ground of the map needs `earth_curvature` strict."""
+        return self.true_metres or self.origin is not None
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:

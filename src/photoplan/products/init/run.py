@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import HeightSystemError, InputError, UsageError
 from photoplan.geometry.bounds import area_fault, area_note
 from photoplan.geometry.crs import crs_label, crs_step
 from photoplan.geometry.frames import triple
-from photoplan.geometry.heights import height_label
+from photoplan.geometry.heights import height_label, height_step
+from photoplan.geometry.local import LocalFrame
 from photoplan.io.camera.file import CameraFile, read_cameras
 from photoplan.io.camera.model import CameraEntry, Triple
 from photoplan.io.camera.opensfm import resized
@@ -128,8 +129,8 @@ class InitRequest:
     """What the orientation file does not say of itself."""
     format: str | None = None
     """Format of the orientation file; None: by its content."""
-    earth_curvature: str = "none"
-    """none, correction or strict."""
+    earth_curvature: str | None = None
+    """none, correction or strict; None: strict for poses that were computed in true metres, else none."""
     refraction: bool = False
     """Whether image points are corrected for refraction."""
     scene: str = "z < 0"
@@ -250,6 +251,10 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
                 size=size,
             )
         )
+    curvature = request.earth_curvature or "none"
+    if request.earth_curvature is None and table is not None and table.cartesian:
+        curvature = _in_true_metres(table, systems, crs, np.array([p[0] for p in poses.values()], float), talk)
+    request = replace(request, earth_curvature=curvature)
     project = _checked(request, terrain, *systems, crs, dict(used.values()), images)
     return InitResult(request.path, project, tuple(f.name for f in lonely_files), tuple(lonely_names), tuple(unusable))
 
@@ -272,6 +277,31 @@ def _readable(files: Sequence[Path]) -> tuple[dict[Path, RasterInfo], list[str]]
             if len(unusable) == len(files):
                 raise
     return infos, unusable
+
+
+def _in_true_metres(
+    table: OrientationTable,
+    systems: tuple[str | None, str],
+    crs: str,
+    centers: NDArray[np.float64],
+    talk: Callable[[str], None],
+) -> str:
+    """The earth curvature of poses in true metres: strict, unless heights cannot be brought onto the ellipsoid."""
+    X, Y = centers[:, :2].mean(axis=0).tolist()
+    scale = float(LocalFrame(crs, (X, Y)).scale(np.array([X, Y])))
+    metre = f"1 m on the ground is {scale:.5f} m of the map"
+    if systems[1] != "same":
+        try:
+            for system in {system for system in systems if system is not None}:
+                height_step(system, "ellipsoidal", crs)(centers)
+        except HeightSystemError as error:
+            talk(
+                f"  warning: earth_curvature none, though the poses of {table.file.name} are in true metres ({metre}, "
+                f"so images are off by up to {1000 * abs(1 - scale):.2g} px per 1000 px from their middle): {error}"
+            )
+            return "none"
+    talk(f"  earth_curvature strict: the poses of {table.file.name} are in true metres ({metre})")
+    return "strict"
 
 
 def _judge_area(
