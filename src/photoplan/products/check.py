@@ -179,6 +179,7 @@ def _unusable(name: str, error: InputError) -> ImageCheck:
         on_terrain=nan,
         relief_px=nan,
         admissible_height_error=nan,
+        choice_px=nan,
         curvature_px=nan,
         fault=f"cannot be used: {error}",
         notes=(),
