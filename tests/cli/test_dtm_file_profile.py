@@ -62,7 +62,9 @@ def test_straight_between_points_is_the_surface(photoplan: Here, model: Path, li
         # Away from points with two heights, where the table jumps.
         clear = np.abs(at[:, None] - d).min(axis=1) > 0.01
         assert np.allclose(np.interp(at, d, z)[clear], surface.heights(XY)[clear], atol=0.0025, equal_nan=True)
-        assert np.nanmax(points[:, 4]) == pytest.approx(0.05)
+        off = np.abs(points[:, 4] - surface.sigmas(points[:, 1:3]))
+        assert np.nanmax(off) < 1e-4
+        assert np.nanmax(points[:, 4]) >= 0.05 - 1e-9
 
 
 def test_a_wall_has_two_heights_at_one_place(photoplan: Here, model: Path, lines: Path, tmp_path: Path) -> None:

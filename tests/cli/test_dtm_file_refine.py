@@ -7,12 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+import shapely
+from rasterio.transform import from_origin
 from tools.command import Here
 from tools.recorded import recorded
 from tools.small_model import LAYOUT, grid_unit, hills, parts, write_units_of
 
 from photoplan.io.terrain.model_read import ModelReader
 from photoplan.io.terrain.model_tables import GrossError
+from photoplan.project.open_terrain import open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.units import LineElement, UnitLayout
 
@@ -58,9 +62,8 @@ def test_fine_inside_coarse_outside_joined_between(
     xmin, ymin, xmax, ymax = INNER
     inwards = np.minimum.reduce([XY[:, 0] - xmin, xmax - XY[:, 0], XY[:, 1] - ymin, ymax - XY[:, 1]])
     z = surface.heights(XY)
-    # Away from the polygon by a unit's finer posts nothing is new; beside it only the grid is finer.
-    assert np.abs(z - before.heights(XY))[inwards < -60].max() < 1e-4
-    assert np.abs(z - hills(*XY.T))[inwards < 0].max() < 0.08
+    # Outside nothing changes but by the single precision of the posts.
+    assert np.abs(z - before.heights(XY))[inwards < 0].max() < 2e-5
     assert np.abs(z - raised(*XY.T))[inwards > BAND + 1.8].max() < 0.01
     t = np.clip(inwards / BAND, 0, 1)
     expected = hills(*XY.T) + BUMP * t * t * (3 - 2 * t)
@@ -149,3 +152,67 @@ def test_fault_02_height_systems(photoplan: Here, files: tuple[Path, Path, Path]
     assert said.code == 3 and "other.gpkg: no height system stated" in said.err
     said = photoplan("dtm", "refine", coarse, other, *words, "--height-system", "same")
     assert said.code == 0 and ModelReader(tmp_path / "o.gpkg").header.height_system == "EPSG:5773"
+
+
+def ridge(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
+    return np.asarray(100 + 0.02 * (X - 500_000) + 8 * np.exp(-(((Y - 5_400_500) / 25) ** 2)))
+
+
+def grid_file(path: Path, left: float, top: float, step: float, columns: int, rows: int) -> Path:
+    """A raster whose posts, the middles of its cells, begin at left, top."""
+    X, Y = np.meshgrid(left + step * np.arange(columns), top - step * np.arange(rows))
+    place = from_origin(left - step / 2, top + step / 2, step, step)
+    shape = {"width": columns, "height": rows, "count": 1, "dtype": "float32"}
+    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:32632", transform=place, **shape) as file:
+        file.write(ridge(X, Y).astype("float32"), 1)
+    return path
+
+
+@pytest.mark.parametrize("ratio", [3, 5, 10])
+def test_rasters_are_refined_by_whole_numbers_and_nothing_changes_outside(
+    photoplan: Here, tmp_path: Path, ratio: int
+) -> None:
+    """Behr 1989, section 6.1: a grid of 50 m whose meshes are divided inside a polygon."""
+    coarse = grid_file(tmp_path / "coarse.tif", 500_000, 5_401_000, 50.0, 21, 21)
+    step = 50.0 / ratio
+    fine = grid_file(tmp_path / "fine.tif", 500_150, 5_400_700, step, 14 * ratio + 1, 8 * ratio + 1)
+    area = shapely.Polygon([(500_195, 5_400_420), (500_800, 5_400_405), (500_770, 5_400_610), (500_230, 5_400_580)])
+    where = tmp_path / "where.geojson"
+    geometry = json.loads(shapely.to_geojson(area))
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32632"}}
+    content = {"type": "Feature", "properties": {}, "geometry": geometry}
+    where.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": [content]}))
+    out = tmp_path / "refined.gpkg"
+    said = photoplan(
+        "dtm", "refine", coarse, fine, "--polygons", where, "--transition", 30, "--height-system", "same", "-o", out
+    )
+    assert said.code == 0, said.err
+    reader = ModelReader(out)
+    assert reader.finest == pytest.approx(step, abs=1e-9)
+    XY = np.random.default_rng(3).uniform([500_001, 5_400_001], [500_999, 5_400_999], (20_000, 2))
+    after = HybridSurface(reader).heights(XY)
+    before, finer = (open_terrain(path).surface.heights(XY) for path in (coarse, fine))
+    outside = ~shapely.contains_xy(area, XY)
+    deep = shapely.contains_xy(area.buffer(-30 - 1.5 * step), XY)
+    assert np.abs(after - before)[outside].max() < 2e-5  # single precision
+    assert np.abs(after - finer)[deep].max() < 2e-5
+    assert deep.sum() > 500 and np.abs(before - finer)[deep].max() > 1
+
+
+def test_a_model_is_refined_by_a_raster(photoplan: Here, files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    coarse, _, where = files
+    X, Y = np.meshgrid(500_030 + np.arange(81.0), 5_299_980 - np.arange(61.0))
+    fine = tmp_path / "fine.tif"
+    place = from_origin(500_029.5, 5_299_980.5, 1, 1)
+    shape = {"width": 81, "height": 61, "count": 1, "dtype": "float32"}
+    with rasterio.open(fine, "w", driver="GTiff", crs="EPSG:32633", transform=place, **shape) as file:
+        file.write(raised(X, Y).astype("float32"), 1)
+    out = tmp_path / "refined.gpkg"
+    words = ("--transition", BAND, "--height-system", "same", "-o", out)
+    said = photoplan("dtm", "refine", coarse, fine, "--polygons", where, *words)
+    assert said.code == 0, said.err
+    XY = np.random.default_rng(1).uniform([500_055, 5_299_945], [500_085, 5_299_955], (200, 2))
+    surface = HybridSurface(ModelReader(out))
+    assert np.abs(surface.heights(XY) - raised(*XY.T)).max() < 0.02
+    assert np.isnan(surface.sigmas(XY)).all()  # a raster states none
+    assert np.isfinite(surface.sigmas([(500_010.0, 5_299_890.0)])).all()

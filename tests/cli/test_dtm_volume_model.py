@@ -97,5 +97,7 @@ def test_monoplotting_on_a_model_takes_its_standard_deviations(small, tmp_path, 
         assert said.code == 0, said.err
         assert json.loads(said.out)["met"] == 2 and json.loads(said.out)["notes"] == []
         tables.append(np.genfromtxt(out, delimiter=",", skip_header=1, usecols=range(2, 8)))
-    np.testing.assert_allclose(tables[0], tables[1], atol=2e-4)
+    np.testing.assert_allclose(tables[0][:, :3], tables[1][:, :3], atol=2e-4)
+    # The model's posts were given 0.1 m; between them its meshes do not follow the hills.
+    assert (np.abs(tables[1][:, 3:] / tables[0][:, 3:] - 1) < 0.05).all()
     assert (tables[0][:, 5] > 0.09).all()

@@ -35,24 +35,30 @@ def predicted(
     models: NDArray[np.float64] | None = None,
     shares: NDArray[np.float64] | None = None,
     squares: NDArray[np.float64] | None = None,
+    lost: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Height, sigma, nearest distance and roughness (t, 4); a patch is asked for what lies within its reach."""
+    """Height, sigma, distance, roughness, lost variance (t, 5); a patch is asked for what lies within its reach."""
     p, t = len(leaves), len(targets)
     if models is None:
         models = np.tile(np.array([family, VARIANCE, LENGTH, GAP]), (p, 1, 1))
     if shares is None:
         shares = np.ones(models.shape[:2]) / models.shape[1]
-    sums = np.zeros((t, 5))
+    sums = np.zeros((t, 6))
     sums[:, 3] = np.inf
     reached = [np.flatnonzero(np.abs(targets - leaf[:2]).max(axis=1) < 1.5 * leaf[2]) for leaf in leaves]
     wanted, start = np.concatenate(reached), np.concatenate([[0], np.cumsum([len(r) for r in reached])])
-    about = np.full(len(xyz), np.nan) if squares is None else squares, USUAL
+    about = (
+        np.full(len(xyz), np.nan) if squares is None else squares,
+        np.zeros(len(xyz)) if lost is None else lost,
+        USUAL,
+    )
     ids = np.ascontiguousarray(ids)
     failed = predict(
         xyz, noise, ids, leaves, targets, wanted, start, *stacked(list(lines)), models, shares, *about, sums
     )
     assert failed == 0
-    return np.column_stack([sums[:, 0] / sums[:, 1], sums[:, 2] / sums[:, 1], sums[:, 3], sums[:, 4] / sums[:, 1]])
+    mean = sums / sums[:, 1:2]
+    return np.column_stack([mean[:, 0], mean[:, 2], sums[:, 3], mean[:, 4:]])
 
 
 USUAL = np.array([1.1, 3.0, 2.5])

@@ -18,6 +18,7 @@ from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose
 from photoplan.io.project.file import load_project, parse_project
 from photoplan.io.project.model import StatedTerrain
+from photoplan.io.terrain.model_read import ModelReader
 from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.products.adjust.block import adjust_prepared, map_result, prepare, stated_accuracy
 from photoplan.products.adjust.inputs import read_inputs
@@ -28,6 +29,7 @@ from photoplan.project.scene import input_files
 from photoplan.project.scenes import ScenesAddress
 from photoplan.project.uncertain import ScenesErrors, height_errors, source_errors
 from photoplan.surfaces.height_errors import StatedHeightErrors
+from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
 
 
@@ -147,7 +149,9 @@ def test_terrain_states_its_own(tmp_path) -> None:
     target = MapTarget(MapGrid(500_000.0, 5_300_000.0, 2.0, 20, 20, CRS))
     of_file = StatedTerrain(file="model.gpkg", height_system="same")
     own = height_errors(loaded.model_copy(update={"terrain": of_file}))(target, target.window)
-    np.testing.assert_allclose(own, 0.05, rtol=1e-6)
+    surface = HybridSurface(ModelReader(tmp_path / "model.gpkg"))
+    np.testing.assert_array_equal(own, surface.relief_with_sigma(target, target.window)[1])
+    assert own.min() >= 0.05 and own.max() < 0.06  # posts of the model, and what is between them
     stated = height_errors(loaded.model_copy(update={"terrain": of_file.model_copy(update={"sigma": 0.3})}))
     assert (stated(target, target.window) == 0.3).all()
 

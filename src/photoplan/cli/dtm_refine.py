@@ -18,13 +18,15 @@ from photoplan.cli.output import say, show, show_json
               help="Width of the band inside the polygons in which the two are joined.")  # fmt: skip
 @click.option("--width", type=POSITIVE, metavar="M",
               help="Largest grid width inside the polygons [the fine model's finest].")  # fmt: skip
+@click.option("--crs", metavar="EPSG", help="CRS of rasters that state none.")
 @click.option("--height-system", metavar="same", help="Declare that both models have the same height system.")
 @click.option("-o", "--output", type=PATH, required=True, metavar="MODEL", help="The new model, a .gpkg.")
 @ending()
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
-    """Write the model COARSE with the model FINE inside polygons, joined without a step.
+    """Write the terrain COARSE with the terrain FINE inside polygons, joined without a step.
 
-    Inside a band along the polygons' border the difference of the two is blended in; outside nothing changes.
+    Both are terrain models or rasters of heights. Each mesh is divided by a whole number. Inside a band along the
+    polygons' border the difference of the two is blended in; outside nothing changes.
     """
     from photoplan.io.run_record import recording
     from photoplan.products.dtm.refine import RefineRequest, dtm_refine

@@ -286,3 +286,99 @@ def scan_faces(
             for i in range(result.shape[1]):
                 if np.isinf(result[j, i]):
                     result[j, i], _ = _on_faces(vertices, corners, start, frame, x0 + i * dx, y0 + j * dy)
+
+
+@inner
+def _side_error(
+    vertices: NDArray[np.float64], a: int, b: int, share: float, scale: float, terms: tuple[float, float, float, float]
+) -> float:
+    """Standard deviation by the side a–b of a triangle; share = 4 · product of the weights of a and b."""
+    ex, ey = abs(vertices[a, 0] - vertices[b, 0]) * scale, abs(vertices[a, 1] - vertices[b, 1]) * scale
+    ex, ey, share = ex ** terms[3], ey ** terms[3], max(share, 0.0) ** (0.5 * terms[3])
+    return share * np.sqrt(max(ex * ex * terms[0] + ey * ey * terms[1] + 2.0 * ex * ey * terms[2], 0.0))
+
+
+@inner
+def _term(terms: NDArray[np.float32], k: int, col: int, row: int, fx: float, fy: float) -> float:
+    upper = terms[k, row, col] + fx * (terms[k, row, col + 1] - terms[k, row, col])
+    lower = terms[k, row + 1, col] + fx * (terms[k, row + 1, col + 1] - terms[k, row + 1, col])
+    return upper + fy * (lower - upper)
+
+
+@inner
+def _with_between(
+    terms: NDArray[np.float32],
+    power: float,
+    vertices: NDArray[np.float64],
+    corners: NDArray[np.int32],
+    start: NDArray[np.int64],
+    frame: Frame,
+    x: float,
+    y: float,
+    sigma: float,
+) -> float:
+    """Standard deviation with the representation error at a place in meshes."""
+    n = frame[3]
+    col, row = np.int64(min(max(np.floor(x), 0.0), n - 1.0)), np.int64(min(max(np.floor(y), 0.0), n - 1.0))
+    fx, fy = min(max(x - col, 0.0), 1.0), min(max(y - row, 0.0), 1.0)
+    xx, yy, xy = (
+        _term(terms, 0, col, row, fx, fy),
+        _term(terms, 1, col, row, fx, fy),
+        _term(terms, 2, col, row, fx, fy),
+    )
+    error = 0.0
+    mesh = row * n + col
+    if start[mesh + 1] > start[mesh]:
+        for f in range(start[mesh], start[mesh + 1]):
+            wa, wb, wc, key = _weights(vertices, corners, f, frame, x, y)
+            if key != -2:
+                a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+                law = (xx, yy, xy, power)
+                error = (
+                    _side_error(vertices, a, b, 4.0 * wa * wb, frame[2], law)
+                    + _side_error(vertices, b, c, 4.0 * wb * wc, frame[2], law)
+                    + _side_error(vertices, c, a, 4.0 * wc * wa, frame[2], law)
+                )
+                break
+    else:
+        bx, by = (4.0 * fx * (1.0 - fx)) ** (0.5 * power), (4.0 * fy * (1.0 - fy)) ** (0.5 * power)
+        error = np.sqrt(max(bx * bx * xx + by * by * yy + 2.0 * bx * by * xy, 0.0))
+    return np.sqrt(sigma * sigma + error * error)
+
+
+@kernel
+def add_between(
+    terms: NDArray[np.float32],
+    power: float,
+    vertices: NDArray[np.float64],
+    corners: NDArray[np.int32],
+    start: NDArray[np.int64],
+    frame: Frame,
+    xy: NDArray[np.float64],
+    sigmas: NDArray[Any],
+) -> None:
+    """Add the representation error to standard deviations (p,) at places (p, 2) in meshes; see `Representation`."""
+    for i in range(len(xy)):
+        if sigmas[i] == sigmas[i]:
+            x, y = xy[i, 0], xy[i, 1]
+            sigmas[i] = _with_between(terms, power, vertices, corners, start, frame, x, y, sigmas[i])
+
+
+@kernel
+def add_between_on_lattice(
+    terms: NDArray[np.float32],
+    power: float,
+    vertices: NDArray[np.float64],
+    corners: NDArray[np.int32],
+    start: NDArray[np.int64],
+    frame: Frame,
+    lattice: Lattice,
+    sigmas: NDArray[Any],
+) -> None:
+    """As `add_between`, for the pixels of a lattice (ny, nx); see `scan_faces`."""
+    x0, dx, y0, dy = lattice
+    for j in range(sigmas.shape[0]):
+        for i in range(sigmas.shape[1]):
+            if sigmas[j, i] == sigmas[j, i]:
+                x, y = x0 + i * dx, y0 + j * dy
+                sigmas[j, i] = _with_between(terms, power, vertices, corners, start, frame, x, y, sigmas[j, i])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.collocation import correlation, solve_transposed
 from photoplan.kernels.jit import inner, kernel
-from photoplan.kernels.patch_system import system, trend, usable
+from photoplan.kernels.patch_system import JITTER, system, trend, usable
 
 # Models of a patch with less weight than this are left out.
 _LEAST = 0.02
@@ -40,6 +40,7 @@ def predict(
     models: NDArray[Any],
     shares: NDArray[Any],
     squares: NDArray[Any],
+    lost: NDArray[Any],
     usual: NDArray[Any],
     sums: NDArray[Any],
 ) -> int:
@@ -67,12 +68,14 @@ def predict(
         Weights of a patch's models, which add up to 1.
     squares : ndarray, shape (n,)
         Squared normalised residuals of the data; NaN: not known.
+    lost : ndarray, shape (n,)
+        Variance at each datum of ground that the filter took for noise, m².
     usual : ndarray, shape (3,)
         Mean of these squares everywhere, how many data it counts as, and the distance at which data count a quarter
         for the roughness, metres.
-    sums : ndarray, shape (t, 5)
+    sums : ndarray, shape (t, 6)
         Sums of w·height, w, w·standard deviation; the shortest distance to a datum; sum of w·roughness, which is the
-        mean square of the normalised residuals around, on the same side of lines.
+        mean square of the normalised residuals around, on the same side of lines; sum of w·`lost` around.
 
     Notes
     -----
@@ -93,10 +96,10 @@ def predict(
                 )
                 if u.shape[0] > 0:
                     solved = True
-                    rough = _roughness(at, at_points, squares[data], models[patch, k], usual)
+                    rough, taken = _roughness(at, at_points, squares[data], lost[data], models[patch, k], usual)
                     w, near = _towards(at, at_points, models[patch, k])
                     solve_transposed(u, w)
-                    about = np.stack((near, rough))
+                    about = np.stack((near, rough, taken))
                     _combine(
                         w, b, at_points, about, models[patch, k], leaves[patch], shares[patch, k], targets, some, sums
                     )
@@ -126,11 +129,17 @@ def _towards(at: NDArray[Any], at_points: NDArray[Any], model: NDArray[Any]) -> 
 
 @kernel
 def _roughness(
-    at: NDArray[Any], at_points: NDArray[Any], squares: NDArray[Any], model: NDArray[Any], usual: NDArray[Any]
-) -> NDArray[Any]:
-    """Mean of squared normalised residuals around each target, shape (t,), drawn to the usual one."""
+    at: NDArray[Any],
+    at_points: NDArray[Any],
+    squares: NDArray[Any],
+    lost: NDArray[Any],
+    model: NDArray[Any],
+    usual: NDArray[Any],
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Means around each target (t,): of squared normalised residuals, drawn to the usual one, and of `lost`."""
     n, m = len(at), len(at_points)
     total, count = np.full(m, usual[0] * usual[1]), np.full(m, usual[1])
+    taken, weights = np.zeros(m), np.full(m, 1e-30)
     plain, across = (model[2] / usual[2]) ** 2, (_APART / model[3]) ** 2
     for i in range(n):
         if not squares[i] >= 0.0:
@@ -145,7 +154,9 @@ def _roughness(
             near = 1.0 / (1.0 + (dx * dx + dy * dy) * plain + apart * across) ** 2
             total[j] += near * square
             count[j] += near
-    return total / count
+            taken[j] += near * near * lost[i]
+            weights[j] += near * near
+    return total / count, taken / weights
 
 
 @kernel
@@ -161,7 +172,7 @@ def _combine(
     some: NDArray[Any],
     sums: NDArray[Any],
 ) -> None:
-    """Heights, variances, and what is about (nearest datum, roughness; shape (2, t)) of one patch's targets, added."""
+    """Add heights, variances and `about` (nearest datum, roughness, lost; shape (3, t)) of one patch's targets."""
     n, m = w.shape
     beta, inverse = trend(b)
     height, explained = np.zeros(m), np.zeros(m)
@@ -182,7 +193,7 @@ def _combine(
         i0 = inverse[0, 0] * v0 + inverse[0, 1] * v1 + inverse[0, 2] * v2
         i1 = inverse[1, 0] * v0 + inverse[1, 1] * v1 + inverse[1, 2] * v2
         i2 = inverse[2, 0] * v0 + inverse[2, 1] * v1 + inverse[2, 2] * v2
-        spread = max(model[1] - explained[j] + v0 * i0 + v1 * i1 + v2 * i2, 1e-6 * model[1])
+        spread = max(model[1] - explained[j] + v0 * i0 + v1 * i1 + v2 * i2, JITTER * model[1])
         t = some[j]
         share = _weight((targets[t, 0] - leaf[0]) / leaf[2]) * _weight((targets[t, 1] - leaf[1]) / leaf[2])
         weight = share * part / spread
@@ -191,3 +202,4 @@ def _combine(
         sums[t, 2] += weight * np.sqrt(spread)
         sums[t, 3] = min(sums[t, 3], about[0, j])
         sums[t, 4] += weight * about[1, j]
+        sums[t, 5] += weight * about[2, j]

@@ -16,7 +16,7 @@ from photoplan.kernels.sides import clip_lines, sides_of
 _KNEE = 16.0
 # So many data of a patch at most take no part in what is said of the others.
 _MOST_ASIDE = 8
-_JITTER = 1e-8
+JITTER = 1e-8
 # A prior for the slope of the trend so weak that it only matters where all data lie on one line.
 _SLOPE_WEIGHT = 1e-4
 _MOST_PIECES = 40
@@ -67,7 +67,7 @@ def system(
             at[i, k] *= gap / 2.0
     u = np.empty((n, n))
     for i in range(n):
-        u[i, i] = variance * (1.0 + _JITTER) + noise[ids[i]]
+        u[i, i] = variance * (1.0 + JITTER) + noise[ids[i]]
         for j in range(i + 1, n):
             u[i, j] = variance * correlation(_distance(at, i, j), family)
     b = np.empty((n, 4))

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.extent import height_ranges
-from photoplan.kernels.hybrid import sample_hybrid, scan_faces
+from photoplan.kernels.hybrid import add_between, add_between_on_lattice, sample_hybrid, scan_faces
 from photoplan.kernels.sample_grid import sample_lattice
 from photoplan.surfaces.carried import box_points, carried_positions
 from photoplan.surfaces.lattice import Lattice
@@ -59,7 +59,8 @@ class HybridSurface:
     def sigmas(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Standard deviation of the height at map points (..., 2), shape (...), metres; NaN where there is no surface.
 
-        Between posts and vertices the standard deviations are interpolated as the heights are.
+        Between posts and vertices the standard deviations are interpolated as the heights are, and the representation
+        error of the meshes is added (`Unit.representation`).
         """
         return self._values(XY, "sigmas")
 
@@ -214,6 +215,9 @@ def _unit_values(unit: Unit, XY: NDArray[np.float64], layer: Layer) -> NDArray[n
     faces = unit.faces or _no_faces(unit.meshes)
     result = np.empty(len(xy))
     sample_hybrid(np.ascontiguousarray(posts), *_plain(faces, layer, datum), frame, xy, result)
+    if layer == "sigmas":
+        between = unit.representation
+        add_between(between.terms, between.power, *_plain(faces, layer, datum), frame, xy, result)
     result += datum
     return result
 
@@ -229,6 +233,10 @@ def _unit_lattice(
     part = sample_lattice(posts, x0, step, nx, y0, step, ny)
     if unit.faces is not None:
         scan_faces(part, (x0, step, y0, step), frame, *_plain(unit.faces, layer, datum))
+    if layer == "sigmas":
+        between, faces = unit.representation, unit.faces or _no_faces(unit.meshes)
+        plain = _plain(faces, layer, datum)
+        add_between_on_lattice(between.terms, between.power, *plain, frame, (x0, step, y0, step), part)
     np.add(part, datum, out=result, casting="unsafe")
 
 

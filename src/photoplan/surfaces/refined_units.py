@@ -28,6 +28,10 @@ MOST_MESHES = 4096
 
 Index = tuple[int, int]
 _BESIDE = {"north": (0, -1), "south": (0, 1), "west": (-1, 0), "east": (1, 0)}
+_OPPOSITE = {"north": "south", "south": "north", "west": "east", "east": "west"}
+_EDGES: dict[str, Any] = {"north": (0, ...), "south": (-1, ...), "west": (..., 0), "east": (..., -1)}
+#: Posts this close to the straight edge of a neighbour, metres, lie on it: heights are held in single precision.
+_ON_EDGE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +49,11 @@ def refine_units(
 ) -> tuple[dict[Index, Unit], tuple[LineElement, ...]]:
     """The units of a coarse model that a finer one changes.
 
-    Units that the polygons touch get posts of the `RefinedSurface` on a finer grid: their own, halved until `width` is
-    reached. Inside the polygons the lines of the fine model count, their heights blended like the surface; outside
-    those of the coarse one. Units around get new triangles, since finer posts adjoin.
+    Units that the polygons touch get posts of the `RefinedSurface` on a finer grid: their meshes are divided by the
+    smallest whole number that makes them no wider than `width`. Posts of meshes that lie partly outside keep the
+    coarse heights, so that nothing changes outside. Inside the polygons the lines of the fine model count, their
+    heights blended like the surface; outside those of the coarse one. Units around get new triangles only where the
+    finer posts that adjoin do not lie on their edge.
 
     Parameters
     ----------
@@ -86,7 +92,7 @@ def refine_units(
         unit = blend.unit(layout, at, plain.get(at), width)
         if unit is not None:
             plain[at] = unit
-    changed = _around(layout, inner, 1)
+    changed = {at for at in _around(layout, inner, 1) if at in inner or (at in plain and _bent(at, plain))}
     lines = _lines(coarse, fine, blend, plain, changed)
     domain = _domain(coarse.domain, fine.domain, polygons)
     return {at: _with_faces(at, plain, layout, lines, domain) for at in sorted(changed & plain.keys())}, lines
@@ -140,15 +146,16 @@ class _Blend:
         """A unit with posts of the joined surface; None if there are none."""
         left, top = layout.corner(*at)
         meshes = old.meshes if old is not None else 1
-        while layout.side / meshes > width * (1 + 1e-9):
-            meshes *= 2
+        meshes *= int(np.ceil(layout.side / meshes / width * (1 - 1e-9)))
         step = np.arange(meshes + 1) * (layout.side / meshes)
         XY = np.stack(np.meshgrid(left + step, top - step), axis=-1)
-        heights = self.surface.heights(XY)
+        kept = ~self._amid(left, top, layout.side, meshes)
+        heights = np.where(kept, self.coarse.heights(XY), self.surface.heights(XY))
         if not np.isfinite(heights).any():
             return None
         datum = old.datum if old is not None else float(np.rint(np.nanmean(heights)))
-        sigmas = np.where(np.isfinite(heights), self.sigmas(XY), np.nan)
+        sigmas = np.where(kept, self.coarse.sigmas(XY), self.sigmas(XY))
+        sigmas = np.where(np.isfinite(heights), sigmas, np.nan)
         return Unit(
             left=left,
             top=top,
@@ -159,13 +166,28 @@ class _Blend:
             faces=None,
         )
 
+    def _amid(self, left: float, top: float, side: float, meshes: int) -> NDArray[np.bool_]:
+        """Posts of a unit, shape (meshes + 1, meshes + 1), around which all meshes lie inside the polygons."""
+        width = side / meshes
+        k = np.arange(-1, meshes + 1)
+        x, y = np.meshgrid(left + k * width, top - k * width)
+        inset = 1e-9 * side
+        inside = shapely.covers(self.polygons, shapely.box(x + inset, y - width + inset, x + width - inset, y - inset))
+        return np.asarray(inside[1:, 1:] & inside[1:, :-1] & inside[:-1, 1:] & inside[:-1, :-1])
+
     def sigmas(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviation of the joined surface: the two models err independently of each other."""
-        weights = self.surface.weights(XY)
-        coarse, fine = self.coarse.sigmas(XY), self.fine.sigmas(XY)
-        both = np.hypot((1 - weights) * coarse, weights * fine)
-        inner = np.where(np.isnan(fine), coarse, np.where(np.isnan(coarse), fine, both))
-        return np.asarray(np.where(np.isfinite(weights), inner, coarse))
+        """Standard deviation of the joined surface: the two models err independently of each other.
+
+        It is unknown where one is that counts.
+        """
+        weights = np.nan_to_num(self.surface.weights(XY), nan=0.0)
+        lost = np.isnan(self.fine.heights(XY)), np.isnan(self.coarse.heights(XY))
+        weights = np.where(lost[0], 0.0, np.where(lost[1], weights > 0, weights))
+        parts = [
+            np.where(share > 0, share * surface.sigmas(XY), 0.0)
+            for share, surface in ((1 - weights, self.coarse), (weights, self.fine))
+        ]
+        return np.asarray(np.hypot(*parts))
 
     def line(self, line: LineElement) -> LineElement:
         """A line of the fine model with blended heights."""
@@ -184,6 +206,23 @@ class _Blend:
             right=None if line.right is None else blended(line.right),
             sigmas=np.hypot((1 - weights) * sigma, weights * line.sigmas),
         )
+
+
+def _bent(at: Index, units: dict[Index, Unit]) -> bool:
+    """Whether finer posts of a neighbour do not lie on the edge of a unit, which then needs triangles there."""
+    unit = units[at]
+    for side, (dc, dr) in _BESIDE.items():
+        other = units.get((at[0] + dc, at[1] + dr))
+        if other is None or unit.meshes % other.meshes == 0:
+            continue
+        own, theirs = _EDGES[side], _EDGES[_OPPOSITE[side]]
+        Z = unit.heights[own] + np.float64(unit.datum)
+        beside = other.heights[theirs] + np.float64(other.datum)
+        between = np.interp(np.linspace(0, 1, len(beside)), np.linspace(0, 1, len(Z)), Z)
+        known = np.isfinite(between) & np.isfinite(beside)
+        if (np.isfinite(between) != np.isfinite(beside)).any() or (np.abs(between - beside)[known] > _ON_EDGE).any():
+            return True
+    return False
 
 
 def _touched(layout: UnitLayout, polygons: Any) -> set[Index]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.surfaces.measured import LineKind
+from photoplan.surfaces.representation import Representation, representation
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,15 @@ class Unit:
     def width(self) -> float:
         """Grid width: side of a mesh, metres."""
         return self.side / self.meshes
+
+    @cached_property
+    def representation(self) -> Representation:
+        """What the meshes cannot follow between the posts; `sigmas` are those of the posts alone."""
+        if self.faces is None:
+            return representation(self.heights)
+        xy = self.faces.vertices[:, :2] - (self.left, self.top)
+        triangled = (np.diff(self.faces.start) > 0).reshape(self.meshes, self.meshes)
+        return representation(self.heights, xy * (1 / self.width, -1 / self.width), triangled)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from photoplan.terrain.clean.borders import domain_of
 from photoplan.terrain.fit import TerrainFit, fit
 from photoplan.terrain.held_out import calibrated
 from photoplan.terrain.observations import Observations, observe
-from photoplan.terrain.predict import Domain, predict_lines, predict_unit
+from photoplan.terrain.predict import Domain, predict_lines, predict_unit, with_chords
 from photoplan.terrain.settings import BuildSettings
 
 #: Gaps are bridged up to twice this many spacings.
@@ -157,7 +157,7 @@ def build_terrain(plan: BuildPlan, run: Map = map, events: Events = SILENT) -> B
     meshes = np.zeros((layout.rows, layout.columns), np.int64)
     for (column, row), unit in units.items():
         meshes[row, column] = unit.meshes
-    lines = [on_grid(line, layout, meshes) for line in lines]
+    lines = with_chords(found, [on_grid(line, layout, meshes) for line in lines], run)
     units = _with_faces(plan, units, lines, run, events)
     sigmas = _surrounded(plan, domain, units)
     every = np.concatenate([np.empty(0), *sigmas.values()])

@@ -308,6 +308,9 @@ def _start(
     # On level ground the whole variance is noise: 2.2 times the square of the median deviation, and more by chance.
     high = np.log([1e4 * variance, _LONGEST * seen.spacing, _MOST_NOISE * variance])
     first = np.log([0.3 * variance, 4 * seen.spacing, 0.01 * variance])
+    if seen.rounding > 0:
+        low[2] = min(max(low[2], 2 * np.log(seen.rounding)), high[2])
+        first[2] = max(first[2], low[2])
     known = seen.known_noise
     given = settings.filters.get("mass") if known is None else known
     if given is not None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from photoplan.events import SILENT, Events, Map
 from photoplan.kernels.local_planes import local_scales
@@ -33,6 +34,11 @@ _ROUGH, _LEAST_OF_LEAF, _WEIGHTS = 3.0, 6, (1.0, 100.0)
 #: So many leaves say whether the ground is rougher than blocks of points say: by so much lower a mean of their scores,
 #: if those of such a part of them are lower; by the first functions of the ladder.
 _LEAVES, _GAIN, _SHARE, _STEPS = 128, 0.5, 0.4, 3
+#: Standard deviations of a mean of squares by which the residuals must lie below the stated noise to contradict it.
+_CERTAIN = 3.1
+#: Residuals of so many points around say what the filter took away, each with so many neighbours, beyond so many
+#: standard deviations of chance.
+_WINDOW, _TOUCHING, _BEYOND = 24, 6, 2.0
 #: With fewer points no one is a gross error.
 _FEWEST = 8
 #: While the stochastic model is estimated, the standard deviation of what looks like a gross error is so many times it.
@@ -70,6 +76,8 @@ class TerrainFit:
     usual: NDArray[np.float64] = field(default_factory=lambda: np.ones(3))
     """Mean of the squared normalised residuals, how many data it counts as beside those around a place, and the
     distance at which these count a quarter, metres."""
+    lost: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    """Variance of ground that the filter took for noise at each datum, m²: what residuals of neighbours share."""
     calibration: SigmaFactor = NONE
 
     @property
@@ -79,6 +87,12 @@ class TerrainFit:
         squares[: self.seen.points] = self.residuals[:, 2] ** 2
         squares[self.noise < 0] = np.nan
         return squares
+
+    @property
+    def least_noise(self) -> float:
+        """Share of the stated variance of noise, at most 1, that the residuals allow with a confidence of 99.9 %."""
+        count = max(int(np.isfinite(self.squares).sum()), 1)
+        return float(min(1.0, self.usual[0] * (1 + _CERTAIN * np.sqrt(2 / count))))
 
     @property
     def gross(self) -> NDArray[np.int64]:
@@ -130,6 +144,7 @@ def fit(
             shares=np.empty((len(leaves.half), len(LADDER))),
             residuals=np.full((seen.points, 3), np.nan),
             ground=whole.ground * mass**2,
+            lost=np.zeros(len(seen.xyz)),
             members=tuple(members),
         )
 
@@ -148,7 +163,7 @@ def fit(
         suspects = _judge(found, around, screened, seen.noise(mass), settings.gross, run)
         _flag(found, around, screened, settings.gross, run)
         found = replace(found, suspects=_whole_groups(found, screened, suspects, settings.gross, run))
-    return replace(found, usual=_usual(found))
+    return replace(found, usual=_usual(found), lost=_lost(found))
 
 
 def _weightless(seen: Observations, screened: Screened) -> Observations:
@@ -176,6 +191,26 @@ def _usual(found: TerrainFit) -> NDArray[np.float64]:
     differ = float(((of_leaf - mean) ** 2 - chance).mean()) / max(mean, 1e-9) ** 2 if len(count) else 0.0
     # Two thirds: data further off count too, less each, so that the sum of their weights is a third of their number.
     return np.array([max(mean, 1e-9), np.clip(2 / 3 / max(differ, 1e-9), *_WEIGHTS), reach])
+
+
+def _lost(found: TerrainFit) -> NDArray[np.float64]:
+    """Variance of ground that the filter took for noise, m², at each datum.
+
+    Residuals of noise alone are independent, or differ in sign a little more often than not. The mean product of those
+    of neighbours is therefore what the filtered surface is off by, squared; it counts by what exceeds chance.
+    """
+    lost = np.zeros(len(found.seen.xyz))
+    points = found.seen.points
+    residual = found.residuals[:, 0] * found.residuals[:, 1]
+    some = np.flatnonzero((found.noise[:points] >= 0) & np.isfinite(residual))
+    if len(some) <= _WINDOW:
+        return lost
+    v = residual[some]
+    near = cKDTree(found.seen.xyz[some, :2]).query(found.seen.xyz[some, :2], k=_WINDOW + 1)[1]
+    shared = v * v[near[:, 1 : _TOUCHING + 1]].mean(axis=1)
+    chance = (v**2)[near].mean(axis=1) / np.sqrt(_WINDOW * _TOUCHING / 2)
+    lost[some] = np.maximum(shared[near].mean(axis=1) - _BEYOND * chance, 0.0)
+    return lost
 
 
 def unit_of(xy: NDArray[np.float64], layout: UnitLayout) -> NDArray[np.int64]:

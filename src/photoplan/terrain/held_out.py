@@ -60,12 +60,14 @@ def _round(found: TerrainFit, gap: float, meshes: int, rng: np.random.Generator,
         u = int(unit_of(seen.xyz[some[:1], :2], found.layout)[0])
         raw = raw_at(rest, u, np.ascontiguousarray(seen.xyz[some, :2]), chosen=False)
         around = raw.around
-        return np.column_stack([raw.height, raw.sigma, around.signal, around.distance, around.beside, around.rough])
+        return np.column_stack(
+            [raw.height, raw.sigma, raw.lost, around.signal, around.distance, around.beside, around.rough]
+        )
 
-    predicted = np.vstack([np.empty((0, 6)), *run(one, groups)])
+    predicted = np.vstack([np.empty((0, 7)), *run(one, groups)])
     at = np.concatenate([np.empty(0, np.int64), *groups])
     ground = np.where(at < seen.points, found.ground[unit_of(seen.xyz[at, :2], found.layout)], 0.0)
-    noise = np.maximum(found.noise[at] - ground, 0.0)
+    noise = np.maximum(found.noise[at] - ground, 0.0) * found.least_noise
     known = np.isfinite(predicted).all(axis=1) & np.isfinite(seen.xyz[at, 2]) & (predicted[:, 1] > 0)
     at, predicted = at[known], predicted[known]
     _, number = np.unique(block[at], return_inverse=True)
@@ -73,8 +75,8 @@ def _round(found: TerrainFit, gap: float, meshes: int, rng: np.random.Generator,
     return HeldOut(
         error=error,
         sigma=predicted[:, 1],
-        noise=noise[known],
-        around=Surroundings(*predicted[:, 2:].T),
+        noise=noise[known] + predicted[:, 2],
+        around=Surroundings(*predicted[:, 3:].T),
         block=number.ravel(),
         bend=_bends(seen, at),
     )
@@ -130,6 +132,7 @@ def without(found: TerrainFit, held: NDArray[np.bool_], meshes: int) -> TerrainF
         neighbours=Neighbours.of(fewer.xyz[:, :2], fewer.points, order),
         noise=found.noise[kept],
         residuals=found.residuals[some],
+        lost=found.lost[kept],
     )
 
 

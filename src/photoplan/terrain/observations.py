@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +71,13 @@ class Observations:
     """xmin, ymin, xmax, ymax of each of these pieces."""
     spacing: float
     """Side of the square that one point has to itself on average, metres."""
+
+    @cached_property
+    def rounding(self) -> float:
+        """Standard deviation of rounding where all heights are whole millimetres, metres; else 0."""
+        Z = self.xyz[: self.points, 2] * 1000
+        whole = len(Z) > 0 and bool((np.abs(Z - np.rint(Z)) < 1e-3).all())
+        return 0.001 / np.sqrt(12) if whole else 0.0
 
     def noise(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances of all data, shape (n,), m², from the standard deviation of mass points at each of them."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from photoplan.events import Map
 from photoplan.kernels.patch import predict
 from photoplan.surfaces.units import LineElement, Unit
 from photoplan.terrain.calibration import Surroundings, signal_share
-from photoplan.terrain.fit import REACH, TerrainFit, choose, lines_of
+from photoplan.terrain.fit import REACH, TerrainFit, choose, lines_of, unit_of
 from photoplan.terrain.leaves import patches_at
 
 #: A prepared polygon builds its index when it is first asked, and GEOS does not guard that against other threads.
@@ -27,6 +27,10 @@ _END = 0.005
 _MOST_CELLS = 30_000_000
 
 
+#: Part of the rounding error of heights that is left in a surface through several of them.
+_ROUNDED = 1 / 3
+#: Distance from a line at which the slope beside it is taken, in spacings.
+_BESIDE = 0.2
 #: Cells that are looked at for the widest gaps.
 _PLACES = 20_000
 
@@ -96,7 +100,12 @@ def heights_at(
         nothing can be predicted.
     """
     raw = raw_at(fit, unit, xy)
-    return raw.height, raw.sigma * fit.calibration.factor(raw.around), raw.around.distance * fit.seen.spacing
+    # Residuals that are smaller than rounding do not show that the surface is better known.
+    sigma = np.maximum(
+        raw.sigma * fit.calibration.factor(raw.around), np.minimum(raw.sigma, _ROUNDED * fit.seen.rounding)
+    )
+    sigma = np.sqrt(sigma**2 + raw.lost)
+    return raw.height, sigma, raw.around.distance * fit.seen.spacing
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +116,8 @@ class Raw:
     """Relative to the origin of the observations, shape (n,), metres; NaN: none."""
     sigma: NDArray[np.float64]
     """Standard deviation by the covariance functions, metres."""
+    lost: NDArray[np.float64]
+    """Variance of ground that the filter took for noise, m²."""
     around: Surroundings
 
 
@@ -118,7 +129,7 @@ def raw_at(fit: TerrainFit, unit: int, xy: NDArray[np.float64], chosen: bool = T
     chosen : bool
         Whether patches have chosen their functions; else those that are needed do now.
     """
-    sums = np.zeros((len(xy), 5))
+    sums = np.zeros((len(xy), 6))
     sums[:, 3] = np.inf
     low, high = xy.min(axis=0), xy.max(axis=0)
     some = _leaves_near(fit, unit, low, high)
@@ -132,15 +143,16 @@ def raw_at(fit: TerrainFit, unit: int, xy: NDArray[np.float64], chosen: bool = T
         patches = patches_at(fit.leaves, some)
         lines = lines_of(fit, patches, ids)
         shares = fit.shares[some] if chosen else choose(fit, some)
-        about = fit.squares, fit.usual
+        about = fit.squares, fit.lost, fit.usual
         predict(
             fit.seen.xyz, fit.noise, ids, patches, xy, wanted, start, *lines, fit.models(some), shares, *about, sums
         )
     with np.errstate(invalid="ignore", divide="ignore"):
         height, sigma, rough = sums[:, 0] / sums[:, 1], sums[:, 2] / sums[:, 1], sums[:, 4] / sums[:, 1]
+        lost = sums[:, 5] / sums[:, 1]
     sigma = np.sqrt(sigma**2 + _ground_at(fit, xy))
     around = Surroundings(signal_share(sigma, fit.whole.noise), sums[:, 3] / fit.seen.spacing, _beside(fit, xy), rough)
-    return Raw(height, sigma, around)
+    return Raw(height, sigma, lost, around)
 
 
 def _beside(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -251,6 +263,55 @@ def predict_lines(fit: TerrainFit, run: Map = map) -> list[LineElement]:
     for some, sides in zip(groups, run(one, groups)):
         left[some], right[some] = sides
     return _elements(fit, left, right)
+
+
+def with_chords(fit: TerrainFit, lines: list[LineElement], run: Map = map) -> list[LineElement]:
+    """Return lines whose intersections with the grid have the representation error of the chords in their sigmas.
+
+    Between two measured vertices a curved line leaves its chord by a quarter of its second differences at most, as a
+    parabola. Across the line that is a height by the slopes of the ground on both sides.
+    """
+
+    def one(line: LineElement) -> LineElement:
+        own = np.flatnonzero(~line.on_grid)
+        if len(own) < 3 or len(own) == len(line.xyz) or line.kind == "border" or not np.isfinite(line.xyz).all():
+            return line
+        vertices = line.xyz[own]
+        second = np.zeros((len(own), 3))
+        second[1:-1] = np.diff(vertices, 2, axis=0)
+        second[0], second[-1] = second[1], second[-2]
+        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(line.xyz[:, :2], axis=0).T)))
+        at = along[own]
+        new = np.flatnonzero(line.on_grid)
+        first = np.clip(np.searchsorted(at, along[new], side="right") - 1, 0, len(at) - 2)
+        t = (along[new] - at[first]) / np.maximum(at[first + 1] - at[first], 1e-9)
+        bend = second[first] + t[:, None] * (second[first + 1] - second[first])
+        step = vertices[first + 1, :2] - vertices[first, :2]
+        normal = np.column_stack([-step[:, 1], step[:, 0]]) / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
+        steepness = _slopes(fit, line, new, normal)
+        across = (bend[:, :2] * normal).sum(axis=1)
+        chord = 0.5 * t * (1 - t) * np.hypot(bend[:, 2], steepness * across)
+        sigmas = line.sigmas.copy()
+        sigmas[new] = np.hypot(sigmas[new], chord)
+        return replace(line, sigmas=sigmas)
+
+    return list(run(one, lines))
+
+
+def _slopes(fit: TerrainFit, line: LineElement, some: NDArray[np.int64], normal: NDArray[np.float64]) -> Any:
+    """Root mean square of the slopes on both sides of a line at some of its vertices; 0 where there is no ground."""
+    apart = _BESIDE * fit.seen.spacing
+    origin = fit.seen.origin
+    slopes = []
+    for side in (1.0, -1.0):
+        low = line.xyz[some, 2] if side > 0 or line.right is None else line.right[some]
+        xy = line.xyz[some, :2] - origin[:2] + side * apart * normal
+        unit = unit_of(xy, fit.layout)
+        beside = np.full(len(some), np.nan)
+        for number in np.unique(unit).tolist():
+            beside[unit == number] = heights_at(fit, number, np.ascontiguousarray(xy[unit == number]))[0]
+        slopes.append((beside + origin[2] - low) / apart)
+    return np.sqrt((np.nan_to_num(np.stack(slopes)) ** 2).mean(axis=0))
 
 
 def _elements(fit: TerrainFit, left: NDArray[np.float64], right: NDArray[np.float64]) -> list[LineElement]:

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
 
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.heights import common_system
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.run_record import run_key
-from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+from photoplan.io.terrain.model_read import ModelReader
 from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.plain import pick
+from photoplan.project.open_terrain import open_terrain
+from photoplan.surfaces.raster import RasterSurface
+from photoplan.surfaces.raster_units import RasterUnits
 from photoplan.surfaces.refined_units import LinedUnits, refine_units
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, unit_range
 
@@ -35,7 +39,10 @@ class RefineRequest:
     transition: float
     """Width of the band inside the polygons in which the two are joined, metres."""
     width: float | None = None
-    """Largest grid width inside the polygons, metres; None: the fine model's finest."""
+    """Largest grid width inside the polygons, metres; None: the fine model's finest. Meshes of the coarse model
+    are divided by the smallest whole number that gives it."""
+    crs: str | None = None
+    """CRS of rasters that do not state their own."""
     height_system: str | None = None
     """`same` declares that both models have one height system."""
     overwrite: bool = False
@@ -65,7 +72,7 @@ def dtm_refine(request: RefineRequest) -> RefineReport:
     Raises
     ------
     UsageError
-        The output exists or is an input, or an input is a raster.
+        The output exists or is an input.
     HeightSystemError
         Height systems differ, or are not stated.
     InputError
@@ -73,7 +80,7 @@ def dtm_refine(request: RefineRequest) -> RefineReport:
     """
     inputs = [request.coarse, request.fine, request.polygons]
     check_output(request.output, inputs, overwrite=request.overwrite)
-    coarse, fine = (_model(path) for path in (request.coarse, request.fine))
+    coarse, fine = (_Model.open(path, request.crs) for path in (request.coarse, request.fine))
     if not same_crs(coarse.header.crs, fine.header.crs):
         raise InputError(
             f"{coarse.path} is in {crs_label(coarse.header.crs)}, {fine.path} in {crs_label(fine.header.crs)}; build "
@@ -82,17 +89,17 @@ def dtm_refine(request: RefineRequest) -> RefineReport:
     stated = {reader.path: reader.header.height_system for reader in (coarse, fine)}
     system = common_system(stated, request.height_system)
     polygons = _polygons(request, coarse)
-    width = request.width if request.width is not None else fine.finest
+    width = request.width if request.width is not None else fine.units.finest
     with ModelWriter(
         path=request.output,
-        layout=coarse.layout,
+        layout=coarse.header.layout,
         run_key=_key(request, coarse, fine),
         overwrite=request.overwrite,
         inputs=inputs,
     ) as writer:
         units, lines = refine_units(
-            LinedUnits(coarse, coarse.lines(), coarse.domain()),
-            LinedUnits(fine, fine.lines(polygons.bounds), fine.domain()),
+            coarse.lined(),
+            fine.lined(polygons.bounds),
             polygons,
             request.transition,
             width,
@@ -107,36 +114,82 @@ def dtm_refine(request: RefineRequest) -> RefineReport:
     )
 
 
-def _model(path: Path) -> ModelReader:
-    if path.is_file() and path.suffix.lower() != ".gpkg" and not is_terrain_model(path):
-        raise UsageError(f"{path}: only models of `photoplan dtm build` are refined; a raster has no units")
-    return ModelReader(path)
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """A terrain model, or a raster of heights as one without lines."""
+
+    path: Path
+    header: ModelHeader
+    units: ModelReader | RasterUnits
+    reader: ModelReader | None
+    """None: a raster."""
+
+    @classmethod
+    def open(cls, path: Path, crs: str | None) -> _Model:
+        opened = open_terrain(path, crs)
+        if opened.model is not None:
+            return cls(path, opened.model.header, opened.model, opened.model)
+        assert isinstance(opened.surface, RasterSurface)
+        try:
+            units = RasterUnits(opened.surface)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        header = ModelHeader(opened.crs, opened.height_system, units.layout, identity=str(input_facts(path)))
+        return cls(path, header, units, None)
+
+    def lined(self, bounds: tuple[float, float, float, float] | None = None) -> LinedUnits:
+        """Its units with its lines in some bounds."""
+        return LinedUnits(self.units, () if self.reader is None else self.reader.lines(bounds), self.domain)
+
+    @property
+    def domain(self) -> Any | None:
+        """Polygon of its borders, if it has any."""
+        return None if self.reader is None else self.reader.domain()
+
+    def unit(self, column: int, row: int) -> tuple[Unit | None, UnitFigures]:
+        """A unit, None if it is empty, and its figures."""
+        unit = self.units.unit(column, row)
+        figures = self.figures.get((column, row), empty_figures(column, row))
+        if self.reader is None and unit is not None:
+            low, high = unit_range(unit)
+            figures = replace(figures, meshes=unit.meshes, low=low, high=high)
+        return unit, figures
+
+    @cached_property
+    def figures(self) -> dict[tuple[int, int], UnitFigures]:
+        """Figures of its units by column and row."""
+        return {} if self.reader is None else {(f.column, f.row): f for f in self.reader.figures()}
 
 
-def _polygons(request: RefineRequest, coarse: ModelReader) -> Any:
+def _polygons(request: RefineRequest, coarse: _Model) -> Any:
     read = read_features(request.polygons, "Polygon", crs=coarse.header.crs)
     return shapely.union_all([shapely.force_2d(item.geometry) for item in read.items])
 
 
-def _key(request: RefineRequest, coarse: ModelReader, fine: ModelReader) -> str:
-    decides = [coarse.header.identity, fine.header.identity, request.transition, request.width, request.height_system]
+def _key(request: RefineRequest, coarse: _Model, fine: _Model) -> str:
+    decides = [
+        coarse.header.identity,
+        fine.header.identity,
+        request.transition,
+        request.width,
+        request.height_system,
+        request.crs,
+    ]
     return run_key("refined model", decides, [request.polygons])
 
 
 def _add(
-    writer: ModelWriter, coarse: ModelReader, units: dict[tuple[int, int], Unit], lines: tuple[LineElement, ...]
+    writer: ModelWriter, coarse: _Model, units: dict[tuple[int, int], Unit], lines: tuple[LineElement, ...]
 ) -> None:
     """All units into the new model."""
     done = writer.done()
-    known = {(f.column, f.row): f for f in coarse.figures()}
     boxes = shapely.STRtree([shapely.LineString(line.xyz[:, :2]) for line in lines])
-    layout = coarse.layout
+    layout = coarse.header.layout
     for row in range(layout.rows):
         for column in range(layout.columns):
             at = column, row
             if at not in done:
-                old, new = coarse.unit(column, row), units.get(at)
-                figures = known.get(at, empty_figures(column, row))
+                (old, figures), new = coarse.unit(column, row), units.get(at)
                 writer.add(new or old, figures if new is None else _figures(new, old, figures, boxes))
 
 
@@ -157,8 +210,8 @@ def _figures(unit: Unit, old: Unit | None, before: UnitFigures, lines: shapely.S
 
 def _parts(
     request: RefineRequest,
-    coarse: ModelReader,
-    fine: ModelReader,
+    coarse: _Model,
+    fine: _Model,
     system: str | None,
     polygons: Any,
     width: float,
@@ -169,7 +222,7 @@ def _parts(
     header = ModelHeader(
         coarse.header.crs,
         system,
-        coarse.layout,
+        coarse.header.layout,
         settings={"refined": settings, "coarse": coarse.header.settings, "fine": fine.header.settings},
         inputs=tuple(input_facts(path) for path in (request.coarse, request.fine, request.polygons)),
         family=coarse.header.family,
@@ -180,23 +233,25 @@ def _parts(
         kept = [g for g in outside if not shapely.intersects_xy(polygons, *g.xyz[:2])]
         return kept + [g for g in inside if shapely.intersects_xy(polygons, *g.xyz[:2])]
 
-    gross, suspects = merged(coarse.gross(), fine.gross()), merged(coarse.suspects(), fine.suspects())
-    outer, inner = coarse.domain(), fine.domain()
+    of_both = [model.reader for model in (coarse, fine)]
+    gross = merged(*([] if reader is None else reader.gross() for reader in of_both))
+    suspects = merged(*([] if reader is None else reader.suspects() for reader in of_both))
+    outer, inner = coarse.domain, fine.domain
     domain = None
     if outer is not None or inner is not None:
         # Inside the polygons the fine model's border counts, outside the coarse one's.
-        outer = shapely.box(*coarse.layout.bounds) if outer is None else outer
+        outer = shapely.box(*coarse.header.layout.bounds) if outer is None else outer
         domain = outer.difference(polygons).union(polygons if inner is None else polygons.intersection(inner))
         areas = [p for p in shapely.get_parts(domain) if p.geom_type == "Polygon" and p.area > 0]
         domain = shapely.multipolygons(areas)
     return ModelParts(header=header, lines=lines, gross=gross, domain=domain, suspects=suspects)
 
 
-def _largest(coarse: ModelReader, units: dict[tuple[int, int], Unit]) -> float:
+def _largest(coarse: _Model, units: dict[tuple[int, int], Unit]) -> float:
     """Largest change of a post that both models have."""
     largest = math.nan
     for (column, row), unit in units.items():
-        old = coarse.unit(column, row)
+        old, _ = coarse.unit(column, row)
         if old is None or unit.meshes % old.meshes:
             continue
         step = unit.meshes // old.meshes
