@@ -34,6 +34,17 @@ def pick(value: object, *names: str, **keys: str) -> dict[str, Any]:
     return {name: getattr(value, name) for name in names} | {key: getattr(value, name) for key, name in keys.items()}
 
 
+def advised(least: float, figures: int = 2) -> str:
+    """Write the smallest number of some figures that is not below a bound: a user who gives it passes the check."""
+    if not (math.isfinite(least) and least > 0):
+        return f"{least:g}"
+    digits = figures - 1 - math.floor(math.log10(least))
+    step = 10.0**-digits
+    # What is the bound but for rounding errors stays.
+    count = math.ceil(least / step * (1 - 1e-12))
+    return f"{max(float(f'{count * step:.{max(digits, 0)}f}'), 0.0):g}"
+
+
 def plain(value: Any, where: str = "value") -> Any:
     """What JSON can say of a value.
 

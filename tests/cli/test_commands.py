@@ -78,7 +78,10 @@ def test_wrong_use_ends_with_2(photoplan: Here, words: list[str], message: str) 
         (["--resolution", "-1"], "resolution -1.0; a positive number"),
         (["--resolution", "nan"], "resolution nan; a positive number"),
         (["--resolution", "inf"], "resolution inf"),
-        (["--tolerance", "0"], "tolerance 0.0 px; allowed are"),
+        (
+            ["--tolerance", "1e-7"],
+            "tolerance 1e-07 px; it must be 0 (every pixel strictly by its camera) or",
+        ),
         (["--tile", "64"], "tile side 64; allowed are multiples of 16 from 128"),
         (["--tile", "200"], "tile side 200; allowed are multiples of 16 from 128"),
         (["--nodata", "black"], "nodata 'black'; allowed are auto, mask or a number"),

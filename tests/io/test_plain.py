@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import UsageError
-from photoplan.plain import json_text, pick, plain
+from photoplan.plain import advised, json_text, pick, plain
 
 
 class Kind(Enum):
@@ -53,3 +53,12 @@ def test_values_of_every_kind() -> None:
 def test_what_json_cannot_say_is_named() -> None:
     with pytest.raises(UsageError, match=r"value\.a\[1\] is a complex"):
         plain({"a": [1, 2j]})
+
+
+@pytest.mark.parametrize("figures", [1, 2, 3])
+def test_an_advised_number_passes_the_check_that_it_answers(figures: int) -> None:
+    bounds = np.random.default_rng(4).uniform(-7, 7, 500)
+    for least in [*(10.0**bounds).tolist(), 0.03301, 0.0334, 0.1, 0.3, 1.0, 99.96, 0.5]:
+        text = advised(least, figures)
+        assert least * (1 - 1e-9) <= float(text) <= least * (1 + 10.0 ** (1 - figures))
+    assert advised(0.0334) == "0.034" and advised(0.5) == "0.5" and advised(592.01, 3) == "593"

@@ -172,9 +172,9 @@ def test_horizontal_view_divides_nothing_behind_the_camera() -> None:
     assert inside.sum() > 2000 and (inside & ~seen).sum() == 0
 
 
-def test_tolerance_must_be_positive() -> None:
+def test_tolerance_must_not_be_negative() -> None:
     with pytest.raises(UsageError, match="tolerance"):
-        AnchorRule(0, 2)
+        AnchorRule(-0.02, 2)
 
 
 def test_the_rule_of_a_kernel_has_half_its_support_and_nearest_keeps_grey_values() -> None:

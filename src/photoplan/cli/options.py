@@ -172,7 +172,7 @@ product_options = several(
     click.option("--resolution", type=float, metavar="R", help="Ground pixel in metres [the images' mean GSD]."),
     bounds_option,
     click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic]."),
-    click.option("--tolerance", type=float, metavar="PX", help="Largest residual of the anchors [0.02]."),
+    click.option("--tolerance", type=float, metavar="PX", help="Largest residual; 0: every pixel strictly [0.02]."),
     click.option(
         "--hidden",
         help="What no image sees: show, nodata, or mark (second raster) [ortho: show; mosaic, --true: nodata].",

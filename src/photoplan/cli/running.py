@@ -57,7 +57,7 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     tiles = sum(len(p.plan.tiles) for p in plan.products)
     events.talk(
         f"plan: {plan.what}, {tiles} tiles · {settings.resolution:g} m · kernel {settings.kernel} · "
-        f"tolerance {settings.tolerance:g} px · nodata {settings.nodata} · "
+        f"{settings.exactness} · nodata {settings.nodata} · "
         f"hidden {settings.hidden} · {how.workers} {how.executor}"
     )
     for line in plan.blind:

@@ -50,7 +50,6 @@ def _draw(plan: OrthoPlan, squares: PlanSquares, picture: Path, how: How, events
 
 
 def _sums(plan: OrthoPlan, figures: PlanFigures) -> str:
-    return (
-        f"plan: {plan.what}, {figures.tiles} tiles, {figures.cells} cells, "
-        f"worst anchor residual {figures.residual:.3g} px"
+    return f"plan: {plan.what}, {figures.tiles} tiles, {figures.cells} cells, " + (
+        f"worst anchor residual {figures.residual:.3g} px" if plan.settings.tolerance else plan.settings.exactness
     )

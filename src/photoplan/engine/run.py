@@ -8,6 +8,7 @@ of which needs all of the one before (a terrain model, tie points), runs them th
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -168,9 +169,8 @@ def tiles_in_flight(wanted: int, memory: int | None, base: int, each: int) -> in
         return wanted
     fits = (memory - base) // each
     if fits < 1:
-        raise UsageError(
-            f"`memory` {memory / 2**20:.0f} MiB; at least {(base + each) / 2**20:.0f} MiB are needed for one tile"
-        )
+        needed = math.ceil((base + each) / 2**20)
+        raise UsageError(f"`memory` {memory / 2**20:.0f} MiB; at least {needed} MiB are needed for one tile")
     return int(min(wanted, fits))
 
 

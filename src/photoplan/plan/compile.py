@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Projection, Tremor, tremor_of
+from photoplan.cameras.base import Projection, Tremor, project, tremor_of
 from photoplan.errors import UsageError
 from photoplan.geometry.breaks import Breaks
 from photoplan.geometry.grid import Window
@@ -16,7 +17,7 @@ from photoplan.kernels.boxes import blocks_in_image, judge_boxes
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.anchors import Anchors, Positions, bend_errors
 from photoplan.plan.field import FieldGrid, FieldTable, field_grid
-from photoplan.plan.ground import CORNERS, SQUARE, Boxes, TileGround
+from photoplan.plan.ground import CORNERS, MIDDLE, SQUARE, Boxes, TileGround
 from photoplan.plan.tremor import TremorTable, tremor_table
 
 #: Pixels of a reduced source that stay for every target pixel at least: the kernel, widened to them, decides what the
@@ -24,6 +25,8 @@ from photoplan.plan.tremor import TremorTable, tremor_table
 FINEST = 2.0
 #: A rectangle that still reaches behind the camera at this side is left out, pixels.
 SMALLEST_BEHIND = 4
+#: Strict positions of pixels are computed for so many at once; tiles with fewer pixels may have so many anchors.
+AT_ONCE, FEWEST = 16_384, 4_096
 #: More layers than this over one rectangle do not pay; the residual that is left is reported.
 MOST_LAYERS = 64
 
@@ -39,7 +42,8 @@ class AnchorRule:
     """How finely a tile is cut."""
 
     tolerance: float
-    """Largest residual of anchors and field together that is accepted, pixels of the source image."""
+    """Largest residual of anchors and field together that is accepted, pixels of the source image; 0: every pixel is
+    computed strictly by its camera."""
     radius: int
     """Half the support of the resampling kernel at scale 1, pixels: what the source window adds all round."""
     reduces: bool = True
@@ -48,8 +52,8 @@ class AnchorRule:
     """Whether the change of depth from pixel to pixel decides what a pixel covers: in a view, not on a map."""
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0:
-            raise UsageError(f"tolerance {self.tolerance} px; a positive number is needed (default 0.02)")
+        if not self.tolerance >= 0:
+            raise UsageError(f"tolerance {self.tolerance} px; it must be 0 (strict) or positive (usual is 0.02)")
 
     @classmethod
     def of(cls, kernel: str, tolerance: float, tilted: bool = False) -> AnchorRule:
@@ -109,12 +113,23 @@ def compile_anchors(
     -------
     Anchors or None
         None if no pixel that is wanted can lie in the image.
+
+    Notes
+    -----
+    Every pixel is computed strictly if the tolerance is 0, and if anchors or nodes that meet it would be more than the
+    pixels of the tile.
     """
+    wanted = ground.ranges if wanted is None else wanted
+    if rule.tolerance == 0:
+        return _each_pixel(projection, ground, rule.radius, wanted, longest)
+    most = max(int(np.isfinite(ground.relief).sum()), FEWEST)
     image = _Image(projection.size, None, rule.tolerance)
     if projection.field is not None:
         grid = field_grid(projection.field, projection.size, rule.tolerance / 2)
+        if grid.miss > rule.tolerance:
+            return _each_pixel(projection, ground, rule.radius, wanted, longest)
         image = _Image(projection.size, grid, (rule.tolerance - min(grid.miss, rule.tolerance / 2)) / grid.stretch)
-    breaks, shaken = projection.breaks, tremor_of(projection)
+    breaks, shaken, strictly = projection.breaks, tremor_of(projection), projection
     if shaken is not None:
         tremor = _tremor(shaken, ground, image)
         if tremor is None:
@@ -128,7 +143,7 @@ def compile_anchors(
             )
         else:
             breaks = Breaks(rows=tuple(np.arange(*tremor.part.rows) + 0.0))
-    boxes = ground.first
+    boxes, settled_boxes = ground.first, 0
     done: list[Piles] = []
     residual = 0.0
     while len(boxes.rects):
@@ -147,12 +162,19 @@ def compile_anchors(
             box = settled[boxes.rect]
             done.append((boxes.rects[boxes.rect[box]], boxes.heights[box], lattice[box][:, CORNERS]))
             residual = max(residual, float(errors[settled].max()))
+            settled_boxes += len(done[-1][0])
         if not (keep & again).any():
             break
-        boxes = ground.boxes(*_finer(boxes, keep, split_u, split_v, thin))
+        rects, layers = _finer(boxes, keep, split_u, split_v, thin)
+        if settled_boxes + int(layers.sum()) > most:
+            return _each_pixel(strictly, ground, rule.radius, wanted, longest)
+        boxes = ground.boxes(rects, layers)
     if not done:
         return None
-    return _assemble(image, done, ground.ranges if wanted is None else wanted, residual, rule.radius, longest)
+    try:
+        return _assemble(image, done, wanted, residual, rule.radius, longest, most)
+    except _TooManyNodes:
+        return _each_pixel(strictly, ground, rule.radius, wanted, longest)
 
 
 def _tremor(tremor: Tremor, ground: TileGround, image: _Image) -> TremorTable | None:
@@ -217,8 +239,65 @@ def _halved(rects: NDArray[np.int32], in_u: bool, in_v: bool) -> NDArray[np.int3
     return np.concatenate(parts).astype(np.int32)
 
 
+class _TooManyNodes(Exception):
+    """A field would need more nodes than a tile has pixels."""
+
+
+def _each_pixel(
+    projection: Projection, ground: TileGround, radius: int, wanted: NDArray[np.float64], longest: float
+) -> Anchors | None:
+    """Anchors in which each pixel is a box of its own that gives exactly the strict position of its middle.
+
+    Its corners are strict, too: they give the scale. They are moved as a whole until their mean is the middle.
+    """
+    size = projection.size
+    place = np.array([*CORNERS.tolist(), MIDDLE])
+    parts: list[tuple[NDArray[Any], ...]] = []
+    rows_at_once = max(1, AT_ONCE // max(1, ground.window.width))
+    for first in range(0, ground.window.height, rows_at_once):
+        row, col = np.nonzero(np.isfinite(ground.relief[first : first + rows_at_once]))
+        row += first
+        pixels = np.stack([col, row, col + 1, row + 1], axis=1).astype(np.int32)
+        boxes = ground.boxes(pixels, np.ones(len(col), np.int64))
+        xy = project(projection, boxes.lattice[:, place])
+        middle = xy[:, 8:]
+        reach = radius + 1.0
+        inside = np.asarray((middle > -0.5 - reach) & (middle < np.array(size) - 0.5 + reach)).all(axis=(1, 2))
+        xy, middle = xy[inside, :8], middle[inside]
+        xy = np.where(np.asarray(np.isfinite(xy).all(axis=(1, 2), keepdims=True)), xy, middle)
+        parts.append((boxes.rects[inside], boxes.heights[inside], xy + middle - xy.mean(axis=1, keepdims=True)))
+    rects, heights, xy = (np.concatenate(part) for part in zip(*parts))
+    of_squares: NDArray[np.bool_] = np.asarray(np.isfinite(wanted[0]))
+    mine: NDArray[np.bool_] = of_squares[rects[:, 1] // SQUARE, rects[:, 0] // SQUARE]
+    if not mine.any():
+        return None
+    along = np.stack([xy[mine][:, [1, 5]] - xy[mine][:, [0, 4]], xy[mine][:, [2, 6]] - xy[mine][:, [0, 4]]])
+    scale = np.hypot(along[0], along[1])
+    low, high = xy[mine].min(axis=(0, 1)), xy[mine].max(axis=(0, 1))
+    source = _source_window(low, high, radius * max(1.0, float(scale.max()), longest), size)
+    corners = np.ones((len(xy), 8, 3))
+    corners[..., :2] = xy - np.array([source.col, source.row])
+    return Anchors(
+        rects=rects,
+        box_start=np.arange(len(rects) + 1, dtype=np.int32),
+        box_heights=heights,
+        corners=corners,
+        field_frame=np.zeros(5),
+        field=np.empty((0, 0, 2), np.float32),
+        residual=0.0,
+        source_window=source,
+        scales=(float(scale.min()), float(scale.max())),
+    )
+
+
 def _assemble(
-    image: _Image, done: list[Piles], ranges: NDArray[np.float64], residual: float, radius: int, longest: float
+    image: _Image,
+    done: list[Piles],
+    ranges: NDArray[np.float64],
+    residual: float,
+    radius: int,
+    longest: float,
+    most: int,
 ) -> Anchors | None:
     rects, heights, corners = (np.concatenate(part) for part in zip(*done))
     starts = [0]
@@ -238,6 +317,8 @@ def _assemble(
         residual, nodes = residual * shaken.stretch + tremor.residual, shaken.nodes
         low, high = low + shaken.low, high + shaken.high
     if image.grid is not None:
+        if image.grid.nodes(low, high) > most:
+            raise _TooManyNodes
         table = image.grid.table(low, high)
         scales = scales[0] * max(0.0, 2.0 - image.grid.stretch), scales[1] * image.grid.stretch
         residual = residual * image.grid.stretch + table.residual

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import ImageField
 
 #: Widest and narrowest spacing of nodes, pixels.
-_WIDEST, _NARROWEST = 256.0, 1.0 / 64.0
+_WIDEST, _NARROWEST = 256.0, 1.0
 #: Intervals of nodes along each axis at which the spacing is tried out.
 _SAMPLES = 24
 #: The residual is that of the middles of cells and of their sides; what a third derivative adds beside them.
@@ -39,6 +39,11 @@ class FieldGrid:
     """Largest factor by which the field makes a distance longer."""
     miss: float
     """Worst difference between interpolation and field where it was tried, pixels; that of a tile is measured again."""
+
+    def nodes(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
+        """Number of nodes around the ideal positions from `low` to `high`, about."""
+        low, high = (np.clip(a, self.bounds[:2], self.bounds[2:]) for a in (low, high))
+        return float(np.prod((high - low) / self.spacing + 2.0))
 
     def table(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> FieldTable:
         """Nodes around the ideal positions from `low` to `high`, (x, y) each, cut at `bounds`."""
@@ -109,7 +114,8 @@ def field_grid(field: ImageField, size: tuple[int, int], tolerance: float) -> Fi
             break
         share = min(tolerance / 3, max(along_x, along_y))
         finer = [0.5 if len(breaks) else 0.5**0.5 for breaks in _breaks(field)]
-        spacings = [s * f if miss >= share else s for s, f, miss in zip(spacings, finer, (along_x, along_y))]
+        cut = [max(s * f, _NARROWEST) for s, f in zip(spacings, finer)]
+        spacings = [c if miss >= share else s for c, s, miss in zip(cut, spacings, (along_x, along_y))]
     return FieldGrid(
         field=field,
         size=size,

@@ -22,6 +22,8 @@ SQUARE = 64
 _LATTICE = np.array(list(itertools.product((0.0, 0.5, 1.0), repeat=3)))
 #: Places of the eight corners in the lattice, 4·ih + 2·iv + iu.
 CORNERS = np.flatnonzero((_LATTICE != 0.5).all(axis=1))
+#: Place of the middle of a box in the lattice.
+MIDDLE = int(np.flatnonzero((_LATTICE == 0.5).all(axis=1))[0])
 
 
 @dataclass(frozen=True, eq=False)

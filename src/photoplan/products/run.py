@@ -18,8 +18,15 @@ from photoplan.io.run_record import run_times, versions
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 320 * 2**20
-#: And of a tile: its source window as read and as packed for the kernel, relief, anchors and result.
+#: And of a tile: its source window as read and as packed for the kernel, relief and result.
 _EACH = 3 * MOST_SOURCE_BYTES
+#: Of each pixel of a tile that is computed strictly: it has a box of its own. Below this tolerance that may happen.
+_STRICT_PIXEL, _NEARLY_STRICT = 512, 1e-3
+
+
+def tile_bytes(tolerance: float, side: int) -> int:
+    """Memory that a tile of some pixels along its side takes."""
+    return _EACH + (_STRICT_PIXEL * side**2 if tolerance < _NEARLY_STRICT else 0)
 
 
 @dataclass(frozen=True)

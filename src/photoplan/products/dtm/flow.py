@@ -21,7 +21,7 @@ from photoplan.io.naming import together, when_named
 from photoplan.io.polygons import check_vectors, label_polygons, write_features
 from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
-from photoplan.plain import pick
+from photoplan.plain import advised, pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.products.dtm.visible import Place, named_points, own_grid, read_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
@@ -163,7 +163,7 @@ def _grid(request: FlowRequest, terrain: OpenTerrain) -> MapGrid:
     need = grid.width * grid.height * CELL_BYTES
     if need > request.memory:
         raise ResourceError(
-            f"{grid.width} × {grid.height} cells take {need / 2**30:.1f} GiB, allowed are "
+            f"{grid.width} × {grid.height} cells take {advised(need / 2**30, 3)} GiB, allowed are "
             f"{request.memory / 2**30:.1f}: water knows no tiles; give a coarser `resolution` or more `memory`"
         )
     return grid

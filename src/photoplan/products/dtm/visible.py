@@ -23,7 +23,7 @@ from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.io.tables import Columns, read_table
-from photoplan.plain import pick
+from photoplan.plain import advised, pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
@@ -246,8 +246,8 @@ def _check_memory(grid: MapGrid, count: int, request: VisibleRequest) -> None:
     need = grid.width * grid.height * (POST_BYTES + pixel * (count + (count > 1)))
     if need > request.memory:
         raise ResourceError(
-            f"{grid.width} × {grid.height} posts and {count} observers take {need / 2**30:.1f} GiB, allowed are "
-            f"{request.memory / 2**30:.1f}; give a `radius`, a coarser `resolution`, fewer observers or more `memory`"
+            f"{grid.width} × {grid.height} posts and {count} observers take {advised(need / 2**30, 3)} GiB, allowed "
+            f"are {request.memory / 2**30:.1f}; give a `radius`, a coarser `resolution`, fewer observers or more `memory`"
         )
 
 

@@ -42,7 +42,7 @@ from photoplan.products.orthophoto.keys import known_errors, tile_keys
 from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, painting
 from photoplan.products.orthophoto.stack import stack_index, write_stack
-from photoplan.products.run import Run, refuse_inputs
+from photoplan.products.run import Run, refuse_inputs, tile_bytes
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files, open_scene
 from photoplan.project.scenes import Scenes, ScenesAddress
@@ -83,7 +83,8 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     """
     run = run or Run()
     folder = Path(output)
-    run.check()
+    each = tile_bytes(plan.settings.tolerance, plan.settings.tile)
+    run.check(each)
     picture = folder / "overview.png" if run.quicklook else None
     rasters = [path for p in plan.products for path in all_files(folder, p, plan.settings)]
     refuse_inputs(input_files(plan.project), [*rasters, *([] if picture is None else [picture])])
@@ -104,7 +105,7 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     if plan.settings.choice is not None:
         _tell_of_one_colour([p for p in plan.products if p.plan.name not in kept], plan.project, run.events)
     run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))
-    with run.runner(_pixel_files(plan), folder) as runner:
+    with run.runner(_pixel_files(plan), folder, each) as runner:
         works = (_work(plan, p, folder, run, kept.get(p.plan.name), runner.workers) for p in plan.products)
         results: list[ProductResult] = runner.run(works)
     if picture is not None:

@@ -14,6 +14,7 @@ from photoplan.events import Events
 from photoplan.geometry.grid import refuse_absurd
 from photoplan.io.project.model import Project
 from photoplan.orientation.plausibility import ImagePlausibility, JudgedView
+from photoplan.plain import advised
 from photoplan.plan.footprint import Footprint, image_border, mean_gsd, some_height
 from photoplan.products.judged import judged, reading_of_block
 from photoplan.products.orthophoto.settings import OrthoSettings
@@ -130,8 +131,8 @@ def _refuse_too_fine(resolution: float, settings: OrthoSettings, looked: Sequenc
         tiles += math.ceil(width / settings.tile) * math.ceil(height / settings.tile)
     raise UsageError(
         f"resolution {resolution:g} m is {finest / resolution:.3g} times finer than the images see the ground "
-        f"({finest:.3g} m): {pixels:.3g} pixels in {tiles:.3g} tiles, most of them made up; choose {finest / 2:.2g} m "
-        "or more, or say `force`"
+        f"({finest:.3g} m): {pixels:.3g} pixels in {tiles:.3g} tiles, most of them made up; choose "
+        f"{advised(finest / 2)} m or more, or say `force`"
     )
 
 

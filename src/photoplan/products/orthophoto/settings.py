@@ -67,7 +67,7 @@ class OrthoSettings:
     kernel: Kernel = "bicubic"
     """Resampling kernel; bicubic is a = −0.5, bicubic-1 is a = −1."""
     tolerance: float = 0.02
-    """Largest residual of the anchors, pixels of the source image."""
+    """Largest residual of the anchors, pixels of the source image; 0: every pixel strictly by its camera."""
     tile: int = 512
     """Side of a tile, pixels; a multiple of 16 from 128 on."""
     true: bool = False
@@ -98,6 +98,11 @@ class OrthoSettings:
     """Name of a virtual raster that shows all orthophotos as bands of one, on the same ground: lines of one camera, of
     other colours; empty: there is none."""
 
+    @property
+    def exactness(self) -> str:
+        """How exactly positions are computed, in words."""
+        return f"tolerance {self.tolerance:g} px" if self.tolerance else "every pixel strictly by its camera"
+
     def __post_init__(self) -> None:
         if self.resolution is not None:
             check_resolution(self.resolution)
@@ -109,8 +114,11 @@ class OrthoSettings:
         for what, value, allowed in (*names, ("method", self.method, Method)):
             if value not in get_args(allowed):
                 raise UsageError(f"{what} {value!r}; allowed are {', '.join(get_args(allowed))}")
-        if not 1e-6 <= self.tolerance <= 10:
-            raise UsageError(f"tolerance {self.tolerance} px; allowed are 1e-6 to 10, usual is 0.02")
+        if not (self.tolerance == 0 or 1e-6 <= self.tolerance <= 10):
+            raise UsageError(
+                f"tolerance {self.tolerance} px; it must be 0 (every pixel strictly by its camera) or 1e-6 to 10 "
+                "(usual is 0.02)"
+            )
         if self.tile < 128 or self.tile > 4096 or self.tile % 16:
             raise UsageError(f"tile side {self.tile}; allowed are multiples of 16 from 128 to 4096")
         if self.bounds is not None:

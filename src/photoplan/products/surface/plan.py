@@ -18,7 +18,7 @@ from photoplan.io.fingerprint import fingerprint
 from photoplan.io.project.model import Project
 from photoplan.io.run_record import run_key
 from photoplan.matching.facets.reconstruct import Scheme
-from photoplan.plain import pick
+from photoplan.plain import advised, pick
 from photoplan.products.orthophoto.look import extent_text
 from photoplan.products.surface.begin import start_apart
 from photoplan.products.surface.scheme import finer_levels, pixels_of_places, scheme_of
@@ -205,7 +205,7 @@ def plan_surface(
     if settings.resolution < _FINEST * gsd * 0.999:
         raise UsageError(
             f"resolution {settings.resolution:g} m is finer than the images see the {settings.seen} ({gsd:.3g} m): a "
-            f"height needs some pixels; choose {3 * gsd:.2g} m, or {gsd:.2g} m at least"
+            f"height needs some pixels; choose {advised(3 * gsd)} m, or {advised(_FINEST * gsd)} m at least"
         )
     grid = MapGrid.covering(bounds, settings.resolution, project.crs if frame is None else None)
     if min(grid.width, grid.height) < 2:
