@@ -131,8 +131,8 @@ def _refuse_too_fine(resolution: float, settings: OrthoSettings, looked: Sequenc
         tiles += math.ceil(width / settings.tile) * math.ceil(height / settings.tile)
     raise UsageError(
         f"resolution {resolution:g} m is {finest / resolution:.3g} times finer than the images see the ground "
-        f"({finest:.3g} m): {pixels:.3g} pixels in {tiles:.3g} tiles, most of them made up; choose "
-        f"{advised(finest / 2)} m or more, or say `force`"
+        f"({finest:.3g} m): {pixels:.3g} pixels in {tiles:.3g} tiles, most of them made up; "
+        f"choose {advised(finest / 2)} m or more, or say `force`"
     )
 
 
