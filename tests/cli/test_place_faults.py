@@ -110,12 +110,12 @@ class TestFaults20And21Places:
         assert f"{small.project}: crs: " in said
         assert message in said
 
-    def test_fault_20_heights_in_feet(self, photoplan: Here, small: Block) -> None:
+    def test_fault_20_heights_in_an_unknown_unit(self, photoplan: Here, small: Block) -> None:
         with rasterio.open(small.terrain, "r+") as file:
-            file.units = ["ft"]
+            file.units = ["cubits"]
         said = refused(photoplan, small.project)
         assert str(small.terrain) in said
-        assert "convert them to metres" in said
+        assert "'cubits' is not a known unit of length" in said
 
     def test_fault_20_a_terrain_in_another_crs_is_converted(self, photoplan: Here, small: Block) -> None:
         """The same hills in the neighbouring zone give the same product within the DEM's own interpolation."""

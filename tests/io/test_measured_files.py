@@ -19,10 +19,17 @@ from numpy.typing import NDArray
 from tools.effort import at_most
 
 from photoplan.errors import HeightSystemError, InputError, UsageError
-from photoplan.io.terrain.files import read_measured
+from photoplan.io.terrain import files
 from photoplan.io.terrain.options import CodeClass, CodeTable, ReadOptions
+from photoplan.surfaces.measured import MeasuredTerrain
 
 laspy = pytest.importorskip("laspy", reason="needs laspy")
+
+
+def read_measured(paths: Sequence[Path], options: ReadOptions | None = None) -> MeasuredTerrain:
+    """Files whose small coordinates lie far outside the area of their CRS."""
+    return files.read_measured(paths, replace(options or ReadOptions(), beyond_area=True))
+
 
 # ---- LandXML ---------------------------------------------------------------------------------------------------------
 
@@ -122,15 +129,15 @@ def test_a_triangulation_is_no_measurement_unless_asked(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("head", "message"),
     [
-        ('<Units><Imperial linearUnit="foot"/></Units>', "lengths in foot.*metres are needed"),
+        ('<Units><Imperial linearUnit="foot"/></Units><CoordinateSystem epsgCode="32632"/>', "feet.*metres"),
+        ('<Units><Metric linearUnit="ell"/></Units>', "linearUnit: 'ell' is not a known unit"),
         ('<Units><Metric linearUnit="millimeter"/></Units>', "millimeter"),
-        ('<Units><Metric linearUnit="meter" elevationUnit="feet"/></Units>', "heights in feet"),
         (UNITS + '<CoordinateSystem epsgCode="4326"/>', "geographic.*ogr2ogr"),
-        (UNITS + '<CoordinateSystem epsgCode="2230"/>', "foot"),
+        (UNITS + '<CoordinateSystem epsgCode="2230"/>', "metres.*feet"),
         (UNITS + '<CoordinateSystem epsgCode="99"/>', "not a coordinate reference system"),
     ],
 )
-def test_fault_20_landxml_not_in_metres_is_refused(tmp_path: Path, head: str, message: str) -> None:
+def test_fault_20_landxml_in_contradicting_units_is_refused(tmp_path: Path, head: str, message: str) -> None:
     path = landxml(tmp_path / "a.xml", "<DataPoints><PntList3D>0 0 0</PntList3D></DataPoints>", head=head)
     with pytest.raises(InputError, match=message):
         read_measured([path])
@@ -310,13 +317,15 @@ def test_las_without_laspy_says_how_to_get_it(tmp_path: Path, monkeypatch: pytes
         read_measured([path])
 
 
-def test_fault_20_las_in_feet_or_degrees_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="foot"):
+def test_fault_20_las_in_feet_is_converted_or_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unit of heights is not stated"):
         read_measured([las(tmp_path / "a.las", 2, "EPSG:2230")])
     with pytest.raises(InputError, match="geographic"):
         read_measured([las(tmp_path / "b.las", 2, "EPSG:4326")])
-    with pytest.raises(InputError, match="heights in US survey foot"):
-        read_measured([las(tmp_path / "c.las", 2, "EPSG:26910+6360")])
+    plain = read_measured([las(tmp_path / "p.las", 2, "EPSG:26910+5703")])
+    feet = read_measured([las(tmp_path / "c.las", 2, "EPSG:26910+6360")])
+    assert feet.height_system == plain.height_system == "EPSG:5703"
+    np.testing.assert_allclose(feet.points[0].xyz, plain.points[0].xyz * [1, 1, 1200 / 3937])
 
 
 # ---- vector files ----------------------------------------------------------------------------------------------------
@@ -454,9 +463,16 @@ def test_dxf_layers_are_classes(tmp_path: Path) -> None:
     assert only.count == 1 and not only.lines
 
 
-def test_fault_20_dxf_in_feet_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="feet"):
-        read_measured([dxf(tmp_path / "a.dxf", POINT, 2)])
+@pytest.mark.parametrize(("number", "metres"), [(2, 0.3048), (21, 1200 / 3937), (4, 1e-3), (1, 0.0254), (14, 0.1)])
+def test_fault_20_dxf_in_other_units_is_converted(tmp_path: Path, number: int, metres: float) -> None:
+    measured = read_measured([dxf(tmp_path / "a.dxf", POINT, number)])
+    np.testing.assert_allclose(measured.points[0].xyz, np.array([[1, 2, 3]]) * metres)
+    assert any("converted to metres" in note for note in measured.notes)
+
+
+def test_fault_20_dxf_in_no_known_unit_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a\.dxf.*INSUNITS"):
+        read_measured([dxf(tmp_path / "a.dxf", POINT, 25)])
 
 
 def test_fault_07_nested_blocks_of_a_drawing_are_not_unfolded(tmp_path: Path) -> None:
@@ -525,9 +541,9 @@ def test_one_file_twice_and_no_files_are_refused(tmp_path: Path) -> None:
         ("a.asc", b"ncols 5\nnrows 5\n", "a raster"),
         ("a.xyz", b"", "empty"),
         ("a.xml", b"<gml/>", "<gml>; LandXML"),
-        ("a.gpkg", b"SQLite format 3\x00 damaged", "cannot be opened"),
+        ("a.gpkg", b"SQLite format 3\x00 damaged", "cannot be read"),
         ("a.shp", b"\x00\x00\x27\x0a damaged", "cannot be"),
-        ("a.geojson", b'{"type": "nothing"', "cannot be opened"),
+        ("a.geojson", b'{"type": "nothing"', "cannot be read"),
         ("a.las", b"LASF", "cut off in its header"),
     ],
 )

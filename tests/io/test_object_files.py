@@ -162,10 +162,10 @@ def broken(**changes: Any) -> dict[str, Any]:
     ("data", "told"),
     [
         (city(version="3.0"), "not CityJSON 1.0 to 2.0"),
-        (city(vertices=[[0, 0]]), "list of X, Y, Z"),
-        (city(vertices=[[0, 0, 1e999]] * 8).__repr__().replace("'", '"').replace("inf", "1e999"), "no numbers"),
+        (city(vertices=[[0, 0]]), "vertices: a list"),
+        (city(vertices=[[0, 0, 1e999]] * 8).__repr__().replace("'", '"').replace("inf", "1e999"), "no number"),
         (city(transform={"scale": [1, 1]}), "3 numbers are needed"),
-        (city(CityObjects=[]), "no CityObjects"),
+        (city(CityObjects=[]), "CityObjects"),
         (broken(boundaries=[[[[0, 1, 99]]]], semantics=None), "'house'.*vertex 99 of 8"),
         (broken(boundaries=[[[[0, 1, -1]]]], semantics=None), "'house'.*vertex -1 of 8"),
         (broken(boundaries=[[[[0, 1.5, 2]]]], semantics=None), "'house'.*no list of vertices"),
@@ -259,7 +259,7 @@ def test_meshes_hide(tmp_path: Path) -> None:
         (OBJ + "f 1 2 9\n", "names vertex 8 of 4"),
         (OBJ + "f 1 2 -9\n", ":9: .*three corners"),
         (OBJ + "v 1 2\n", ":9: 'v 1 2' is no v"),
-        ("v 1 2 nan\n" + OBJ + "f 1 2 3\n", "no numbers"),
+        ("v 1 2 nan\n" + OBJ + "f 1 2 3\n", "no number"),
         ("v 1 2 3\n", "holds no faces"),
     ],
 )

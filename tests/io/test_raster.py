@@ -140,13 +140,11 @@ def test_pixel_is_point_names_the_same_places(tmp_path: Path) -> None:
 
 def test_compound_reference_system_and_unit(tmp_path: Path) -> None:
     info = read_info(make(tmp_path / "a.tif", scene(1), crs="EPSG:32633+5773", transform=rasterio.Affine.scale(2)))
-    assert info.vertical_crs is not None
-    assert "EGM96" in info.vertical_crs
-    assert (info.unit, info.metres_per_unit) == ("metre", 1.0)
+    assert (info.height_system, info.metres_per_unit) == ("EPSG:5773", 1.0)
     feet = read_info(make(tmp_path / "b.tif", scene(1), crs="EPSG:2263+6360", transform=rasterio.Affine.scale(2)))
     assert feet.metres_per_unit == pytest.approx(1200 / 3937, rel=1e-12)
     plain = read_info(make(tmp_path / "c.tif", scene(1), crs="EPSG:32633", transform=rasterio.Affine.scale(2)))
-    assert (plain.vertical_crs, plain.unit, plain.metres_per_unit) == (None, None, None)
+    assert (plain.height_system, plain.band_unit, plain.metres_per_unit) == (None, None, None)
 
 
 class TestFault22Validity:

@@ -69,7 +69,7 @@ def test_values_that_are_no_heights_are_refused_with_their_count(tmp_path: Path,
     heights = hills((20, 30))
     heights[3, 4:7] = value
     path = grid(tmp_path / "a.tif", heights)
-    with pytest.raises(InputError, match=rf"a\.tif: 3 values in window .* no heights .* {value:g}; declare the nodata"):
+    with pytest.raises(InputError, match=rf"a\.tif: 3 values in .* no heights .* {value:g} m; .*declare the nodata"):
         TerrainReader(path).read(Window(0, 0, 5, 5))
 
 
@@ -77,11 +77,11 @@ def test_scale_offset_and_feet(tmp_path: Path) -> None:
     stored = np.full((4, 5), 12_345, np.int16)
     path = grid(tmp_path / "a.tif", stored, scales=(0.01,), offsets=(500.0,), units=("US survey foot",))
     reader = TerrainReader(path)
-    np.testing.assert_allclose(reader.read(Window(0, 0, 5, 4)), 623.45, rtol=1e-7)
+    np.testing.assert_allclose(reader.read(Window(0, 0, 5, 4)), 623.45 * 1200 / 3937, rtol=1e-7)
     assert reader.info.metres_per_unit == pytest.approx(0.3048006096, abs=1e-10)
     # 30 000 ft are no height of the Earth in metres, but less than 9 144 m: the limit is asked in metres.
     feet = grid(tmp_path / "b.tif", np.full((4, 5), 29_000, np.int16), units=("ft",))
-    assert TerrainReader(feet).pixel(0, 0) == 29_000
+    assert TerrainReader(feet).pixel(0, 0) == pytest.approx(29_000 * 0.3048)
     with pytest.raises(InputError, match="no heights"):
         TerrainReader(grid(tmp_path / "c.tif", np.full((4, 5), 29_000, np.int16))).pixel(0, 0)
 

@@ -272,7 +272,7 @@ def test_fault_20_an_orientation_in_another_crs_is_transformed_angles_included(f
 def test_fault_20_feet_need_a_named_vertical_unit(files: dict[str, Any]) -> None:
     files["orientation"].with_suffix(".prj").write_text("EPSG:2225")
     files["orientation"].write_text(HEAD + "a,6561666.7,1640416.7,900,0,0,0\nb,6561766.7,1640416.7,900,0,0,0\n")
-    with pytest.raises(HeightSystemError, match="US survey foot"):
+    with pytest.raises(HeightSystemError, match=r"ext\.csv.*EPSG:6360 in US survey feet"):
         make_project(InitRequest(**files, crs="EPSG:26910"))
 
 

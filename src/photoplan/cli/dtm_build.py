@@ -41,6 +41,8 @@ _SHOWN = 10
 @click.option("--tin-points", is_flag=True, help="Vertices of a LandXML triangulation as points, if it has no others.")
 @click.option("--nodata", type=float, help="Height that means none.")
 @click.option("--crs", help="CRS of files that state none.")
+@click.option("--height-field", metavar="NAME", help="Attribute of vector files that holds heights, as of contours.")
+@click.option("--unit", help="Unit of drawings whose header states none or a wrong one [as $INSUNITS states].")
 @click.option("--height-system", help="Height system of files that state none: ellipsoidal or EPSG:nnnn.")
 @beyond_area_option
 @click.option("--report/--no-report", default=None, help="A page with plots beside the model [if matplotlib is there].")
@@ -115,6 +117,8 @@ def _request(options: dict[str, Any]) -> BuildRequest:
         nodata=options.pop("nodata"),
         crs=options.pop("crs"),
         beyond_area=options.pop("beyond_area"),
+        height_field=options.pop("height_field"),
+        unit=options.pop("unit"),
     )
     settings = BuildSettings(
         grid_width=options.pop("grid_width"),

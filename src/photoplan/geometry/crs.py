@@ -38,8 +38,8 @@ def parse_crs(text: str, where: str = "CRS") -> CRS:
     try:
         crs = CRS.from_user_input(text.strip())
         why = "" if text.strip()[:5].upper() == "EPSG:" else _unusable(crs)
-    except CRSError as error:
-        why = str(error).split(":")[-1].strip(" )")
+    except (CRSError, ValueError) as error:  # a text may hold bytes that are no text
+        why = str(error).split(":")[-1].strip(" )") or "unknown"
     if why:
         raise InputError(
             f"{where}: {text[:120]!r} is not a coordinate reference system ({why}); "
@@ -243,15 +243,17 @@ def _east_north_of(crs: CRS) -> str:
 def split_compound(text: str) -> tuple[str, str | None]:
     """Horizontal CRS as a string, and the height system that the text states.
 
-    The second is a vertical CRS's string for a compound CRS, ``"ellipsoidal"`` for a three-dimensional one,
-    and None where nothing is said of heights.
+    The second is a vertical CRS's string for a compound CRS, ``"ellipsoidal"`` for a three-dimensional one (its own
+    string if its heights are not metres upwards), and None where nothing is said of heights.
     """
     crs = parse_crs(text)
     if crs.is_compound:
         parts = crs.sub_crs_list
         return canonical_crs(parts[0].to_wkt()), canonical_crs(parts[1].to_wkt())
     if len(crs.axis_info) == 3 and not crs.is_geocentric:
-        return canonical_crs(crs.to_2d().to_wkt()), "ellipsoidal"
+        height = crs.axis_info[2]
+        metric = height.unit_conversion_factor == 1.0 and height.direction.casefold() == "up"
+        return canonical_crs(crs.to_2d().to_wkt()), "ellipsoidal" if metric else canonical_crs(text)
     return canonical_crs(text), None
 
 

@@ -21,6 +21,7 @@ from pyproj.transformer import TransformerGroup
 
 from photoplan.errors import HeightSystemError, InputError, UsageError
 from photoplan.geometry.crs import area_of, canonical_crs, crs_label, missing_grids, parse_crs
+from photoplan.geometry.units import metric_heights, unit_label
 
 OPTIONS = (
     "ellipsoidal, EPSG:nnnn (a vertical CRS, such as EPSG:5773 for EGM96), or same (both inputs are in one system)"
@@ -46,8 +47,27 @@ def check_height_system(name: str, where: str = "height system") -> str:
     if crs.is_vertical:
         return canonical_crs(name)
     if len(crs.axis_info) == 3 and not crs.is_geocentric:
-        return "ellipsoidal"
+        return "ellipsoidal" if metric_heights(name)[1] == 1.0 else canonical_crs(name)
     raise HeightSystemError(f"{where}: {crs.name!r} says nothing of heights; allowed are {OPTIONS}")
+
+
+def require_metric_heights(name: str, where: str) -> str:
+    """The name in its canonical form, if its heights are metres upwards.
+
+    Raises
+    ------
+    HeightSystemError
+        It is not a height system, or in another unit, or of depths.
+    """
+    name = check_height_system(name, where)
+    metric, rise = metric_heights(name)
+    if rise != 1.0:
+        raise HeightSystemError(
+            f"{where}: {height_label(name)} has heights in {unit_label(rise)}; metres upwards are needed here: convert "
+            f"the heights and declare {crs_label(metric) if metric != 'ellipsoidal' else metric} "
+            "(`photoplan init` converts those of orientations)"
+        )
+    return name
 
 
 def height_label(name: str | None) -> str:
@@ -62,6 +82,8 @@ def height_label(name: str | None) -> str:
 def declared_pair(terrain: str | None, orientation: str | None) -> tuple[str, str]:
     """Height systems of terrain and orientation, both known; ``"same"`` stands for the other one's where it has a name.
 
+    Both are in metres upwards: readers convert heights in other units.
+
     Raises
     ------
     HeightSystemError
@@ -73,7 +95,10 @@ def declared_pair(terrain: str | None, orientation: str | None) -> tuple[str, st
             f"one, or `height_system` same, to `photoplan init`; in the project file: height_system in [terrain] "
             f"and [orientation]; allowed are {OPTIONS}"
         )
-    pair = [check_height_system(terrain, "terrain"), check_height_system(orientation, "orientation")]
+    pair = [
+        metric_heights(check_height_system(system, what))[0]
+        for system, what in ((terrain, "terrain"), (orientation, "orientation"))
+    ]
     named = [p for p in pair if p != "same"]
     if len(named) == 1:
         pair = named * 2
@@ -99,7 +124,9 @@ def common_system(stated: Mapping[Path, str | None], declared: str | None) -> st
     """
     if declared not in (None, "same"):
         raise UsageError(f"height system {declared!r}; `same` declares that all models have one")
-    named = {path: check_height_system(system) for path, system in stated.items() if system is not None}
+    named = {
+        path: metric_heights(check_height_system(system))[0] for path, system in stated.items() if system is not None
+    }
     if len(set(named.values())) > 1:
         told = ", ".join(f"{path}: heights {height_label(system)}" for path, system in named.items())
         raise HeightSystemError(f"{told}; convert one of them first")

@@ -24,7 +24,7 @@ class DrawnFeatures:
 
     path: Path
     XYZ: NDArray[np.float64]
-    """Vertices of all, shape (n, 3); NaN height: none is stated."""
+    """Vertices of all in the units of the file, shape (n, 3); NaN height: none is stated."""
     part: NDArray[np.int64]
     """Number of the point or line of each vertex, ascending, shape (n,)."""
     is_point: NDArray[np.bool_]
@@ -36,6 +36,8 @@ class DrawnFeatures:
     crs: str | None
     """Of the map; None: the file does not state it."""
     height_system: str | None
+    unit: float | None = None
+    """Metres in the unit of a drawing; None: none is stated."""
 
 
 def read_drawn_features(path: Path, layer: str | None) -> DrawnFeatures:
@@ -80,4 +82,5 @@ def read_drawn_features(path: Path, layer: str | None) -> DrawnFeatures:
         fields=fields,
         crs=crs,
         height_system=heights,
+        unit=found.unit,
     )

@@ -19,7 +19,8 @@ import numpy as np
 
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import InputError
-from photoplan.geometry.crs import crs_label, crs_step, parse_crs, same_crs, split_compound
+from photoplan.geometry.crs import crs_label, crs_step, parse_crs, same_crs
+from photoplan.geometry.units import metric_system
 from photoplan.io.names import same_images
 from photoplan.io.plain_files import read_text
 from photoplan.io.table_lines import NUMBER, number
@@ -67,7 +68,8 @@ def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
     lines = [(n, text.strip()) for n, text in enumerate(read_text(path, MAX_BYTES).split("\n"), 1) if text.strip()]
     if not lines:
         raise InputError(f"{path}: holds no line with data")
-    own = _crs(f"{path}:{lines[0][0]}", lines[0][1])
+    system = metric_system(_crs(f"{path}:{lines[0][0]}", lines[0][1]))
+    own = system.crs
     rows = [_line(path, line, text) for line, text in lines[1:] if not text.startswith("#")]
     if not rows:
         raise InputError(f"{path}: holds a CRS and no measurement")
@@ -88,7 +90,7 @@ def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
                 f"{path}:{row.number}: point {name!r} is measured in image {row.image!r} in line {at} already; keep "
                 "one of the measurements"
             )
-    XYZ = np.array([row.XYZ for row in places.values()], float)
+    XYZ = system.to_metres(np.array([row.XYZ for row in places.values()], float), f"{path}: heights")
     if crs is not None and not same_crs(own, crs):
         XYZ[:, :2] = crs_step(own, crs)(XYZ[:, :2])
         own = crs
@@ -111,7 +113,7 @@ def _crs(where: str, text: str) -> str:
     if len(text.split()) >= 6 and sum(bool(NUMBER.fullmatch(word)) for word in text.split()[:5]) == 5:
         raise InputError(f"{where}: the first line is a measurement; it must state the CRS, such as EPSG:32632")
     parse_crs(text, where)
-    return split_compound(text)[0]
+    return text
 
 
 def _line(path: Path, line: int, text: str) -> _Line:

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import odd_place
-from photoplan.geometry.crs import crs_label, same_crs, split_compound
+from photoplan.geometry.crs import crs_label, same_crs
+from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.checks import check_plain_file
 from photoplan.io.plain_files import crs_beside
 from photoplan.io.tables import Columns, Dialect, read_table, write_table
@@ -50,7 +51,8 @@ def read_ground_points(
     Parameters
     ----------
     crs : str, optional
-        The CRS that the points must be in, where the file (or a ``.prj`` beside it) states one.
+        The CRS that the points must be in, where the file (or a ``.prj`` beside it) states one. Coordinates that it
+        states in feet or another unit are converted to metres; standard deviations are in metres always.
     columns : str, optional
         Columns of a table in their order where it does not name them; ``-`` for one that is not used.
     decimal_comma : bool
@@ -70,10 +72,9 @@ def read_ground_points(
     if path.suffix.lower() == ".gpkg":
         return _from_layer(path, crs)
     beside = crs_beside(path)
-    _check_crs(path, None if beside is None else beside.crs, crs)
     table = read_table(path, Columns(roles=_ROLES, needed=_NEEDED), Dialect(columns, decimal_comma=decimal_comma))
     names = table.names("name")
-    XYZ = table.numbers("x", "y", "z", empty=True)
+    XYZ = _in_metres(path, table.numbers("x", "y", "z", empty=True), None if beside is None else beside.system, crs)
     return _points(names, XYZ, lambda role: table.numbers(role, empty=True), table.texts("role"), table.where)
 
 
@@ -122,18 +123,23 @@ def _first(*columns: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def _check_crs(path: Path, own: str | None, wanted: str | None) -> None:
-    if own is not None and wanted is not None and not same_crs(split_compound(own)[0], wanted):
+def _in_metres(
+    path: Path, XYZ: NDArray[np.float64], own: MetricSystem | None, wanted: str | None
+) -> NDArray[np.float64]:
+    """Coordinates in metres; a CRS other than the wanted one is refused."""
+    if own is None:
+        return XYZ
+    if wanted is not None and not same_crs(own.crs, wanted):
         raise InputError(
-            f"{path}: ground points in {crs_label(own)}, the project is in {crs_label(wanted)}; transform them"
+            f"{path}: ground points in {crs_label(own.crs)}, the project is in {crs_label(wanted)}; transform them"
         )
+    return own.to_metres(XYZ, f"{path}: heights")
 
 
 def _from_layer(path: Path, crs: str | None) -> GroundPoints:
     path = check_plain_file(path, "ground points")
     found = read_layer(path)
     shapes = found.shapes
-    _check_crs(path, found.crs, crs)
 
     def where(k: int) -> str:
         return f"{path}: feature {k + 1}"
@@ -152,6 +158,7 @@ def _from_layer(path: Path, crs: str | None) -> GroundPoints:
     if not all(names):
         raise InputError(f"{where(names.index(''))} has no name; give it one")
     XYZ = np.stack([shapely.get_x(shapes), shapely.get_y(shapes), shapely.get_z(shapes)], axis=1)
+    XYZ = _in_metres(path, XYZ, None if found.crs is None else metric_system(found.crs, f"{path}: CRS"), crs)
 
     def numbers(role: str) -> NDArray[np.float64]:
         column = next((fields[n] for n in _ROLES[role] if n in fields), None)

@@ -128,7 +128,7 @@ def read_observed_positions(
         return _from_orientation(path, form, crs)
     beside = None if crs is None else crs_beside(path)
     if beside is not None and crs is not None:
-        _same(path, beside.crs, crs)
+        _same(path, beside.system.crs, crs)
     table = read_table(
         path, Columns(roles=_ROLES, needed=_NEEDED), Dialect(columns, form.delimiter, form.decimal_comma)
     )
@@ -142,6 +142,8 @@ def read_observed_positions(
                 f"{table.where(k)}: image {name!r} is given in line {table.lines[at]} already; keep one of the lines"
             )
     XYZ = table.numbers("x", "y", "z")
+    if beside is not None:
+        XYZ = beside.system.to_metres(XYZ, f"{path}: heights")
     for k, place in enumerate(XYZ.tolist()):
         odd = odd_place(place, camera=True)
         if odd is not None:
@@ -239,7 +241,7 @@ def _from_images(path: Path, crs: str) -> PositionTable:
 
 
 def _from_orientation(path: Path, form: TableFormat, crs: str | None) -> PositionTable:
-    table = read_orientation(path, form)
+    table = read_orientation(path, form).heights_in_metres(None)
     if table.origin is not None:
         raise InputError(f"{path}: positions refer to a local system; `photoplan convert` brings them into the CRS")
     if table.crs is not None and crs is not None:

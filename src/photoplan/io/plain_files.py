@@ -10,10 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
+from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.appearance import looks_like
 from photoplan.io.project.errors import explain
 
@@ -87,7 +90,7 @@ def read_json(path: Path, max_bytes: int = 1_000_000_000) -> Any:
     InputError
         The file is not JSON, or nested without reason.
     """
-    return _from_json(path, read_text(path, max_bytes))
+    return parse_json(read_text(path, max_bytes), str(path))
 
 
 def read_json_lines(path: Path, max_bytes: int = 1_000_000_000) -> list[Any]:
@@ -104,20 +107,98 @@ def read_json_lines(path: Path, max_bytes: int = 1_000_000_000) -> list[Any]:
     first = next((line for line in lines if line.strip()), "")
     # The first line of a document in many lines is no document.
     if not (first.rstrip().endswith("}") and first.lstrip().startswith("{")):
-        return [_from_json(path, text)]
-    return [_from_json(path, line, number) for number, line in enumerate(lines, 1) if line.strip()]
+        return [parse_json(text, str(path))]
+    return [parse_json(line, str(path), number) for number, line in enumerate(lines, 1) if line.strip()]
 
 
-def _from_json(path: Path, text: str, first_line: int = 1) -> Any:
+def parse_json(text: str, where: str, first_line: int = 1) -> Any:
+    """Plain contents of a JSON text, the one place where foreign JSON is taken apart.
+
+    Whole numbers beyond 64 bits become floats; NaN, infinity and numbers too large for a float are refused.
+
+    Raises
+    ------
+    InputError
+        The text is not JSON, or nested without reason; the message begins with `where`.
+    """
+
     def refuse(word: str) -> NoReturn:
-        raise InputError(f"{path}: holds {word}, which is no number in JSON; repair the file")
+        raise InputError(f"{where}: holds {word[:40]}, which is no number in JSON; repair the file")
+
+    def number(word: str) -> float:
+        value = float(word)
+        return value if math.isfinite(value) else refuse(word)
+
+    def whole(word: str) -> int | float:
+        return int(word) if len(word) < 19 else number(word)
 
     try:
-        return json.loads(text, parse_constant=refuse)
+        return json.loads(text, parse_constant=refuse, parse_int=whole, parse_float=number)
     except json.JSONDecodeError as error:
-        raise InputError(f"{path}:{error.lineno + first_line - 1}: not valid JSON ({error.msg})") from None
+        raise InputError(f"{where}:{error.lineno + first_line - 1}: not valid JSON ({error.msg})") from None
     except RecursionError:
-        raise InputError(f"{path}: nested far too deep for a file of this kind") from None
+        raise InputError(f"{where}: nested far too deep for a file of this kind") from None
+
+
+def json_object(text: Any, where: str) -> dict[str, Any]:
+    """Members of a JSON text that must be an object.
+
+    Raises
+    ------
+    InputError
+        It is none; the message begins with `where`.
+    """
+    if not isinstance(text, str):
+        raise InputError(f"{where}: {type(text).__name__} instead of a text in JSON")
+    return members(parse_json(text, where), where)
+
+
+def members(value: Any, where: str) -> dict[str, Any]:
+    """The value, if it is an object of JSON; None stands for an empty one.
+
+    Raises
+    ------
+    InputError
+        It is something else; the message begins with `where`.
+    """
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: {str(value)[:60]!r} given; named values in {{ }} are needed")
+    return value
+
+
+def elements(value: Any, where: str) -> list[Any]:
+    """The value, if it is a list of JSON; None stands for an empty one.
+
+    Raises
+    ------
+    InputError
+        It is something else; the message begins with `where`.
+    """
+    if value is None:
+        return []
+    if not isinstance(value, list):
+        raise InputError(f"{where}: {str(value)[:60]!r} given; a list is needed")
+    return value
+
+
+def number_rows(value: Any, where: str, width: int) -> NDArray[np.float64]:
+    """A list of lists of `width` finite numbers, shape (n, width); None stands for an empty one.
+
+    Raises
+    ------
+    InputError
+        It is something else; the message begins with `where`.
+    """
+    rows = elements(value, where)
+    try:
+        out = np.array(rows, float).reshape(-1, width) if rows else np.empty((0, width))
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        out = np.full((1, width), np.nan)
+    if not np.isfinite(out).all() or len(out) != len(rows):
+        raise InputError(f"{where}: a list of {width} finite numbers each is needed")
+    return out
 
 
 def build(model: type[M], values: dict[str, Any], source: str) -> M:
@@ -163,6 +244,8 @@ class StatedCrs:
     """Horizontal CRS."""
     height_system: str | None
     """None: it states a horizontal CRS alone."""
+    system: MetricSystem
+    """The same in metres, with what leads coordinates there."""
 
 
 def crs_beside(path: Path) -> StatedCrs | None:
@@ -178,7 +261,7 @@ def crs_beside(path: Path) -> StatedCrs | None:
         return None
     text = read_text(side, _MAX_BYTES).strip()
     parse_crs(text, str(side))
-    return StatedCrs(side, *split_compound(text))
+    return StatedCrs(side, *split_compound(text), metric_system(text, str(side)))
 
 
 #: A project of 100,000 images stays far below; anything larger is not a project file.
@@ -196,7 +279,7 @@ def read_toml(path: Path, max_bytes: int = MAX_BYTES) -> tuple[dict[str, Any], s
     text = read_text(path, max_bytes)
     try:
         return tomllib.loads(text), text
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # whole numbers of thousands of digits are no TOMLDecodeError
         raise InputError(f"{path}: not valid TOML: {error}") from None
 
 

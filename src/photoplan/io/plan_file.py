@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyogrio.raw
@@ -15,11 +16,19 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.naming import give_name
+from photoplan.io.plain_files import json_object
+from photoplan.io.vector_layer import read_columns
 
 FORMAT = 2
 _HEADER = "photoplan_plan"
 #: What is read of the tiles again.
-_READ = ["product", "tile", "sources", "cells", "residual_px"]
+_READ: dict[str, Literal["text", "integer", "number"]] = {
+    "product": "text",
+    "tile": "integer",
+    "sources": "text",
+    "cells": "integer",
+    "residual_px": "number",
+}
 #: Tiles that are written at once: as polygons they take much more memory than as numbers.
 _PIECE = 100_000
 
@@ -118,12 +127,15 @@ def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]
     if not path.is_file():
         raise InputError(f"{path}: no such plan")
     try:
-        with sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True) as db:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
             row = db.execute(f"SELECT format, content FROM {_HEADER}").fetchone()
-        db.close()
-    except sqlite3.Error as error:
+    except (sqlite3.Error, OverflowError, UnicodeError) as error:
         raise InputError(f"{path}: not a plan of photoplan ({error}); make one with `photoplan ortho`") from error
     if row is None or row[0] != FORMAT:
-        raise InputError(f"{path}: plan format {row and row[0]}; this version reads {FORMAT}: make the plan again")
-    meta, _, _, values = pyogrio.raw.read(str(path), layer="tiles", columns=_READ, read_geometry=False)
-    return json.loads(row[1]), dict(zip(meta["fields"], values))
+        raise InputError(
+            f"{path}: plan format {row and row[0]!r:.40}; this version reads {FORMAT}: make the plan again"
+        )
+    try:
+        return json_object(row[1], f"{path}: header"), read_columns(path, "tiles", _READ)
+    except InputError as error:
+        raise InputError(f"{error}; the plan is damaged, make it again with the command that wrote it") from None

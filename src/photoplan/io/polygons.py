@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid
+from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.checks import check_plain_file
 from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.vector_layer import MAGIC, read_layer, states_crs
@@ -45,6 +46,8 @@ class VectorFeatures:
     crs: str | None
     """As the file states it; None: it does not."""
     items: tuple[Feature, ...]
+    fields: tuple[str, ...] = ()
+    """Names of the columns."""
 
 
 def read_features(path: Path, *kinds: str, crs: str | None = None) -> VectorFeatures:
@@ -86,11 +89,23 @@ def read_features(path: Path, *kinds: str, crs: str | None = None) -> VectorFeat
         raise InputError(f"{path}: holds no {' or '.join(kinds)}; give a file that does")
     _refuse_invalid(path, items)
     own = found.crs if states_crs(path) else None
+    if own is not None and crs is not None:
+        system = metric_system(own, f"{path}: CRS")
+        if not system.is_plain:
+            items = [Feature(item.name, _in_metres(item.geometry, system, str(path))) for item in items]
+        own = system.crs
     if own is not None and crs is not None and not same_crs(own, crs):
         raise InputError(
             f"{path}: {_PLURAL[kinds[0]]} in {crs_label(own)}, the model is in {crs_label(crs)}; reproject them"
         )
-    return VectorFeatures(path, own, tuple(items))
+    return VectorFeatures(path, own, tuple(items), tuple(found.fields))
+
+
+def _in_metres(shape: Any, system: MetricSystem, where: str) -> Any:
+    """A geometry with its coordinates in metres."""
+    if not shapely.has_z(shape):
+        return shapely.transform(shape, lambda XY: XY * system.scale)
+    return shapely.transform(shape, lambda XYZ: system.to_metres(XYZ, f"{where}: heights"), include_z=True)
 
 
 def _refuse_invalid(path: Path, items: Sequence[Feature]) -> None:

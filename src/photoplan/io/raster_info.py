@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.geometry.crs import split_compound
+from photoplan.geometry.units import known_metres, metric_heights
 from photoplan.io.checks import (
     IMAGE_LIMITS,
     RasterLimits,
@@ -40,11 +42,6 @@ def check_png_complete(path: Path) -> None:
             if kind == b"IEND" and position <= size:
                 return
     raise InputError(f"{path}: the PNG is cut off (its end chunk is missing, {size} bytes); get a fresh copy")
-
-
-_METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
-_METRES |= dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048)
-_METRES |= dict.fromkeys(("us survey foot", "us-ft", "ftus", "ft_us", "foot_us"), 1200.0 / 3937.0)
 
 
 @dataclass(frozen=True)
@@ -81,13 +78,11 @@ class RasterInfo:
     """Reduction factors of the overviews."""
     crs: str | None
     """Coordinate reference system as WKT."""
-    vertical_crs: str | None
-    """The vertical part of a compound reference system as WKT."""
     to_map: tuple[float, float, float, float, float, float] | None
     """(X0, Xx, Xy, Y0, Yx, Yy): X = X0 + Xx x + Xy y, Y = Y0 + Yx x + Yy y, where (x, y) = (column, row) refer to
     pixel **centres**. None if the file is not georeferenced."""
-    unit: str | None
-    """Unit of the values as the first band or the vertical reference system states it."""
+    band_unit: str | None
+    """Unit of the values as the bands state it."""
     scales: tuple[float, ...]
     """Factor of every band from stored to true values."""
     offsets: tuple[float, ...]
@@ -111,9 +106,16 @@ class RasterInfo:
         return len(self.colour_bands) == 1 and self.colours[self.colour_bands[0] - 1] == "palette"
 
     @property
+    def height_system(self) -> str | None:
+        """What the reference system states of heights: a vertical CRS, `ellipsoidal` for a three-dimensional one."""
+        return None if self.crs is None else split_compound(self.crs)[1]
+
+    @property
     def metres_per_unit(self) -> float | None:
-        """Metres in the unit of heights; None if the unit is not stated or unknown."""
-        return None if self.unit is None else _METRES.get(self.unit.strip().lower())
+        """Metres in the unit that the bands or the vertical reference system state; None: none is, or it is unknown."""
+        if self.band_unit is not None:
+            return known_metres(self.band_unit)
+        return None if self.height_system is None else abs(metric_heights(self.height_system)[1])
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -221,8 +223,6 @@ def _facts(path: Path, dataset: Any, layout: TiffLayout | None) -> RasterInfo:
     colours = tuple(c.name for c in dataset.colorinterp)
     alpha = tuple(i + 1 for i, name in enumerate(colours) if name == "alpha")
     wkt = dataset.crs.to_wkt() if dataset.crs else None
-    vertical = _part(wkt, "VERT_CS[") if wkt else None
-    unit = next((u for u in dataset.units if u), None) or (_unit_of(vertical) if vertical else None)
     orientation = dataset.tags().get("EXIF_Orientation") or dataset.tags(ns="EXIF").get("EXIF_Orientation")
     bits = dataset.tags(1, ns="IMAGE_STRUCTURE").get("NBITS")
     return RasterInfo(
@@ -241,9 +241,8 @@ def _facts(path: Path, dataset: Any, layout: TiffLayout | None) -> RasterInfo:
         block=dataset.block_shapes[0][::-1],
         overviews=tuple(dataset.overviews(1)),
         crs=wkt,
-        vertical_crs=vertical,
         to_map=_centre_transform(dataset),
-        unit=unit,
+        band_unit=next((u.strip() for u in dataset.units if u and u.strip()), None),
         scales=tuple(dataset.scales),
         offsets=tuple(dataset.offsets),
         white_is_zero=layout is not None and layout.photometric == 0,
@@ -284,22 +283,3 @@ def _centre_transform(dataset: Any) -> tuple[float, float, float, float, float, 
     if t.is_identity:
         return None
     return (t.c + 0.5 * (t.a + t.b), t.a, t.b, t.f + 0.5 * (t.d + t.e), t.d, t.e)
-
-
-def _part(wkt: str, key: str) -> str | None:
-    """The bracketed part of a WKT that begins with `key`."""
-    start = wkt.find(key)
-    if start < 0:
-        return None
-    depth = 0
-    for i in range(start, len(wkt)):
-        depth += {"[": 1, "]": -1}.get(wkt[i], 0)
-        if wkt[i] == "]" and depth == 0:
-            return wkt[start : i + 1]
-    return None
-
-
-def _unit_of(wkt: str) -> str | None:
-    """Name of the unit in the WKT of a vertical reference system."""
-    unit = _part(wkt, "UNIT[")
-    return unit.split('"')[1] if unit and unit.count('"') >= 2 else None

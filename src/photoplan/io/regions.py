@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio
 import rasterio
 import rasterio.features
 import rasterio.windows
@@ -107,8 +106,9 @@ def read_regions(path: Path, images: Sequence[str], grid: MapGrid, known: Sequen
         The file cannot be read, has no column `image`, names an image that is not among `images`, or holds polygons
         that cross themselves.
     """
-    features = read_features(path, "Polygon", crs=grid.crs).items
-    if "image" not in pyogrio.read_info(path)["fields"]:
+    read = read_features(path, "Polygon", crs=grid.crs)
+    features = read.items
+    if "image" not in read.fields:
         raise InputError(f"{path}: no column `image`, which says whose each region is")
     names = [each.name for each in features]
     unknown = [name for name in names if name not in images and name not in known]

@@ -235,14 +235,15 @@ def _with_poses(table: OrientationTable, centers: NDArray[np.float64], opk: NDAr
 
 
 def _in_crs(block: OrientationBlock, crs: str | None) -> OrientationBlock:
-    """The block in a CRS; heights stay as they are."""
+    """The block in a CRS, with heights in metres in their own height system."""
+    block = replace(block, table=block.table.heights_in_metres(None))
     if crs is None:
         return block
     require_projected_metres(crs, "`crs`")
     table, crs = block.table, canonical_crs(crs)
     if table.crs is None and table.origin is None:
         return replace(block, table=replace(table, crs=crs))
-    centers, opk = placed(table, crs, table.height_system or "same")
+    centers, opk = placed(table, crs)
     if centers is not table.centers:
         table = _with_poses(table, centers, opk)
     return replace(block, table=replace(table, crs=crs, crs_file=None, origin=None, true_metres=block.table.cartesian))

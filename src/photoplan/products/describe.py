@@ -345,7 +345,9 @@ def _raster(info: RasterInfo) -> dict[str, Any]:
     }
     if info.crs is not None:
         facts["crs"] = crs_label(info.crs)
-        facts["heights"] = "not stated" if info.vertical_crs is None else crs_label(info.vertical_crs)
+        facts["heights"] = height_label(info.height_system) + (
+            f", in {info.band_unit}" if info.band_unit is not None and len(info.colour_bands) == 1 else ""
+        )
     if info.to_map is not None:
         x0, xx, _, y0, _, yy = info.to_map
         facts["first pixel's centre"] = f"X {x0:.4f}, Y {y0:.4f}"

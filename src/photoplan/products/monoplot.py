@@ -168,7 +168,9 @@ def _mesh_and_sigma(
     """Mesh width of the project's terrain and its standard deviation, if that is known."""
     errors = known_height_errors(project)
     sigma = None if errors is None else errors.sigmas
-    return 1.0 if ground.file is None else open_terrain(ground.file, project.ground.crs).resolution, sigma
+    if ground.file is None:
+        return 1.0, sigma
+    return open_terrain(ground.file, project.ground.crs, height_system=project.ground.height_system).resolution, sigma
 
 
 def _unknown_on_objects(found: MonoplotPoints, ground: Ground) -> list[str]:

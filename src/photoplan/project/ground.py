@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import CrsStep
 from photoplan.geometry.heights import HeightStep, declared_pair, height_step
+from photoplan.geometry.units import metric_heights
 from photoplan.io.names import resolve_input
 from photoplan.io.project.model import Objects, Project, StatedTerrain
 from photoplan.project.open_terrain import open_terrain
@@ -118,7 +119,7 @@ def _ground(address: _GroundAddress) -> Ground:
         systems = declared_pair(terrain.height_system, address.orientation_system)
         return _in_system(
             Ground(
-                surface=LevelSurface(terrain.height),
+                surface=LevelSurface(terrain.height * metric_heights(terrain.height_system or "same")[1]),
                 bounds=None,
                 file=None,
                 operations=(),
@@ -129,7 +130,7 @@ def _ground(address: _GroundAddress) -> Ground:
         )
     assert terrain.file is not None
     path = resolve_input(Path(address.folder), terrain.file)
-    own = open_terrain(path, terrain.crs, 'as crs = "EPSG:nnnn" in [terrain]')
+    own = open_terrain(path, terrain.crs, 'as crs = "EPSG:nnnn" in [terrain]', terrain.height_system)
     systems = declared_pair(terrain.height_system or own.height_system, address.orientation_system)
     placed, steps = own.in_crs(address.crs)
     return _in_system(

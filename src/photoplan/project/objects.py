@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.bounds import MOST_HEIGHT
 from photoplan.geometry.crs import CrsStep, crs_label, crs_step, require_projected_metres, same_crs
 from photoplan.geometry.heights import OPTIONS, HeightStep, check_height_system, height_step
+from photoplan.geometry.units import agreed_metres, metric_system
 from photoplan.io.objects.file import read_objects
 from photoplan.io.objects.model import ObjectFile
 from photoplan.io.project.model import Objects
@@ -88,7 +89,6 @@ def with_objects(ground: Terrain, files: Sequence[tuple[Path, Objects]], place: 
 
 def _placed(path: Path, own: ObjectFile, stated: Objects, place: Place) -> tuple[NDArray[np.float64], Steps]:
     """Corners in the project's CRS and heights."""
-    corners = own.corners + (stated.offset or (0.0, 0.0, 0.0))
     crs = own.crs or stated.crs
     if crs is None:
         raise InputError(
@@ -103,6 +103,17 @@ def _placed(path: Path, own: ObjectFile, stated: Objects, place: Place) -> tuple
             f"allowed are {OPTIONS}"
         )
     system = check_height_system(system, str(path))
+    # The height system of the file and its CRS decide the unit, a declared system where the file states none.
+    metric = metric_system(crs, f"{path}: CRS").declaring(system, str(path))
+    if own.unit is not None:
+        metric = replace(
+            metric,
+            scale=agreed_metres(own.unit, metric.scale, f"{path}: X and Y", in_one_file=False),
+            height_scale=agreed_metres(own.unit, metric.height_scale, f"{path}: heights", in_one_file=False),
+        )
+    corners = metric.to_metres(own.corners, f"{path}: heights")
+    corners = corners + (stated.offset or (0.0, 0.0, 0.0))
+    crs, system = metric.crs, metric.heights or system
     steps: list[CrsStep | HeightStep] = []
     if not same_crs(crs, place.crs):
         require_projected_metres(crs, f"{path}: CRS")

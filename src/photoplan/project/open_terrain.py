@@ -20,6 +20,7 @@ from photoplan.geometry.crs import (
     same_crs,
     turn_of,
 )
+from photoplan.geometry.heights import require_metric_heights
 from photoplan.io.surface_file import target_of
 from photoplan.io.terrain.known_ranges import KnownRanges
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
@@ -112,7 +113,9 @@ class OpenTerrain:
         return float(nearest_turn(longitude / 360.0 * turn, middle, turn))
 
 
-def open_terrain(path: Path, crs: str | None = None, option: str = "with `crs` EPSG:nnnn") -> OpenTerrain:
+def open_terrain(
+    path: Path, crs: str | None = None, option: str = "with `crs` EPSG:nnnn", height_system: str | None = None
+) -> OpenTerrain:
     """Open a terrain model.
 
     Parameters
@@ -123,17 +126,22 @@ def open_terrain(path: Path, crs: str | None = None, option: str = "with `crs` E
         CRS of a file that does not state its own.
     option : str, optional
         How a user states it, for the message.
+    height_system : str, optional
+        Declared height system; its unit is that of a raster's heights. All heights and coordinates are returned in
+        metres, whatever the units of the file are.
 
     Raises
     ------
     InputError
-        The file is no terrain model, its CRS is unknown, or it is in feet or in degrees.
+        The file is no terrain model, its CRS is unknown, or its units are unknown or contradict each other.
     """
     path = Path(path)
     if path.suffix.lower() == ".gpkg" or is_terrain_model(path):
         reader = ModelReader(path)
         header = reader.header
         require_projected_metres(header.crs, f"{path}: CRS")
+        if height_system is not None:
+            require_metric_heights(height_system, f"{path}: a terrain model is in metres; declared height system")
         return OpenTerrain(
             path=path,
             surface=HybridSurface(reader),
@@ -143,37 +151,34 @@ def open_terrain(path: Path, crs: str | None = None, option: str = "with `crs` E
             resolution=reader.finest,
             model=reader,
         )
-    return _open_raster(path, crs, option)
+    return _open_raster(path, crs, option, height_system)
 
 
-def _open_raster(path: Path, crs: str | None, option: str) -> OpenTerrain:
-    reader = TerrainReader(path)
+def _open_raster(path: Path, crs: str | None, option: str, height_system: str | None) -> OpenTerrain:
+    reader = TerrainReader(path, crs, height_system)
     info = reader.info
     assert info.to_map is not None
-    found = info.crs or crs
     target = target_of(info.path, info.driver)
     if target is not None:
         raise InputError(
             f"{path}: heights over {target}, which is no map and no terrain; let `photoplan surface` write them as "
             "points, too, and build a terrain of these"
         )
-    if found is None:
+    if reader.system is None:
         raise InputError(f"{path}: no CRS; state it {option}, it is not guessed")
-    if info.metres_per_unit not in (None, 1.0):
-        raise InputError(f"{path}: heights in {info.unit}; convert them to metres first")
-    x0, xx, xy, y0, yx, yy = info.to_map
+    x0, xx, xy, y0, yx, yy = (reader.system.scale * value for value in info.to_map)
     if xy or yx or xx <= 0 or yy >= 0:
         raise InputError(f"{path}: the grid is rotated or not north-up; bring it north-up with gdalwarp first")
     columns, rows = info.size
     bounds = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
     surface = RasterSurface(
-        reader, (x0, y0), (xx, -yy), part=reader.block, store=KnownRanges.of(reader), turn=turn_of(found)
+        reader, (x0, y0), (xx, -yy), part=reader.block, store=KnownRanges.of(reader), turn=turn_of(reader.system.crs)
     )
     return OpenTerrain(
         path=info.path,
         surface=surface,
         bounds=bounds,
-        crs=found,
-        height_system=info.vertical_crs,
+        crs=reader.system.crs,
+        height_system=reader.system.heights,
         resolution=min(xx, -yy),
     )

@@ -219,4 +219,8 @@ def known_height_errors(project: Project) -> HeightErrors | None:
         return StatedHeightErrors(terrain.sigma)
     if terrain.file is None:
         return None
-    return open_terrain(project.resolve(terrain.file), terrain.crs).in_crs(project.crs)[0].errors
+    return (
+        open_terrain(project.resolve(terrain.file), terrain.crs, height_system=terrain.height_system)
+        .in_crs(project.crs)[0]
+        .errors
+    )

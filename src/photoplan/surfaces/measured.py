@@ -106,6 +106,10 @@ class MeasuredTerrain:
     """What was noticed while reading and repaired or left out, one line each."""
     codes: frozenset[str] = frozenset()
     """All codes and names of layers that the files hold."""
+    unit: float | None = None
+    """Metres in the unit of X, Y and, without `height_unit`, Z that the file states apart from its CRS; None: none."""
+    height_unit: float | None = None
+    """Metres in the unit of Z that the file states apart from its height system; None: none."""
     fields: tuple[str, ...] = ()
     """What the columns, attributes or layers of the files are called, file by file, for messages."""
 

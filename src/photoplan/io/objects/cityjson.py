@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.objects.model import ObjectFile, from_polygons
-from photoplan.io.plain_files import finite, read_json_lines
+from photoplan.io.plain_files import elements, finite, members, number_rows, read_json_lines
 
 #: Types that are read if nobody says which: what stands on the ground, not what is the ground.
 STANDING = ("Building", "Bridge")
@@ -21,6 +21,8 @@ _DEPTH = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2,
 #: Surfaces of an object that the ground is, or that are none.
 _NO_FACES = ("GroundSurface", "ClosureSurface")
 _MOST_BYTES = 1 << 29
+#: No coordinate of a map is as large as this, metres or feet.
+_FARTHEST = 1e12
 
 
 def read(path: Path, layer: str | None) -> ObjectFile:
@@ -39,6 +41,7 @@ def read(path: Path, layer: str | None) -> ObjectFile:
     if not version or data.get("type") != "CityJSON" or not re.fullmatch(r"(1\.[01]|2\.0)(\.\d+)?", version):
         raise InputError(f"{path}: not CityJSON 1.0 to 2.0 (version {version[:20]!r}); convert it with cjio")
     templates = _templates(path, data)
+    transform = members(data.get("transform"), f"{path}: transform")
     types = STANDING if layer is None else (layer,)
     polygons: list[list[NDArray[np.float64]]] = []
     objects: list[int] = []
@@ -47,10 +50,10 @@ def read(path: Path, layer: str | None) -> ObjectFile:
     for holder in (data, *features):
         if holder is not data and (not isinstance(holder, dict) or holder.get("type") != "CityJSONFeature"):
             raise InputError(f"{path}: a line of the sequence is no CityJSONFeature; get a fresh copy")
-        vertices = _vertices(path, holder.get("vertices"), data.get("transform"))
-        city = holder.get("CityObjects")
-        if not isinstance(city, dict):
+        vertices = _vertices(path, holder.get("vertices"), transform)
+        if "CityObjects" not in holder:
             raise InputError(f"{path}: no CityObjects; get a fresh copy")
+        city = members(holder["CityObjects"], f"{path}: CityObjects")
         for name, item in city.items():
             kind = str(item.get("type", "")).lstrip("+") if isinstance(item, dict) else ""
             there.add(kind)
@@ -58,7 +61,15 @@ def read(path: Path, layer: str | None) -> ObjectFile:
                 continue
             try:
                 found = list(_faces(item.get("geometry") or [], vertices, templates))
-            except (TypeError, KeyError, IndexError, ValueError, AttributeError, RecursionError) as error:
+            except (
+                TypeError,
+                KeyError,
+                IndexError,
+                ValueError,
+                AttributeError,
+                OverflowError,
+                RecursionError,
+            ) as error:
                 raise InputError(
                     f"{path}: object {name[:100]!r}: damaged geometry ({error}); get a fresh copy"
                 ) from None
@@ -71,21 +82,17 @@ def read(path: Path, layer: str | None) -> ObjectFile:
         raise InputError(
             f"{path}: no {' or '.join(types)} with faces; its types are {told}; layer = … in [[objects]] chooses one"
         )
-    return from_polygons(str(path), polygons, objects, names, _crs(data))  # type: ignore[arg-type]
+    return from_polygons(str(path), polygons, objects, names, _crs(path, data))  # type: ignore[arg-type]
 
 
-def _vertices(path: Path, stated: Any, transform: Any) -> NDArray[np.float64]:
-    try:
-        vertices = np.array(stated, float).reshape(-1, 3)
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: `vertices` are not a list of X, Y, Z; get a fresh copy") from None
-    if transform is not None:
-        scale, translate = (
-            finite((transform or {}).get(k), f"{path}: transform {k}", 3) for k in ("scale", "translate")
-        )
-        vertices = vertices * scale + translate
-    if not np.isfinite(vertices).all():
-        raise InputError(f"{path}: vertices that are no numbers; get a fresh copy")
+def _vertices(path: Path, stated: Any, transform: dict[str, Any]) -> NDArray[np.float64]:
+    vertices = number_rows(stated, f"{path}: vertices", 3)
+    if transform:
+        scale, translate = (finite(transform.get(k), f"{path}: transform {k}", 3) for k in ("scale", "translate"))
+        with np.errstate(over="ignore", invalid="ignore"):
+            vertices = vertices * scale + translate
+    if not (np.abs(vertices) < _FARTHEST).all():
+        raise InputError(f"{path}: vertices that lie nowhere on a map; check `transform`, or get a fresh copy")
     return vertices
 
 
@@ -97,9 +104,10 @@ def _templates(path: Path, data: dict[str, Any]) -> _Templates:
     stated = data.get("geometry-templates")
     if stated is None:
         return [], np.empty((0, 3))
-    if not isinstance(stated, dict) or not isinstance(stated.get("templates"), list):
-        raise InputError(f"{path}: `geometry-templates` hold no templates; get a fresh copy")
-    return stated["templates"], _vertices(path, stated.get("vertices-templates"), None)
+    where = f"{path}: geometry-templates"
+    held = members(stated, where)
+    templates = elements(held.get("templates"), f"{where}: templates")
+    return templates, _vertices(path, held.get("vertices-templates"), {})
 
 
 def _faces(
@@ -150,7 +158,7 @@ def _ring(places: list[int], vertices: NDArray[np.float64]) -> NDArray[np.float6
     return np.asarray(vertices[at.astype(int)])
 
 
-def _crs(data: dict[str, Any]) -> str | None:
-    stated = (data.get("metadata") or {}).get("referenceSystem")
-    found = re.search(r"EPSG(?:::|/\d+/|/[\d.]+/|:)(\d+)$", str(stated))
+def _crs(path: Path, data: dict[str, Any]) -> str | None:
+    stated = members(data.get("metadata"), f"{path}: metadata").get("referenceSystem")
+    found = re.search(r"EPSG(?:::|/\d{1,8}/|/[\d.]{1,12}/|:)(\d{1,8})$", str(stated))
     return f"EPSG:{found[1]}" if found else None

@@ -27,6 +27,8 @@ class ObjectFile:
     crs: str | None
     """Horizontal CRS as stated; None: it is not."""
     height_system: str | None
+    unit: float | None = None
+    """Metres in the unit that a drawing states for all its coordinates; None: none is stated."""
     mesh: bool = False
     """Whether it is a mesh, which by itself only hides."""
     faults: Mapping[str, str] = field(default_factory=dict)
@@ -40,6 +42,7 @@ def from_polygons(
     names: list[str],
     crs: str | None = None,
     roles: list[str | None] | None = None,
+    unit: float | None = None,
 ) -> ObjectFile:
     """Objects of polygons.
 
@@ -53,6 +56,8 @@ def from_polygons(
         As stated, with its height system if it has one.
     roles : list, optional
         Of each object.
+    unit : float, optional
+        Metres in the unit of a drawing.
 
     Raises
     ------
@@ -72,5 +77,6 @@ def from_polygons(
         roles=said,
         crs=horizontal,
         height_system=heights,
+        unit=unit,
         faults=faults,
     )

@@ -57,7 +57,7 @@ def read(path: Path, layer: str | None) -> ObjectFile:
             polygons.append(rings)
             objects.append(k)
     crs = found.crs if drawing or states_crs(path) else None
-    return from_polygons(str(path), polygons, objects, names, crs, roles)  # type: ignore[arg-type]
+    return from_polygons(str(path), polygons, objects, names, crs, roles, found.unit)  # type: ignore[arg-type]
 
 
 def _name(layer: str, called: Any, row: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -70,7 +71,7 @@ def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
 def read_orientation_block(
     path: str | Path, form: TableFormat | None = None, format: str | None = None
 ) -> OrientationBlock:
-    """Oriented images of a file, with cameras where it holds them.
+    """Oriented images of a file, with cameras where it holds them; coordinates are brought into metres.
 
     Parameters
     ----------
@@ -89,7 +90,9 @@ def read_orientation_block(
         The format is unknown.
     """
     path, form = Path(path), form or TableFormat()
-    return (choose_format(path, form) if format is None else orientation_format(format)).read(path, form)
+    chosen = choose_format(path, form) if format is None else orientation_format(format)
+    block = chosen.read(path, form)
+    return replace(block, table=block.table.in_metres())
 
 
 def read_orientation(path: str | Path, form: TableFormat | None = None, format: str | None = None) -> OrientationTable:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import crs_step, parse_crs, split_compound
+from photoplan.geometry.crs import crs_step, parse_crs
 from photoplan.geometry.earth_poses import (
     enu_axes,
     geocentric_of_geodetic,
@@ -37,6 +37,7 @@ from photoplan.geometry.earth_poses import (
     legacy_wkt,
     map_poses,
 )
+from photoplan.geometry.units import metric_system
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import AgisoftForm, agisoft_form, frame_camera
 from photoplan.io.markup_files import numbers, read_xml
@@ -220,11 +221,13 @@ def _geodetic(references: _Floats, chunk: Element, path: Path) -> _Floats | None
     if not there.any() or not crs or is_local_crs(crs):
         return None
     try:
-        horizontal = split_compound(crs)[0]
-        if parse_crs(horizontal, f"{path}: reference").is_geocentric:
+        system = metric_system(crs, f"{path}: reference")
+        if parse_crs(system.crs).is_geocentric:
             return None
         out = np.full(references.shape, np.nan)
-        out[there] = np.column_stack([crs_step(horizontal, "EPSG:4326")(references[there, :2]), references[there, 2]])
+        lonlat = crs_step(system.crs, "EPSG:4326")(system.scale * references[there, :2])
+        rise = np.nan if system.height_scale is None else system.height_scale
+        out[there] = np.column_stack([lonlat, rise * references[there, 2]])
     except InputError:  # they only check the poses
         return None
     return out[:, [1, 0, 2]]
@@ -313,18 +316,22 @@ def _place(chunk: Element, centers: _Floats, rotations: _Floats, georeferenced: 
         return _Placed(centers, rotations, notes=(f"{path.name}: coordinates are in a local system",))
     where = f"{path}: reference"
     crs = parse_crs(stated, where)
-    if crs.is_geocentric or is_wgs84_geographic(split_compound(stated)[0], where):
+    if crs.is_geocentric or is_wgs84_geographic(metric_system(stated, where).crs, where):
         lat, lon, h = geodetic_of_geocentric(centers.mean(axis=0))
         axes = enu_axes(lat, lon)
         enu = (centers - geocentric_of_geodetic((lat, lon, h))) @ axes.T
         return _Placed(enu, axes @ rotations, origin=(lat, lon, h))
-    horizontal = split_compound(stated)[0]
+    # Poses are geocentric, in metres; only the reference may be in feet.
+    horizontal = metric_system(stated, where).crs
     if not parse_crs(horizontal, where).is_projected:
         raise InputError(
             f"{where}: {crs.name!r} is geographic on another datum than WGS 84; choose a projected CRS in Metashape "
             "(Reference, Convert) and export again"
         )
-    XYZ, axes = map_poses(horizontal, centers)
+    try:
+        XYZ, axes = map_poses(horizontal, centers)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
     return _Placed(XYZ, np.swapaxes(axes, 1, 2) @ rotations, crs=horizontal)
 
 

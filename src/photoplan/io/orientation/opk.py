@@ -21,6 +21,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.earth_poses import enu_poses, is_local_crs, is_wgs84_geographic, legacy_wkt
 from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.units import metric_system
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
 from photoplan.io.orientation.text import numbers
@@ -53,8 +54,11 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
             images.append(_image(line, number, path))
     height_system = None
     if crs is not None:
+        metric = metric_system(crs, f"{path}: CoordinateSystem")
         crs, height_system = split_compound(crs)
         if is_wgs84_geographic(crs, f"{path}: CoordinateSystem"):
+            rise = metric.height_scale or 1.0
+            images = [replace(i, center=(*i.center[:2], i.center[2] * rise)) for i in images]
             return OrientationBlock(_in_tangential_system(OrientationTable(path, tuple(images), notes=tuple(notes))))
     return OrientationBlock(
         OrientationTable(

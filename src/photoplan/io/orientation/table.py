@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.rotation import ANGLE_UNITS, ROTATION_ORDERS, angles_from_rotation, rotation_from_angles
+from photoplan.geometry.units import agreed_metres, metric_heights, metric_system, unit_label
 
 Direction = Literal["camera-to-ground", "ground-to-camera"]
 #: By the letters that spell an order of rotations.
@@ -87,7 +88,7 @@ class OrientedImage:
 
     name: str
     center: tuple[float, float, float]
-    """Projection centre in the table's system, metres."""
+    """Projection centre in the table's system, in its units (metres once `read_orientation_block` returns it)."""
     angles: tuple[float, float, float]
     """Angles in the table's unit, in the sequence of its rotation order."""
     camera: str | None = None
@@ -124,6 +125,69 @@ class OrientationTable:
     them beside the poses; NaN for images without. They were not used to place the poses."""
     notes: tuple[str, ...] = ()
     """What a user should know of how the file was read."""
+    map_unit: float = 1.0
+    """Metres in the unit in which the file states X and Y; `in_metres` has converted them."""
+    height_unit: float | None = None
+    """Metres upwards in the unit of Z that the file states, converted like X and Y; None: it states no height system,
+    and Z is as in the file."""
+
+    def in_metres(self) -> OrientationTable:
+        """The table with X and Y in metres, and Z too if the file states its height system.
+
+        Raises
+        ------
+        InputError
+            The CRS or the height system is not known.
+        """
+        if self.crs is None:
+            return self
+        system = metric_system(self.crs, f"{self.file}: CRS")
+        heights, rise = self.height_system, None
+        if heights is not None:
+            heights, rise = metric_heights(heights, f"{self.file}: heights")
+        if (system.scale, rise or 1.0) == (1.0, 1.0):
+            return replace(self, height_unit=rise)
+        factors = np.array([system.scale, system.scale, rise or 1.0])
+        units = "" if system.scale == 1.0 else f"X and Y in {unit_label(system.scale)}"
+        units += "" if rise is None else f"{', ' if units else ''}heights in {unit_label(rise)}"
+        X, Y, Z = (np.array([image.center for image in self.images]) * factors).T.tolist()
+        images = tuple(replace(image, center=center) for image, center in zip(self.images, zip(X, Y, Z)))
+        return replace(
+            self,
+            images=images,
+            crs=system.crs,
+            height_system=heights,
+            notes=(*self.notes, f"{self.file.name}: {units}; converted to metres"),
+            map_unit=system.scale,
+            height_unit=rise,
+        )
+
+    def heights_in_metres(self, declared: str | None) -> OrientationTable:
+        """The table with Z in metres, by the unit that the file states, else by that of a declared height system.
+
+        Raises
+        ------
+        InputError
+            The unit of Z is not stated, or the file and the declaration contradict each other.
+        """
+        where = f"{self.file}: heights"
+        word = (declared or "same").strip().casefold()
+        system = None
+        if word not in ("same", "ellipsoidal"):
+            system = metric_heights(declared or "", "declared height system")[1]
+        if self.height_unit is not None:
+            if system is not None:
+                agreed_metres(abs(self.height_unit), system, where, in_one_file=False)
+            return self
+        if system is None and self.map_unit == 1.0:
+            return self
+        rise = agreed_metres(None, system, where, in_one_file=False)
+        if rise == 1.0:
+            return self
+        images = tuple(
+            replace(image, center=(image.center[0], image.center[1], image.center[2] * rise)) for image in self.images
+        )
+        return replace(self, images=images, height_unit=rise)
 
     def __post_init__(self) -> None:
         if not self.images:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import require_projected_metres
-from photoplan.geometry.heights import check_height_system
+from photoplan.geometry.heights import check_height_system, require_metric_heights
 from photoplan.io.naming import write_atomically
 from photoplan.io.plain_files import read_toml
 from photoplan.io.project.errors import explain
@@ -50,9 +50,11 @@ def parse_project(data: dict[str, Any], folder: Path, source: str, text: str = "
     project = project.in_standard_axes()
     require_projected_metres(project.crs, f"{source}: crs")
     terrain = None if project.terrain is None else project.terrain.height_system
-    for table, name in (("terrain", terrain), ("orientation", project.orientation.height_system)):
-        if name is not None:
-            check_height_system(name, f"{source}: [{table}] height_system")
+    if terrain is not None:
+        check_height_system(terrain, f"{source}: [terrain] height_system")
+    if project.orientation.height_system is not None:
+        # Every Z of the project, of control and of positions refers to it, and all are metres.
+        require_metric_heights(project.orientation.height_system, f"{source}: [orientation] height_system")
     for objects in project.objects:
         if objects.height_system is not None:
             check_height_system(objects.height_system, f"{source}: [[objects]] {objects.file} height_system")

@@ -10,11 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.errors import GeometryError, HeightSystemError, InputError, UsageError
-from photoplan.geometry.bounds import area_fault, area_note
-from photoplan.geometry.crs import crs_label, parse_crs, require_projected_metres, same_crs, split_compound
-from photoplan.geometry.heights import height_label
+from photoplan.geometry.bounds import area_fault, area_note, beyond_area
+from photoplan.geometry.crs import crs_label, require_projected_metres, same_crs, split_compound
+from photoplan.geometry.heights import check_height_system
+from photoplan.geometry.units import MetricSystem, agreed_metres, metric_system, unit_label
 from photoplan.io.checks import check_plain_file
 from photoplan.io.terrain import landxml as terrain_landxml
 from photoplan.io.terrain import las as terrain_las
@@ -26,6 +28,8 @@ from photoplan.io.terrain.reader import HIGHEST, LOWEST
 from photoplan.io.validity import USUAL_NODATA
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup, Tin
 
+#: Kilometres beyond the area of the CRS from which on the unit of a drawing is doubted, if its numbers lie inside.
+_MISSTATED = 20.0
 _USUAL_NODATA = (*USUAL_NODATA, -999.0)
 _RASTERS = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+", b"\x89PNG", b"\xff\xd8\xff", b"ncols", b"NCOLS")
 _Reader = Callable[[Path, ReadOptions], MeasuredTerrain]
@@ -34,9 +38,9 @@ _Reader = Callable[[Path, ReadOptions], MeasuredTerrain]
 def read_measured(paths: Sequence[Path], options: ReadOptions | None = None) -> MeasuredTerrain:
     """Points, lines and triangulation of all files together.
 
-    The files must be in one projected CRS in metres: what they state, or what `options.crs` declares for files that
-    state none. The height system is what the files state; where one of them states none it is None (nothing is
-    guessed).
+    The files must be in one projected CRS: what they state, or what `options.crs` declares for files that state none.
+    Coordinates and heights in feet or another known unit are converted: the result is in metres. The height system is
+    what the files state; where one of them states none it is None (nothing is guessed).
 
     Parameters
     ----------
@@ -50,8 +54,9 @@ def read_measured(paths: Sequence[Path], options: ReadOptions | None = None) -> 
     UsageError
         No file, or one file twice; LAS without laspy.
     InputError
-        A file cannot be read, is not in metres, or states another CRS than the others; the message names file and
-        line, point or feature. A table of codes was given, and none of its codes is in the files.
+        A file cannot be read, is in units that are unknown or contradict each other, or states another CRS than the
+        others; the message names file and line, point or feature. A table of codes was given, and none of its codes is
+        in the files.
     HeightSystemError
         Two files state different height systems.
     """
@@ -73,7 +78,7 @@ def read_measured(paths: Sequence[Path], options: ReadOptions | None = None) -> 
             raise InputError(f"{path}: cannot be read as text ({error})") from None
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-        parts.append(_with_crs(_plausible(part, options), options))
+        parts.append(_in_metres(_with_crs(_without_nodata(part, options), options), options, part.crs is not None))
     measured = _merged(parts)
     check_matched(measured, options)
     return measured
@@ -109,8 +114,8 @@ def _reader(path: Path) -> _Reader:
     return terrain_text.read
 
 
-def _plausible(part: MeasuredTerrain, options: ReadOptions) -> MeasuredTerrain:
-    """The part without points of the declared nodata height; impossible heights are refused."""
+def _without_nodata(part: MeasuredTerrain, options: ReadOptions) -> MeasuredTerrain:
+    """The part without points of the declared nodata height; the usual ones that nobody declared are refused."""
     groups: list[PointGroup] = []
     notes = list(part.notes)
     for group in part.points:
@@ -121,21 +126,20 @@ def _plausible(part: MeasuredTerrain, options: ReadOptions) -> MeasuredTerrain:
             names = None if group.names is None else group.names[keep]
             group = replace(group, xyz=group.xyz[keep], records=group.records[keep], names=names)
             z = group.xyz[:, 2]
-        wrong = (z < LOWEST) | (z > HIGHEST)
+        wrong = np.zeros(len(z), bool)
         for value in _USUAL_NODATA if len(z) and z.min() <= max(_USUAL_NODATA) else ():
             wrong |= z == value
         if wrong.any():
             at = int(np.flatnonzero(wrong)[0])
             raise InputError(
-                f"{part.files[0]}: {group.label(at)}: height {z[at]:g} ({int(wrong.sum())} such points); is it a mark "
-                "for none? then declare it as nodata, else check unit and order of the columns"
+                f"{part.files[0]}: {group.label(at)}: height {z[at]:g} ({int(wrong.sum())} such points) is usually a "
+                "mark for none; declare it as nodata, or change these heights a little"
             )
         if len(group.xyz):
             groups.append(group)
     for line in part.lines:
-        z = line.xyz[:, 2][~np.isnan(line.xyz[:, 2])]
-        if len(z) and not (z.min() > LOWEST and z.max() < HIGHEST and not np.isin(z, _USUAL_NODATA).any()):
-            raise InputError(f"{line.name}: heights from {z.min():g} to {z.max():g}; check them and their unit")
+        if np.isin(line.xyz[:, 2], _USUAL_NODATA).any():
+            raise InputError(f"{line.name}: a height of {_USUAL_NODATA} usually means none; check its heights")
     return replace(part, points=tuple(groups), notes=tuple(notes))
 
 
@@ -144,23 +148,86 @@ def _with_crs(part: MeasuredTerrain, options: ReadOptions) -> MeasuredTerrain:
     path = part.files[0]
     declared, declared_heights = (None, None) if options.crs is None else split_compound(options.crs)
     if declared is not None:
-        require_projected_metres(declared, "declared CRS")
-    if part.crs is not None:
-        if declared is not None and not same_crs(part.crs, declared):
-            raise InputError(
-                f"{path}: states {crs_label(part.crs)}, declared is {crs_label(declared)}; drop the declaration, or "
-                "transform the file beforehand (ogr2ogr -t_srs, pdal)"
-            )
+        require_projected_metres(metric_system(declared, "declared CRS").crs, "declared CRS")
+    if part.crs is not None and declared is not None and not same_crs(part.crs, declared):
+        raise InputError(
+            f"{path}: states {crs_label(part.crs)}, declared is {crs_label(declared)}; drop the declaration, or "
+            "transform the file beforehand (ogr2ogr -t_srs, pdal)"
+        )
+    return replace(part, crs=part.crs or declared, height_system=part.height_system or declared_heights)
+
+
+def _in_metres(part: MeasuredTerrain, options: ReadOptions, own_crs: bool) -> MeasuredTerrain:
+    """The part in a projected CRS in metres, with heights in metres upwards; impossible ones are refused.
+
+    `own_crs` states whether the CRS is the file's own, not a declared one.
+    """
+    path = part.files[0]
+    system = MetricSystem("", 1.0, None, 1.0) if part.crs is None else metric_system(part.crs, f"{path}: CRS")
+    stated, heights = part.height_system or options.height_system, part.height_system
+    if stated is not None and stated.strip().casefold() != "same":
         try:
-            require_projected_metres(part.crs, f"{path}: CRS")
+            system = system.declaring(check_height_system(stated), f"{path}: heights")
+            heights = system.heights if part.height_system is not None else None
+        except InputError:  # a name of a height system that no register has
+            if part.height_system is None:
+                raise
+    plan = agreed_metres(part.unit, system.scale, f"{path}: X and Y", in_one_file=own_crs)
+    every = _coordinates(part.points, part.lines)
+    with_heights = part.tin is not None or any(bool(np.isfinite(xyz[:, 2]).any()) for xyz in every)
+    rise = 1.0
+    if with_heights:
+        unit = part.unit if part.height_unit is None else part.height_unit
+        rise = agreed_metres(unit, system.height_scale, f"{path}: heights", in_one_file=False)
+    if part.crs is not None:
+        try:
+            require_projected_metres(system.crs, f"{path}: CRS")
         except InputError as error:
             raise InputError(f"{error}; transform the file beforehand (ogr2ogr -t_srs, pdal)") from None
-    heights = part.height_system or declared_heights
-    if heights is not None and heights.upper().startswith("EPSG:"):
-        _check_height_unit(path, heights)
-    crs = declared or part.crs
-    notes = part.notes if crs is None or options.beyond_area else (*part.notes, *_judged_area(path, part, crs))
-    return replace(part, crs=crs, height_system=heights, notes=notes)
+    notes = part.notes
+    if (plan, rise) != (1.0, 1.0):
+        notes = (
+            *notes,
+            f"{path.name}: X and Y in {unit_label(plan)}, heights in {unit_label(rise)}; converted to metres",
+        )
+        if part.unit is not None and system.scale == 1.0:
+            _refuse_misstated(part, plan, system.crs)
+    factors = np.array([plan, plan, rise])
+    groups = tuple(_scaled(group, factors) for group in part.points)
+    lines = tuple(
+        replace(line, xyz=line.xyz * factors, right=None if line.right is None else line.right * rise)
+        if (plan, rise) != (1.0, 1.0)
+        else line
+        for line in part.lines
+    )
+    for group in groups:
+        z = group.xyz[:, 2]
+        wrong = (z < LOWEST) | (z > HIGHEST)
+        if wrong.any():
+            at = int(np.flatnonzero(wrong)[0])
+            raise InputError(
+                f"{path}: {group.label(at)}: height {z[at]:g} m ({int(wrong.sum())} such points); is it a mark for "
+                "none? then declare it as nodata, else check unit and order of the columns"
+            )
+    for line in lines:
+        z = line.xyz[:, 2][~np.isnan(line.xyz[:, 2])]
+        if len(z) and not (z.min() > LOWEST and z.max() < HIGHEST):
+            raise InputError(f"{line.name}: heights from {z.min():g} to {z.max():g} m; check them and their unit")
+    tin = part.tin if part.tin is None or (plan, rise) == (1.0, 1.0) else replace(part.tin, xyz=part.tin.xyz * factors)
+    part = replace(
+        part,
+        points=groups,
+        lines=lines,
+        tin=tin,
+        crs=None if part.crs is None else system.crs,
+        height_system=heights,
+        notes=notes,
+        unit=None,
+        height_unit=None,
+    )
+    if part.crs is None or options.beyond_area:
+        return part
+    return replace(part, notes=(*part.notes, *_judged_area(path, part, part.crs)))
 
 
 def _judged_area(path: Path, part: MeasuredTerrain, crs: str) -> tuple[str, ...]:
@@ -175,12 +242,29 @@ def _judged_area(path: Path, part: MeasuredTerrain, crs: str) -> tuple[str, ...]
     return () if note is None else (f"{path.name}: {note}",)
 
 
-def _check_height_unit(path: Path, heights: str) -> None:
-    axis = parse_crs(heights).axis_info
-    if axis and axis[-1].unit_conversion_factor != 1.0:
+def _coordinates(points: Sequence[PointGroup], lines: Sequence[MeasuredLine]) -> list[NDArray[np.float64]]:
+    """X, Y, Z of each group and line that has some."""
+    return [xyz for xyz in (*(p.xyz for p in points), *(line.xyz for line in lines)) if len(xyz)]
+
+
+def _scaled(group: PointGroup, factors: NDArray[np.float64]) -> PointGroup:
+    return group if (factors == 1.0).all() else replace(group, xyz=group.xyz * factors)
+
+
+def _refuse_misstated(part: MeasuredTerrain, plan: float, crs: str) -> None:
+    """Refuse a unit that leads out of the area of the CRS, if the numbers lie in it as metres.
+
+    Templates of CAD programs state millimetres or inches in drawings of any unit.
+    """
+    every = [xyz[:, :2] for xyz in _coordinates(part.points, part.lines)]
+    if not crs or plan == 1.0 or not every:
+        return
+    middle = np.array([np.median(np.concatenate([xy[:1] for xy in every]), axis=0)])
+    if beyond_area(crs, middle * plan)[0] > _MISSTATED and beyond_area(crs, middle)[0] == 0.0:
+        x, y = middle[0]
         raise InputError(
-            f"{path}: heights in {axis[-1].unit_name} ({height_label(heights)}); metres are needed: convert them "
-            "beforehand (ogr2ogr -t_srs, pdal)"
+            f"{part.files[0]}: states {unit_label(plan)}, but X {x:.10g}, Y {y:.10g} lies in the area of "
+            f"{crs_label(crs)} only in metres; declare the unit of the drawing with `unit` m, or correct it"
         )
 
 
@@ -203,6 +287,7 @@ def _merged(parts: Sequence[MeasuredTerrain]) -> MeasuredTerrain:
     tin = _joined([p.tin for p in parts if p.tin is not None])
     if not points and not lines and tin is None:
         raise InputError(f"{', '.join(str(p.files[0]) for p in parts)}: no point and no line is left")
+    notes += _constant(points, lines)
     return MeasuredTerrain(
         points=points,
         lines=lines,
@@ -214,6 +299,20 @@ def _merged(parts: Sequence[MeasuredTerrain]) -> MeasuredTerrain:
         codes=frozenset().union(*(p.codes for p in parts)),
         fields=tuple(f for p in parts for f in p.fields),
     )
+
+
+def _constant(points: Sequence[PointGroup], lines: Sequence[MeasuredLine]) -> list[str]:
+    """What to note if all heights are one number: files whose heights are elsewhere look so."""
+    every = [xyz[:, 2] for xyz in _coordinates(points, lines)]
+    ranges = [(float(np.nanmin(z)), float(np.nanmax(z))) for z in every if bool(np.isfinite(z).any())]
+    low, high = min((a for a, _ in ranges), default=0.0), max((b for _, b in ranges), default=1.0)
+    count = sum(len(z) for z in every)
+    if low != high or count < 3:
+        return []
+    return [
+        f"warning: all {count} heights are {low:g} m: the surface is level. Are the heights in an attribute "
+        "(`height_field`), in texts, or missing?"
+    ]
 
 
 def _heights(parts: Sequence[MeasuredTerrain], notes: list[str]) -> str | None:

@@ -65,7 +65,7 @@ class KnownRanges:
         try:
             where = info.path.resolve()
             beside = (where.with_name(where.name + suffix) for suffix in (".msk", ".MSK", ".aux.xml"))
-            state: list[Any] = [info.size, info.dtype, info.nodata, info.scales, info.offsets]
+            state: list[Any] = [info.size, info.dtype, info.nodata, info.scales, info.offsets, reader.metres]
             state += [
                 (file.name, file.stat().st_mtime_ns, fingerprint(file)) for file in (where, *beside) if file.is_file()
             ]

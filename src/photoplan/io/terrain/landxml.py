@@ -19,7 +19,8 @@ from defusedxml.ElementTree import iterparse  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import canonical_crs, parse_crs
+from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
+from photoplan.geometry.units import FOOT, metres_in
 from photoplan.io.terrain.options import OTHER, CodeClass, ReadOptions
 from photoplan.surfaces.measured import LINE_KINDS, LineKind, MeasuredLine, MeasuredTerrain, PointGroup, Tin
 
@@ -28,7 +29,6 @@ MAX_DEPTH = 64
 """Levels of nesting; LandXML surfaces need ten."""
 _CODE_LABELS = ("terrainCoding", "code", "Code", "surveyCode")
 _BOUNDARIES: dict[str, LineKind] = {"outer": "border", "island": "border", "void": "hole"}
-_METRE = ("meter", "metre", "m")
 
 
 @dataclass
@@ -50,7 +50,8 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     Raises
     ------
     InputError
-        The file is damaged, holds entities or a document type, is not in metres, or leaves open which surface is meant.
+        The file is damaged, holds entities or a document type, states an unknown unit, or leaves open which surface is
+        meant.
     """
     if path.stat().st_size > MAX_BYTES:
         raise InputError(f"{path}: more than {MAX_BYTES >> 30} GiB of XML; export the part that is needed")
@@ -82,6 +83,8 @@ class _Reader:
         self.surfaces: list[_LandXmlSurface] = []
         self.system: dict[str, str] = {}
         self.notes: list[str] = []
+        self.unit: float | None = None
+        self.height_unit: float | None = None
         self.walls = 0
         self.codes: set[str] = set()
 
@@ -110,13 +113,17 @@ class _Reader:
             self.open[-1].remove(element)
 
     def _units(self, element: Element, tag: str) -> None:
-        linear = element.get("linearUnit", "")
-        heights = element.get("elevationUnit", "meter")
-        if tag == "Imperial" or linear not in _METRE or heights not in _METRE:
+        linear = element.get("linearUnit") or ("meter" if tag == "Metric" else "foot")
+        self.unit = metres_in(linear, f"{self.path}: linearUnit")
+        heights = element.get("elevationUnit")
+        foot = abs(self.unit - FOOT) < 1e-5
+        if heights is None and not foot and self.unit != 1.0:
             raise InputError(
-                f"{self.path}: lengths in {linear or tag}, heights in {heights if tag == 'Metric' else linear}; "
-                "metres are needed: export the file in metres, or convert it beforehand"
+                f"{self.path}: lengths in {linear}, and elevationUnit is not stated; set it to the unit of heights"
             )
+        # An elevationUnit of feet beside lengths in US survey feet stands for the same feet.
+        same = heights is None or (heights.casefold() in ("feet", "foot") and foot)
+        self.height_unit = self.unit if same else metres_in(heights or "", f"{self.path}: elevationUnit")
 
     def data_points(self, element: Element, surface: _LandXmlSurface) -> None:
         code = _code(element)
@@ -279,6 +286,8 @@ class _Reader:
             notes=notes,
             codes=frozenset(held),
             fields=fields,
+            unit=self.unit,
+            height_unit=self.height_unit,
         )
 
     def _chosen(self) -> list[_LandXmlSurface]:
@@ -383,18 +392,20 @@ def _reference(path: Path, system: dict[str, str]) -> tuple[str | None, str | No
     """CRS and height system of the attributes of a CoordinateSystem."""
     code = system.get("epsgCode", "").strip().upper().removeprefix("EPSG:").strip()
     wkt = system.get("ogcWktCode", "").strip()
-    crs = None
+    crs, heights = None, None
     if code or wkt:
         text = f"EPSG:{code}" if code else wkt
         parse_crs(text, f"{path}: CRS")
-        crs = canonical_crs(text)
+        crs, heights = split_compound(text)
     name = (system.get("verticalCoordinateSystemName") or system.get("verticalDatum") or "").strip()
+    if not name:
+        return crs, heights
     try:
         # PROJ knows vertical systems as "N2000 height" where files say N2000.
         vertical = parse_crs(name if name.upper().startswith("EPSG:") else f"{name} height")
     except InputError:
-        return crs, name or None
+        return crs, name
     same = vertical.is_vertical and (
         name.upper().startswith("EPSG:") or vertical.name.casefold() == f"{name} height".casefold()
     )
-    return crs, canonical_crs(vertical.to_wkt()) if same else name or None
+    return crs, canonical_crs(vertical.to_wkt()) if same else name

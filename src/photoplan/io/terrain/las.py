@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
+from photoplan.geometry.units import agreed_metres, metres_in, metric_heights
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.surfaces.measured import MeasuredTerrain, PointGroup
 
@@ -44,7 +45,7 @@ RATIO_FROM = 1 << 30
 _RECORD_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 # GeoTIFF keys (OGC 19-008r4): model, geographic CRS, projected CRS, linear unit, vertical CRS, vertical unit.
 _GEOGRAPHIC, _PROJECTED, _UNIT, _VERTICAL, _VERTICAL_UNIT = 2048, 3072, 3076, 4096, 4099
-_METRE, _USER_DEFINED = 9001, 32767
+_USER_DEFINED = 32767
 
 
 def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
@@ -72,7 +73,7 @@ def _decoded(path: Path, options: ReadOptions, head: _Header) -> MeasuredTerrain
             scaling = np.array([header.scales, header.offsets], float)
             if not (np.isfinite(scaling).all() and (scaling[0] != 0).all()):
                 raise InputError(f"{path}: scale {header.scales} and offset {header.offsets} of the header are damaged")
-            crs, heights = _crs(path, header)
+            crs, heights, units = _crs(path, header)
             xyz, records, notes = _points(path, file, options)
     except (InputError, MemoryError):
         raise
@@ -91,6 +92,8 @@ def _decoded(path: Path, options: ReadOptions, head: _Header) -> MeasuredTerrain
         files=(path,),
         notes=tuple(notes),
         fields=(f"{path.name}: LAS",),
+        unit=units[0],
+        height_unit=units[1],
     )
 
 
@@ -225,34 +228,38 @@ def _points(path: Path, file: Any, options: ReadOptions) -> tuple[NDArray[np.flo
     return xyz, np.concatenate([k[1] for k in kept]).astype(np.int64), notes
 
 
-def _crs(path: Path, header: Any) -> tuple[str | None, str | None]:
-    """Horizontal CRS and height system of the file's WKT or GeoTIFF keys."""
+_Units = tuple[float | None, float | None]
+"""Metres in the units of X and Y and of Z that GeoTIFF keys state beside the CRS; None: none."""
+
+
+def _crs(path: Path, header: Any) -> tuple[str | None, str | None, _Units]:
+    """Horizontal CRS, height system and units of the file's WKT or GeoTIFF keys."""
     vlrs = list(header.vlrs) + list(getattr(header, "evlrs", None) or [])
     for vlr in vlrs:
         text = getattr(vlr, "string", None)
         if vlr.user_id.strip("\0 ") == "LASF_Projection" and vlr.record_id == 2112 and text and text.strip("\0 "):
             parse_crs(text.strip("\0 "), f"{path}: CRS")
-            return split_compound(text.strip("\0 "))
+            return *split_compound(text.strip("\0 ")), (None, None)
     for vlr in vlrs:
         entries = getattr(vlr, "geo_keys", None)
         if vlr.user_id.strip("\0 ") == "LASF_Projection" and entries:
             return _of_geokeys(path, {k.id: k.value_offset for k in entries if k.tiff_tag_location == 0})
-    return None, None
+    return None, None, (None, None)
 
 
-def _of_geokeys(path: Path, keys: dict[int, int]) -> tuple[str | None, str | None]:
-    units = {keys.get(_VERTICAL_UNIT, _METRE)} | ({keys[_UNIT]} if _UNIT in keys and _PROJECTED in keys else set())
-    if units - {_METRE, 0}:
-        raise InputError(
-            f"{path}: lengths are in a unit other than metres (EPSG unit {', '.join(map(str, sorted(units)))}); "
-            "convert the file to metres beforehand, for example with pdal or las2las"
-        )
-    code = keys.get(_PROJECTED) or keys.get(_GEOGRAPHIC)
-    if not code or code == _USER_DEFINED:
-        return None, None
-    text = f"EPSG:{code}"
-    parse_crs(text, f"{path}: CRS")
-    vertical = keys.get(_VERTICAL, 0)
-    if not 1024 <= vertical < _USER_DEFINED or not parse_crs(f"EPSG:{vertical}", f"{path}: heights").is_vertical:
-        return canonical_crs(text), None
-    return canonical_crs(text), canonical_crs(f"EPSG:{vertical}")
+def _of_geokeys(path: Path, keys: dict[int, int]) -> tuple[str | None, str | None, _Units]:
+    plan, up = (
+        metres_in(keys[key], f"{path}: {what}") if keys.get(key, 0) not in (0, _USER_DEFINED) else None
+        for key, what in ((_UNIT, "unit of X and Y"), (_VERTICAL_UNIT, "unit of heights"))
+    )
+    if _PROJECTED not in keys:
+        plan = None
+    code, vertical = keys.get(_PROJECTED) or keys.get(_GEOGRAPHIC), keys.get(_VERTICAL, 0)
+    if code and code != _USER_DEFINED:
+        parse_crs(f"EPSG:{code}", f"{path}: CRS")
+    crs = canonical_crs(f"EPSG:{code}") if code and code != _USER_DEFINED else None
+    heights = None
+    if 1024 <= vertical < _USER_DEFINED and parse_crs(f"EPSG:{vertical}", f"{path}: heights").is_vertical:
+        heights = canonical_crs(f"EPSG:{vertical}")
+        agreed_metres(up, metric_heights(heights)[1], f"{path}: heights", in_one_file=True)
+    return crs, heights, (plan, up)

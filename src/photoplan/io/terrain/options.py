@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.errors import InputError, UsageError
+from photoplan.geometry.units import metres_in
 from photoplan.io.plain_files import read_toml
 from photoplan.io.table_lines import decimal
 from photoplan.io.tables import Columns, Dialect, read_table
@@ -90,8 +91,16 @@ class ReadOptions:
     """CRS of all files, declared; files that state another one are refused."""
     beyond_area: bool = False
     """Whether coordinates far outside the area of use of the CRS are meant."""
+    height_system: str | None = None
+    """Height system of all files, declared; its unit is that of heights of files that state none."""
+    height_field: str | None = None
+    """Attribute of vector files that holds the heights of features, such as contours; None: their geometry does."""
+    unit: str | None = None
+    """Unit of X, Y and Z of drawings, whatever their header states; None: as it states."""
 
     def __post_init__(self) -> None:
+        if self.unit is not None:
+            metres_in(self.unit, "unit of drawings")
         if self.las_classes is not None and not all(0 <= c <= 255 for c in self.las_classes):
             raise UsageError(f"LAS classes {self.las_classes}; allowed are numbers from 0 to 255")
 

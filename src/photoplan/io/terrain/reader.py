@@ -12,6 +12,13 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
+from photoplan.geometry.units import (
+    MetricSystem,
+    agreed_metres,
+    metres_in,
+    metric_system,
+    unit_label,
+)
 from photoplan.io.block_cache import BlockCache
 from photoplan.io.checks import TERRAIN_LIMITS, RasterLimits
 from photoplan.io.raster_info import RasterInfo, read_info
@@ -34,9 +41,10 @@ _PLAIN = -9_000.0
 class TerrainReader:
     """One band of heights, delivered as float32 with NaN where there is none.
 
-    Scale and offset of the file are applied; the unit is the file's (`info.unit`, `info.metres_per_unit`). Overviews
-    are not used. Blocks that were read are kept up to `cache_bytes`, least recently used ones are forgotten first.
-    Safe to call from several threads and to pickle (the cache stays behind).
+    Scale and offset of the file are applied, and heights are brought into metres upwards from the unit of the band, of
+    the reference system, or of the declared height system. Overviews are not used. Blocks that were read are kept up
+    to `cache_bytes`, least recently used ones are forgotten first. Safe to call from several threads and to pickle (the
+    cache stays behind).
 
     Nodata, alpha, mask and blocks that were never written follow the rule of `photoplan.io.validity`; NaN and values
     of ±1e30 and more are void as well. Other values that are no height on Earth (below -12 000 m or above 9 000 m), and
@@ -46,11 +54,16 @@ class TerrainReader:
     ------
     InputError
         When made: whatever `read_info` refuses; another number of bands than one, or another type than
-        `TERRAIN_TYPES`; a grid that is not georeferenced. When read: damaged data, values that are no heights.
+        `TERRAIN_TYPES`; a grid that is not georeferenced; a unit of heights that is unknown, or that contradicts the
+        height system. When read: damaged data, values that are no heights.
     """
 
     path: Path
     """The file."""
+    crs: str | None = None
+    """CRS of a file that states none."""
+    height_system: str | None = None
+    """Declared height system: it is used instead of the file's."""
     cache_bytes: int = 64 << 20
     """Bytes of blocks that are kept."""
     limits: RasterLimits = TERRAIN_LIMITS
@@ -59,6 +72,10 @@ class TerrainReader:
     """Follow virtual rasters, `/vsi…` paths and URLs."""
     info: RasterInfo = field(init=False, repr=False)
     """Facts of the file."""
+    system: MetricSystem | None = field(init=False, repr=False)
+    """Reference system in metres, and what leads the file's coordinates there; None: no CRS is stated or declared."""
+    metres: float = field(init=False, repr=False)
+    """Metres upwards in the unit of the file's heights; negative for depths."""
     _missing: MissingBlocks | None = field(init=False, repr=False)
     _cache: BlockCache = field(init=False, repr=False)
 
@@ -77,6 +94,8 @@ class TerrainReader:
             raise InputError(f"{info.path}: scale {info.scales[0]} and offset {info.offsets[0]} make no heights")
         object.__setattr__(self, "path", info.path)
         object.__setattr__(self, "info", info)
+        object.__setattr__(self, "system", self._reference(info))
+        object.__setattr__(self, "metres", self._unit(info))
         object.__setattr__(self, "_missing", missing_blocks(info))
         object.__setattr__(self, "_cache", BlockCache(self.cache_bytes))
 
@@ -87,13 +106,32 @@ class TerrainReader:
         self.__dict__.update(state)
         object.__setattr__(self, "_cache", BlockCache(self.cache_bytes))
 
+    def _reference(self, info: RasterInfo) -> MetricSystem | None:
+        stated = info.crs or self.crs
+        if stated is None:
+            return None
+        system = metric_system(stated, f"{info.path}: CRS")
+        return system.declaring(self.height_system, f"{info.path}: declared height system")
+
+    def _unit(self, info: RasterInfo) -> float:
+        """Metres upwards in a unit of the file's heights."""
+        where = f"{info.path}: heights"
+        own = metric_system(info.crs, where) if info.crs is not None else None
+        stated = None if info.band_unit is None else metres_in(info.band_unit, f"{where}: unit of the band")
+        if stated is not None and own is not None and own.heights is not None:
+            agreed_metres(stated, own.height_scale, where, in_one_file=True)
+        elif stated is None and own is not None and own.heights is not None:
+            stated = abs(own.height_scale or 1.0)
+        system = 1.0 if self.system is None else self.system.height_scale
+        return agreed_metres(stated, system, where, in_one_file=False)
+
     @property
     def size(self) -> tuple[int, int]:
         """Columns and rows of the grid."""
         return self.info.size
 
     def read(self, window: Window) -> NDArray[np.float32]:
-        """Heights of a window inside the grid, shape (height, width), in the file's unit; NaN where there is none."""
+        """Heights of a window inside the grid, shape (height, width), metres; NaN where there is none."""
         width, height = self.info.size
         right, bottom = window.stop
         if window.size == 0 or window.col < 0 or window.row < 0 or right > width or bottom > height:
@@ -110,7 +148,7 @@ class TerrainReader:
         return out
 
     def pixel(self, col: int, row: int) -> float:
-        """Height of one grid point in the file's unit; NaN if there is none."""
+        """Height of one grid point, metres; NaN if there is none."""
         return float(self.read(Window(col, row, 1, 1))[0, 0])
 
     @property
@@ -127,12 +165,12 @@ class TerrainReader:
         """Read and check a block."""
         pixels, valid = read_pixels(self.info, window, self._missing)
         stored = pixels[0]
-        if valid is None and (self.info.scales[0], self.info.offsets[0]) == (1.0, 0.0):
-            metres = self.info.metres_per_unit or 1.0
-            if float(stored.min()) * metres > _PLAIN and float(stored.max()) * metres < HIGHEST:
-                return stored.astype(np.float32, copy=False)
+        plain = valid is None and (self.info.scales[0], self.info.offsets[0], self.metres) == (1.0, 0.0, 1.0)
+        if plain and float(stored.min()) > _PLAIN and float(stored.max()) < HIGHEST:
+            return stored.astype(np.float32, copy=False)
         heights = stored.astype(np.float64) * self.info.scales[0] + self.info.offsets[0]
         void = ~(np.abs(heights) < _VOID)
+        heights *= self.metres
         if valid is not None:
             void |= ~valid
         self._check_range(stored, heights, void, window)
@@ -143,14 +181,19 @@ class TerrainReader:
         self, stored: NDArray[Any], heights: NDArray[np.float64], void: NDArray[np.bool_], window: Window
     ) -> None:
         """Refuse values that are no heights."""
-        metres = self.info.metres_per_unit or 1.0
-        wrong = ~void & ((heights * metres < LOWEST) | (heights * metres > HIGHEST))
+        wrong = ~void & ((heights < LOWEST) | (heights > HIGHEST))
         if self.info.nodata is None:
             wrong |= ~void & np.isin(stored, USUAL_NODATA)
         if not wrong.any():
             return
+        value, raw = float(heights[wrong][0]), stored[wrong][0]
+        unit = self.info.band_unit or ("metres" if self.metres == 1.0 else unit_label(self.metres))
+        what = f"declare the nodata value (`gdal_edit.py -a_nodata {raw:g}`)"
+        if raw not in USUAL_NODATA:
+            what = (
+                f"if {raw:g} marks missing heights, {what}; else state their unit (`gdal_edit.py -units`, now {unit})"
+            )
         raise InputError(
             f"{self.path}: {int(wrong.sum())} values in window col {window.col} row {window.row} {window.width} × "
-            f"{window.height} are no heights (allowed {LOWEST:g} to {HIGHEST:g} m), for one "
-            f"{heights[wrong][0]:g}; declare the nodata value (`gdal_edit -a_nodata {stored[wrong][0]:g}`)"
+            f"{window.height} are no heights (allowed {LOWEST:g} to {HIGHEST:g} m), for one {value:g} m; {what}"
         )

@@ -4,13 +4,15 @@ The class of a feature is that of its code: the attribute `ReadOptions.attribute
 DXF the layer), else the name of the layer. Without one, points are mass points, lines breaklines and polygons borders
 with their holes. Attributes ``sigma`` and ``name`` are the standard deviation and the name. A breakline with the
 attribute ``z_right`` (one height for each vertex: a list of numbers, or a text with spaces between them; or one height
-for all) is two-sided. M values are not read.
+for all) is two-sided. M values are not read. `ReadOptions.height_field` names an attribute that holds the heights of
+features, such as contours. A drawing that holds nothing but faces gives their corners as mass points.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +22,11 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
+from photoplan.geometry.crs import parse_crs, split_compound
+from photoplan.geometry.units import metres_in, unit_label
 from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_line, make_groups
 from photoplan.io.terrain.options import CodeClass, ReadOptions
-from photoplan.io.vector_layer import ENTITIES, check_drawing_units, is_drawing, layers_of, read_layer, views_of
+from photoplan.io.vector_layer import ENTITIES, is_drawing, layers_of, read_layer, views_of
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 
 _CODES = ("kind", "class", "code")
@@ -45,6 +48,8 @@ class _Layer:
     fields: tuple[str, ...]
     """What the attributes are called."""
     right: NDArray[Any] | None
+    numeric: tuple[str, ...] = ()
+    """Attributes of numbers that may be heights."""
 
 
 def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
@@ -53,11 +58,9 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     Raises
     ------
     InputError
-        The file cannot be read, is not in metres, or a point or line that needs heights has none.
+        The file cannot be read, or a point or line that needs heights has none.
     """
     drawing = is_drawing(path)
-    if drawing and options.crs is None:  # A declared CRS says that the numbers are its metres.
-        check_drawing_units(path)
     notes: list[str] = []
     points: list[PointGroup] = []
     lines: list[MeasuredLine] = []
@@ -65,8 +68,9 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     heights: str | None = None
     codes: set[str] = set()
     fields: list[str] = []
+    unit: float | None = None
     for name in _layers(path, options, drawing):
-        layer, text = _layer(path, name, options, drawing, notes)
+        layer, text, unit = _layer(path, name, options, drawing, notes)
         if layer is None:
             continue
         stated = _reference(path, text, layer, notes)
@@ -88,6 +92,7 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
         notes=tuple(notes),
         codes=frozenset(codes),
         fields=tuple(fields),
+        unit=unit,
     )
 
 
@@ -114,9 +119,17 @@ def _layers(path: Path, options: ReadOptions, drawing: bool) -> list[str]:
 
 def _layer(
     path: Path, name: str, options: ReadOptions, drawing: bool, notes: list[str]
-) -> tuple[_Layer | None, str | None]:
-    """One layer with its geometries taken apart, and its CRS."""
+) -> tuple[_Layer | None, str | None, float | None]:
+    """One layer with its geometries taken apart, its CRS, and the unit of a drawing."""
     found = read_layer(path, name)
+    notes += found.notes
+    unit = found.unit
+    if drawing and options.unit is not None:
+        unit = metres_in(options.unit, "unit of drawings")
+        if found.unit is not None and found.unit != unit:
+            notes.append(
+                f"{path.name}: states {unit_label(found.unit)} ($INSUNITS); read in {unit_label(unit)} as declared"
+            )
     geometry, fields = found.shapes, {name.casefold(): values for name, values in found.fields.items()}
     use = ~(shapely.is_missing(geometry) | shapely.is_empty(geometry))
     if drawing:
@@ -129,8 +142,10 @@ def _layer(
         parts, again = shapely.get_parts(parts, return_index=True)
         whose = whose[again]
     if not len(parts):
-        return None, None
+        return None, None, unit
     row = at[whose]
+    if options.height_field is not None:
+        parts = _raised(path, name, options.height_field, parts, row, fields, notes)
     attribute = "layer" if drawing and options.attribute is None else options.attribute
     key = attribute.casefold() if attribute else next((c for c in _CODES if c in fields), "")
     if attribute and key not in fields:
@@ -147,9 +162,50 @@ def _layer(
             names=None if names is None else np.array([_text(v) for v in names[row]]),
             fields=tuple(found.fields),
             right=fields["z_right"][row] if "z_right" in fields else None,
+            numeric=_height_fields(found.fields),
         ),
         found.crs,
+        unit,
     )
+
+
+#: Beginnings of names of attributes that hold heights, in small letters.
+_HEIGHT_NAMES = ("elev", "height", "contour", "alt", "level", "z", "h_", "hoehe", "höhe", "kote", "cota", "quota")
+
+
+def _height_fields(fields: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
+    """Attributes of numbers that may be heights; those that are called so come first."""
+    numeric = [name for name, values in fields.items() if values.dtype.kind in "iuf" and name.casefold() != "sigma"]
+    called = [name for name in numeric if name.casefold().startswith(_HEIGHT_NAMES) or name.casefold() == "h"]
+    return tuple(called or numeric)
+
+
+def _raised(
+    path: Path,
+    layer: str,
+    wanted: str,
+    parts: NDArray[Any],
+    row: NDArray[np.int64],
+    fields: Mapping[str, NDArray[Any]],
+    notes: list[str],
+) -> NDArray[Any]:
+    """Geometries with the heights that an attribute states; those of features without one stay as they are."""
+    if wanted.casefold() not in fields:
+        raise InputError(f"{path}: layer {layer}: no attribute {wanted!r}; it has {', '.join(fields) or 'none'}")
+    values = fields[wanted.casefold()]
+    try:
+        heights = np.array([np.nan if v is None or v == "" else v for v in values], np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: layer {layer}: not all values of {wanted} are numbers; heights are needed") from None
+    lost = int((~np.isfinite(heights[np.unique(row)])).sum())
+    if lost:
+        notes.append(f"{path.name}: layer {layer}: {lost} features state no height in {wanted}")
+    out = parts.copy()
+    known = np.isfinite(heights[row])
+    XYZ, part = shapely.get_coordinates(parts[known], include_z=True, return_index=True)
+    XYZ[:, 2] = heights[row[known]][part]
+    out[known] = shapely.set_coordinates(shapely.force_3d(parts[known]), XYZ)
+    return out
 
 
 def _drawn(
@@ -157,18 +213,29 @@ def _drawn(
 ) -> NDArray[np.bool_]:
     """Which entities of a drawing are measured points and lines: no texts, no faces and hatches."""
     text = np.array([v is not None for v in fields.get("text", [None] * len(geometry))], bool)
-    faces = np.isin(shapely.get_type_id(geometry), (3, 6, 7, 15, 16, 17))
-    for what, which in (("texts", text), ("faces and hatches", faces)):
-        if which.any():
-            notes.append(f"{path.name}: {int(which.sum())} {what} left out")
-    use = ~(text | faces)
+    faces = shapely.get_type_id(geometry) == _POLYGON
+    use = np.ones(len(geometry), bool)
     if options.layers is not None:
         layers = fields["layer"]
         use &= np.isin(layers.astype(str), options.layers)
         if not use.any():
-            known = ", ".join(sorted(set(layers.astype(str))))
+            known = ", ".join(sorted(set(layers.astype(str))))[:300]
             raise InputError(f"{path}: nothing on layers {', '.join(options.layers)}; it has {known}")
-    return use
+    if (use & text).any():
+        notes.append(f"{path.name}: {int((use & text).sum())} texts left out")
+    use &= ~text
+    if (use & faces).any() and (options.tin_points or not (use & ~faces).any()):
+        # Corners of faces are shared: each counts once.
+        corners = np.unique(shapely.get_coordinates(geometry[use & faces], include_z=True), axis=0)
+        first = int(np.flatnonzero(use & faces)[0])
+        notes.append(f"{path.name}: {int((use & faces).sum())} faces: their {len(corners)} corners are mass points")
+        geometry[first] = shapely.MultiPoint(corners)
+        faces = faces & (np.arange(len(geometry)) != first)
+    elif (use & faces).any():
+        notes.append(
+            f"{path.name}: {int((use & faces).sum())} faces left out; with `tin_points` their corners are mass points"
+        )
+    return use & ~faces
 
 
 def _text(value: Any) -> str:
@@ -244,9 +311,12 @@ def _known(path: Path, layer: _Layer, code: str, options: ReadOptions) -> CodeCl
 def _no_height(path: Path, layer: _Layer, at: int, count: int) -> str:
     code = f" ({layer.codes[at]})" if layer.codes[at] else ""
     more = f"; so have {count - 1} others" if count > 1 else ""
+    wanted = f"; its attribute {' or '.join(layer.numeric[:5])} may hold it" if layer.numeric else ""
+    name = layer.numeric[0] if layer.numeric else "NAME"
     return (
-        f"{path}: layer {layer.name}, feature {layer.feature[at]}{code}: has no height{more}; give 3-D geometry, "
-        "choose other layers, or leave its code out (`ignore` in the table of codes)"
+        f"{path}: layer {layer.name}, feature {layer.feature[at]}{code}: has no height{more}{wanted}; name the "
+        f"attribute with `height_field` {name}, give 3-D geometry, choose other layers, or leave its code out "
+        "(`ignore` in the table of codes)"
     )
 
 
@@ -313,6 +383,4 @@ def _reference(path: Path, text: str | None, layer: _Layer, notes: list[str]) ->
         # GeoJSON without a CRS is WGS 84 by its standard; coordinates that are no degrees say otherwise.
         notes.append(f"{path.name}: states no CRS, and its coordinates are no degrees")
         return None, None
-    if crs.is_geographic:
-        return canonical_crs(text), None
     return split_compound(text)

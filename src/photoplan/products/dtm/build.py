@@ -17,6 +17,7 @@ from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import check_height_system, height_label
+from photoplan.geometry.units import metric_heights
 from photoplan.io.naming import together, when_named
 from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
@@ -88,7 +89,7 @@ def load(request: BuildRequest) -> tuple[MeasuredTerrain, tuple[Finding, ...], s
     HeightSystemError
         The declared height system is none, or contradicts the files.
     """
-    raw = read_measured(request.inputs, request.options)
+    raw = read_measured(request.inputs, replace(request.options, height_system=request.height_system))
     if raw.crs is None:
         names = ", ".join(path.name for path in request.inputs)
         raise InputError(f"{names}: no CRS; state it with `crs` EPSG:nnnn, it is not guessed")
@@ -235,6 +236,7 @@ def _height_system(measured: MeasuredTerrain, declared: str | None) -> str | Non
     wanted = check_height_system(declared)
     if wanted == "same":
         raise UsageError("height system same; a model needs a name: ellipsoidal or EPSG:nnnn of a vertical CRS")
+    wanted, _ = metric_heights(wanted)
     if measured.height_system is not None and check_height_system(measured.height_system) != wanted:
         raise UsageError(
             f"height system {declared} was declared, but the files state {height_label(measured.height_system)}"

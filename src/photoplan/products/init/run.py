@@ -38,7 +38,14 @@ from photoplan.products.init.match import (
     match_images,
     some,
 )
-from photoplan.products.init.systems import check_joined, height_systems, placed, project_crs, terrain_entry
+from photoplan.products.init.systems import (
+    check_joined,
+    height_systems,
+    in_declared_unit,
+    placed,
+    project_crs,
+    terrain_entry,
+)
 from photoplan.products.judged import differences, on_map, stated_positions
 from photoplan.project.by_rpc import size_fault
 
@@ -203,6 +210,8 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     table = None
     if request.orientation is not None:
         table = read_orientation(request.orientation, request.form, request.format)
+    others = [*request.control, *([] if request.positions is None else [request.positions])]
+    table = in_declared_unit(request, table, others)
     pairs, lonely_files, lonely_names = match_images(files, table) if table else ([], files, [])
     own = own_geometry(lonely_files, request.folder, names)
     lonely_files = [file for file in lonely_files if file not in own]
@@ -228,7 +237,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     talk(f"  height systems: {of_terrain}{of_others} {height_label(systems[1])}")
     poses: dict[str, tuple[Triple, Triple]] = {}
     if table is not None:
-        centers, angles = placed(table, crs, systems[1])
+        centers, angles = placed(table, crs)
         check_joined(*systems, crs, centers)
         _judge_area(request, crs, centers, f"{table.file}: projection centre", talk)
         poses = {i.name: (triple(c), triple(a)) for i, c, a in zip(table.images, centers, angles)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -22,8 +23,10 @@ from photoplan.geometry.crs import (
     utm_codes,
 )
 from photoplan.geometry.heights import check_height_system, declared_pair, height_label, height_step
+from photoplan.geometry.units import metric_heights, unit_label
 from photoplan.io.names import check_input_name, relative_path
 from photoplan.io.orientation.table import OrientationTable, degrees_of
+from photoplan.io.plain_files import crs_beside
 from photoplan.io.project.model import StatedTerrain
 from photoplan.io.raster_info import read_info
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
@@ -82,7 +85,7 @@ def _terrain_facts(file: Path) -> TerrainSource:
         header = ModelReader(file).header
         return TerrainSource(file, header.crs, header.height_system)
     info = read_info(file)
-    return TerrainSource(info.path, info.crs, info.vertical_crs)
+    return TerrainSource(info.path, info.crs, info.height_system)
 
 
 def terrain_entry(request: Systems) -> tuple[StatedTerrain | None, TerrainSource | None]:
@@ -195,24 +198,25 @@ def height_systems(
             )
     terrain_system, orientation_system = stated
     if request.terrain is not None:
-        return declared_pair(terrain_system, orientation_system)
+        metric, of_images = declared_pair(terrain_system, orientation_system)
+        # The project states the unit of the terrain's heights; those of images are converted by `in_declared_unit`.
+        own = check_height_system(terrain_system or "same")
+        return metric if metric_heights(own)[1] == 1.0 else own, of_images
     if orientation_system is None:
         raise HeightSystemError(
             "height system of control points and orientation not stated → declare it with `height_system`: "
             "ellipsoidal, EPSG:nnnn (a vertical CRS, such as EPSG:5773 for EGM96), or same (as that of all heights)"
         )
-    return None, check_height_system(orientation_system, "orientation")
+    return None, metric_heights(check_height_system(orientation_system, "orientation"))[0]
 
 
-def placed(table: OrientationTable, crs: str, system: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS.
 
     Raises
     ------
     InputError
         The positions are in a CRS to whose axes angles cannot refer.
-    HeightSystemError
-        The unit of the heights is not stated.
     """
     if table.origin is not None:
         centers, axes = topocentric_poses(table.origin, crs, table.centers)
@@ -225,16 +229,45 @@ def placed(table: OrientationTable, crs: str, system: str) -> tuple[NDArray[np.f
             f"{table.file}: positions are in {crs_label(table.crs)}, which is not projected, so angles have no axes "
             "to refer to; transform the orientation into a projected CRS beforehand"
         )
-    if source.axis_info[0].unit_conversion_factor != 1.0 and system in ("same", "ellipsoidal"):
-        raise HeightSystemError(
-            f"{table.file}: {crs_label(table.crs)} is in {source.axis_info[0].unit_name}, and the unit of Z is not "
-            "stated; declare the vertical CRS with `orientation_height_system` EPSG:nnnn"
-        )
     XY = table.centers[:, :2]
     bounds = (XY[:, 0].min(), XY[:, 1].min(), XY[:, 0].max(), XY[:, 1].max())
-    step = crs_step(table.crs, crs, bounds)
-    centers = np.column_stack([step(XY), table.centers[:, 2]])
+    try:
+        step = crs_step(table.crs, crs, bounds)
+        centers = np.column_stack([step(XY), table.centers[:, 2]])
+    except InputError as error:
+        raise InputError(f"{table.file}: {error}") from None
     return centers, degrees_of(grid_rotation(step, XY) @ table.rotations)
+
+
+def in_declared_unit(
+    request: Systems, table: OrientationTable | None, others: Sequence[Path]
+) -> OrientationTable | None:
+    """The orientation with heights in metres, by the unit of its file or of the height system that is declared for it.
+
+    Parameters
+    ----------
+    others : sequence of Path
+        Files of control and positions, which the same declaration concerns.
+
+    Raises
+    ------
+    InputError
+        The unit of heights is not stated, or the file and the declaration contradict each other.
+    HeightSystemError
+        Heights of `others` would be in another unit than metres, and no file beside them states it.
+    """
+    own = None if table is None else table.height_system
+    declared = request.orientation_height_system or (request.height_system if own is None else None)
+    if declared is not None and declared.strip().casefold() not in ("same", "ellipsoidal"):
+        metric, rise = metric_heights(check_height_system(declared))
+        silent = [f for f in others if f.is_file() and f.suffix.lower() != ".gpkg" and crs_beside(f) is None]
+        if rise != 1.0 and silent:
+            raise HeightSystemError(
+                f"{silent[0]}: heights of control and positions are in metres, not in {unit_label(rise)} as declared "
+                f"({height_label(declared)}); convert them and declare {crs_label(metric)}, or state their CRS with "
+                f"its height system in {silent[0].with_suffix('.prj').name} beside the file: they are then converted"
+            )
+    return None if table is None else table.heights_in_metres(declared)
 
 
 def check_joined(terrain: str | None, images: str, crs: str, centers: NDArray[np.float64]) -> None:
@@ -242,4 +275,4 @@ def check_joined(terrain: str | None, images: str, crs: str, centers: NDArray[np
     if terrain is None:
         return
     bounds = (centers[:, 0].min(), centers[:, 1].min(), centers[:, 0].max(), centers[:, 1].max())
-    height_step(images, terrain, crs, bounds)(centers)
+    height_step(images, metric_heights(terrain)[0], crs, bounds)(centers)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, same_crs
+from photoplan.geometry.units import MetricSystem, agreed_metres, metric_system
 from photoplan.io.drawn_features import DrawnFeatures, read_drawn_features
 from photoplan.products.dtm.contours import ContourRequest, contour_parts
 from photoplan.products.view.ground import ViewGround
@@ -206,7 +207,7 @@ def _features(request: LinesRequest, ground: ViewGround) -> Drawing:
 
 
 def in_crs_of_ground(table: DrawnFeatures, options: dict[str, str], ground: ViewGround) -> NDArray[np.float64]:
-    """Vertices in the CRS of the ground; heights as they are, or left out where all lies on the ground."""
+    """Vertices in the CRS of the ground, in metres; heights are left out where all lies on the ground."""
     XYZ = table.XYZ.copy()
     drape = options.get("drape", "no")
     if drape not in ("yes", "no"):
@@ -223,6 +224,12 @@ def in_crs_of_ground(table: DrawnFeatures, options: dict[str, str], ground: View
             "the ground"
         )
     stated, known = table.height_system, ground.height_system
+    system = MetricSystem(ground.crs, 1.0, None, 1.0) if crs is None else metric_system(crs, f"{table.path}: CRS")
+    system = system.declaring(stated, f"{table.path}: heights")
+    XYZ[:, :2] *= agreed_metres(table.unit, system.scale, f"{table.path}: X and Y", in_one_file=False)
+    if not np.isnan(XYZ[:, 2]).all():
+        XYZ[:, 2] *= agreed_metres(table.unit, system.height_scale, f"{table.path}: heights", in_one_file=False)
+    crs, stated = crs and system.crs, stated and system.heights
     if not np.isnan(XYZ[:, 2]).all() and stated is not None and known is not None and not same_crs(stated, known):
         raise InputError(
             f"{table.path}: heights in {crs_label(stated)}, those of the ground are in {crs_label(known)}; convert "
