@@ -7,7 +7,9 @@
     ├── InputError            exit 3   an input cannot be used: file, table, orientation, heights
     │   ├── HeightSystemError          a height system is unknown, or the grid that joins two is missing
     │   └── GeometryError              rank, visibility or overlap do not allow the computation
+    │       └── DatumDefect            nothing determines where a block lies
     ├── TilesFailed           exit 4   finished, but some tiles failed; they are listed
+    │   └── ImagesLeftOut              finished, but some images of a block are not oriented
     ├── ResourceError         exit 5   disk or memory is exhausted
     └── RunLocked             exit 2   another run is writing the same product
 
@@ -47,10 +49,18 @@ class GeometryError(InputError):
     """The geometry of the inputs does not determine what was asked."""
 
 
+class DatumDefect(GeometryError):
+    """The observations of a block do not determine where it lies, how it is turned, or its scale."""
+
+
 class TilesFailed(PhotoplanError):
     """The run finished, but the tiles listed in the message could not be computed."""
 
     exit_code = 4
+
+
+class ImagesLeftOut(TilesFailed):
+    """A block was adjusted and written, but the images listed in the message could not be oriented."""
 
 
 class ResourceError(PhotoplanError):

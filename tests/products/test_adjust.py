@@ -204,7 +204,7 @@ def test_images_that_drop_out_do_not_shift_the_others(tmp_path: Path) -> None:
     before = load_project(made.path).image("a1")
     report = exactly(made)
     assert report.orientations == 7
-    assert load_project(made.path).image("a1") == before
+    assert load_project(made.path).image("a1") == before.model_copy(update={"approximate": True})
     assert "a1" in dict(report.figures.left_out)
     centers, rotations = found(made)
     np.testing.assert_allclose(centers[1:], made.centers[1:], atol=2e-4)

@@ -76,9 +76,9 @@ def test_images_that_only_the_calibrated_lens_fits_take_part(tmp_path: Path) -> 
 
 def test_without_calibration_the_reason_is_the_right_one(tmp_path: Path) -> None:
     found = _adjusted(board(tmp_path, calibrate=""), robust=False)
-    notes = " ".join(found.figures.notes)
-    assert "im5" in notes
-    assert "are known from other images, but no orientation makes enough of them fit: are camera constant" in notes
+    reasons = dict(found.not_oriented)
+    what = "are known from other images, but no orientation makes enough of them fit: are camera constant"
+    assert what in reasons["im5"]
 
 
 def test_where_nothing_tells_which_control_is_wrong_all_of_it_stays(tmp_path: Path) -> None:

@@ -23,6 +23,11 @@ _SHOWN = 20
 @click.option(
     "--calibrate", multiple=True, metavar="CAMERA=c:SIGMA,x0,…", help="Unknowns, with what is known [as stated]."
 )
+@click.option(
+    "--datum",
+    type=click.Choice(["observations", "orientations"]),
+    help="What places the block: control and observed positions, or the orientations in PROJECT [as stated].",
+)
 @images_option()
 @click.option("--no-robust", is_flag=True, help="Seek no gross errors.")
 @click.option("--critical", type=float, default=4.0, show_default=True, help="Normalised residual of a gross error.")
@@ -35,9 +40,11 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Orientations, points and cameras from all measurements of a project at once.
 
     Measurements are the files that [observations] names. Orientations and calibrated cameras are written into the
-    project file (the one before is kept as *.previous.toml), a report and the points into the output folder.
+    project file (the one before is kept as *.previous.toml), a report and the points into the output folder. Images that
+    cannot be oriented do not stop the others; they are listed at the end (exit code 4), and products leave them out.
     """
     from photoplan.cli.telling import Telling
+    from photoplan.errors import ImagesLeftOut
     from photoplan.io.naming import together
     from photoplan.products.adjust.run import AdjustRequest, adjust_project
     from photoplan.report.adjust.page import adjust_page
@@ -64,6 +71,25 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
             show(line)
     for line in _talk(report):
         events.talk(line)
+    if report.not_oriented:
+        raise ImagesLeftOut(_not_oriented(report))
+
+
+def _not_oriented(report: AdjustReport) -> str:
+    """The images that are not oriented, by reason, and what may help."""
+    names: dict[str, list[str]] = {}
+    for name, reason in report.not_oriented:
+        names.setdefault(reason, []).append(name)
+    count = len(report.figures.images) + len(report.not_oriented)
+    return "\n".join(
+        [
+            f"{len(report.not_oriented)} of {count} images could not be oriented; those of the others are "
+            + ("written, and products leave these out:" if report.written else "determined:"),
+            *(f"  {', '.join(images)}: {reason}" for reason, images in names.items()),
+            "more tie points may connect them: `photoplan tie --overwrite` with other --pairs, --scale or --features; "
+            "or control points in them",
+        ]
+    )
 
 
 def _figures(report: AdjustReport) -> list[str]:

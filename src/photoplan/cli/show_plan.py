@@ -31,7 +31,7 @@ def show_plan(
     show(plan)
     show(_sums(plan, figures))
     for line in plan.blind:
-        show(f"  {'left out' if plan.of_objects else 'sees no terrain'}: {line}")
+        show(f"  left out: {line}")
     for line in [] if squares is None else [f"quadtree: {len(squares.bounds)} squares", *squares.lines]:
         show(line)
     if plan_file is not None:

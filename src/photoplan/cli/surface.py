@@ -75,7 +75,7 @@ def command(project: Path, **options: Any) -> None:
     with Telling(how.quiet) as events:
         plan = plan_surface(stated, SurfaceSettings(**options), images or None, force=force, events=events)
         for line in plan.blind:
-            events.talk(f"  sees none of it and is left out: {line}")
+            events.talk(f"  left out: {line}")
         if dry_run:
             show_json(plan.json_fields()) if how.as_json else show(plan)
             return

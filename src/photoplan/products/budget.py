@@ -165,7 +165,8 @@ def make_budget(request: BudgetRequest) -> Budget:
     project, notes = _stated(project, request)
     ground = ground_of(project)
     heights = height_errors(project)
-    names = project.select(request.images)
+    names, left_out = project.oriented(project.select(request.images))
+    notes += [f"left out: {line}" for line in left_out]
     if heights == StatedHeightErrors(0.0):
         notes.append("the terrain counts as free of error")
     budgets = tuple(_of_image(project, name, ground, heights, request) for name in names)

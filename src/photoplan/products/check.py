@@ -84,6 +84,8 @@ class ProjectCheck:
     """Whether any image with a fault is oriented by angles, which might be read in another way."""
     advice: tuple[str, ...]
     """Sentences that tell what would be better."""
+    left_out: tuple[str, ...] = ()
+    """Images without orientation, and why."""
 
     @property
     def implausible(self) -> tuple[str, ...]:
@@ -100,7 +102,7 @@ class ProjectCheck:
     def json_fields(self) -> dict[str, Any]:
         """Height systems by what has them."""
         systems = dict(zip(("terrain", "orientation", "working"), self.heights))
-        own = pick(self, "images", "sensible_resolution", "crs", "alternative", "advice")
+        own = pick(self, "images", "sensible_resolution", "crs", "alternative", "advice", "left_out")
         return {**own, "height_systems": systems}
 
     def __str__(self) -> str:
@@ -122,6 +124,9 @@ class ProjectCheck:
         closing = [f"sensible resolution {self.sensible_resolution:g} m" if known else "no sensible resolution"]
         if not self.implausible and self.alternative is None:
             closing.append("all plausible")
+        if self.left_out:
+            closing.append(f"{len(self.left_out)} of {len(self.left_out) + len(self.images)} images are not oriented")
+        lines += [f"left out: {line}" for line in self.left_out]
         return "\n".join([*lines, " · ".join(closing), *self.advice])
 
 
@@ -138,7 +143,7 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
     PhotoplanError
         An input of all images, or every image, cannot be used. One of several images has a fault instead.
     """
-    names = project.select(images)
+    names, left_out = project.oriented(project.select(images))
     ground = ground_of(project)
     looked: dict[int, tuple[JudgedView | None, ImagePlausibility, ImageCheck]] = {}
     failed: dict[int, InputError] = {}
@@ -165,6 +170,7 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
         alternative=reading_of_block(project, dict(zip(known, zip(views, looks))), ground),
         angles=any(view is not None for view, check in zip(views, good) if check.fault),
         advice=_advice(project, good) + _of_objects(project, ground, known),
+        left_out=tuple(left_out),
     )
 
 

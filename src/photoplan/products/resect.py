@@ -219,6 +219,7 @@ class ResectedImage:
             "center": _rounded(self.center, decimals_of(self.sigma_center)),
             "angles": _rounded(self.angles, _ANGLE_DECIMALS),
             **stated_accuracy(self.covariance),
+            "approximate": None,
         }
 
     @property

@@ -55,6 +55,11 @@ class ImageEntry(Entry, ABC):
         return [] if self.geometry_file is None else [resolve(self.geometry_file)]
 
     @property
+    def unoriented(self) -> str | None:
+        """Why products leave the image out; None if it is oriented."""
+        return None
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """What a user should know of its geometry, a clause each."""
         return ()

@@ -174,6 +174,8 @@ class Adjustment(Entry):
     """Antenna minus projection centre in camera axes (x right, y up, z towards the viewer), metres."""
     lever_arm_sigma: NotNegative = 0.0
     """Its standard deviation, metres; 0: it is held fixed."""
+    datum: Literal["observations", "orientations"] = "observations"
+    """What places the block: control and observed positions, or the orientations that the project states."""
     drift: Literal["none", "shift", "linear"] = "none"
     """Drift of observed positions in each strip: none, a shift, or a shift and a change linear in time."""
     boresight: Annotated[bool, Strict()] = False
@@ -321,6 +323,23 @@ class Project(Entry):
                 )
             chosen.update(found)
         return [n for n in names if n in chosen]
+
+    def oriented(self, names: Sequence[str], approximate: bool = False) -> tuple[list[str], list[str]]:
+        """The oriented ones of some images, and a line for each of the others; `approximate` ones count if asked for.
+
+        Raises
+        ------
+        InputError
+            None of them is oriented.
+        """
+        reasons = {name: self.any_image(name).unoriented for name in names}
+        if approximate:
+            reasons |= {i.name: None for i in self.posed if i.name in reasons and i.center is not None}
+        left_out = [f"{name}: {reason}" for name, reason in reasons.items() if reason is not None]
+        if len(left_out) == len(names) > 0:
+            others = f" (nor has any other of {len(names)} images)" if len(names) > 1 else ""
+            raise InputError(f"image {left_out[0]}{others}")
+        return [name for name in names if reasons[name] is None], left_out
 
     def restoration(self, image: ImageEntry) -> Restoration | None:
         """How an image of the project is restored: as it states itself, else as its camera does; None: not at all."""

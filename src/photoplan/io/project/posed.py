@@ -65,6 +65,9 @@ class Image(ImageEntry):
     correlation: Correlation | None = None
     """The correlation matrix of centre, angles and, after a calibration, what `sigma` of the camera lists, below its
     diagonal, row by row; None: they are not correlated."""
+    approximate: Annotated[bool, Strict()] | None = None
+    """Whether center and angles are initial values that `photoplan adjust` could not improve: products leave the image
+    out."""
     fiducials: Fiducials | None = None
     """Measured fiducial marks of a film scan: name = [column, row], pixels."""
 
@@ -145,6 +148,13 @@ class Image(ImageEntry):
         return self.model_copy(update=update) if update else self
 
     @property
+    def unoriented(self) -> str | None:
+        """See `ImageEntry`."""
+        if self.center is None:
+            return "has no orientation; `photoplan resect` or `photoplan adjust` determines it"
+        return "its orientation is approximate: `photoplan adjust` could not determine it" if self.approximate else None
+
+    @property
     def pose_numbers(self) -> tuple[Triple, Triple]:
         """Projection centre and angles as stated.
 
@@ -154,7 +164,5 @@ class Image(ImageEntry):
             The image is not oriented.
         """
         if self.center is None or self.angles is None:
-            raise InputError(
-                f"image {self.name!r} has no orientation; `photoplan resect` or `photoplan adjust` determines it"
-            )
+            raise InputError(f"image {self.name!r} {self.unoriented}")
         return self.center, self.angles

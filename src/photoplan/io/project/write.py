@@ -165,6 +165,7 @@ def _adjustment(adjustment: Adjustment) -> list[str]:
         "prior_sigma": "standard deviations with which they are known beforehand",
         "lever_arm": "antenna minus projection centre in camera axes, metres",
         "lever_arm_sigma": "its standard deviation; 0: held fixed",
+        "datum": '"observations" or "orientations": what places the block',
         "drift": '"none", "shift" or "linear" for each strip',
         "boresight": "whether rotations between observed attitudes and camera are unknowns",
         "rpc": "correction of rational polynomials, and what is known of it beforehand",

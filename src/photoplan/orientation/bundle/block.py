@@ -101,6 +101,9 @@ class Block:
     projections: tuple[BlockProjection, ...] = ()
     on_map: OnMap | None = None
     """Where projections see points of the block; None: map and block are one."""
+    datum: bool = False
+    """Whether positions and attitudes are approximate orientations that only place the block: their accuracy counts as
+    stated, whatever the residuals are."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.sparse import identity
 from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, splu
 
-from photoplan.errors import GeometryError
+from photoplan.errors import DatumDefect, GeometryError
 from photoplan.kernels.quadratic_forms import SparseRows, gathered, point_variances, row_variances
 from photoplan.kernels.selected_inverse import SelectedInverse, aligned, fill_pattern, selected_inverse
 from photoplan.orientation.bundle.datum import OfPoints, motions_of_points
@@ -195,7 +195,7 @@ def check_rank(model: Model, state: State, reduced: Reduced) -> None:
 
     Raises
     ------
-    GeometryError
+    DatumDefect, GeometryError
         The message names the combinations of unknowns that nothing determines, or whose equations are no numbers.
     """
     wrong = ~np.isfinite(np.asarray(reduced.S.sum(axis=1)).ravel())
@@ -220,8 +220,9 @@ def check_rank(model: Model, state: State, reduced: Reduced) -> None:
     names = _datum(model, state, directions, reduced.scale)
     names = names or _one_motion(model, state, directions)
     names = names or list(motions_of_points(state, reduced.of_points, directions) if model.projections else ())
+    error = DatumDefect if names else GeometryError
     names = names or [model.columns.spelled(d, reduced.scale) for d in vectors[:, null].T]
-    raise GeometryError(
+    raise error(
         f"the observations leave {int(null.sum())} direction{'s' if null.sum() > 1 else ''} of the unknowns free: "
         + "; ".join(dict.fromkeys(names))
         + ". Give control points or observed positions that fix them, or fewer free parameters"

@@ -24,7 +24,7 @@ from photoplan.orientation.bundle.block import (
 from photoplan.orientation.bundle.datum import by_prior
 from photoplan.orientation.bundle.model import Model
 from photoplan.orientation.bundle.normal import Inverse, Reduced, check_rank, reduce_normals
-from photoplan.orientation.bundle.robust import Judged, kinds_of, kinds_of_measurements, robust_scale
+from photoplan.orientation.bundle.robust import DATUM, Judged, kinds_of, kinds_of_measurements, robust_scale
 from photoplan.orientation.bundle.rows import Residuals, linearise, residuals_of_all, whitened
 from photoplan.orientation.bundle.select import Selection
 from photoplan.orientation.bundle.unknowns import BORESIGHT, DRIFT, IMAGES, LEVER, State
@@ -98,11 +98,12 @@ class Solution:
         return np.asarray(np.where(control, np.maximum(factors, 1.0), factors))
 
     def factors(self, before: _Floats | None = None) -> _Floats:
-        """Variance components of the groups; `before`: None is 1 for all."""
+        """Variance components of the groups; `before`: None is 1 for all. Orientations that are the datum keep 1."""
         kinds, of = kinds_of(self.model)
         used = self.weight[: len(of)] > 0
         start = np.ones(len(kinds)) if before is None else before
-        return variance_factors(self.e[: len(of)][used], self.redundancies[: len(of)][used], of[used], start)
+        found = variance_factors(self.e[: len(of)][used], self.redundancies[: len(of)][used], of[used], start)
+        return np.where([name.startswith(DATUM) for name, _ in kinds], 1.0, found)
 
 
 def solution_of(

@@ -19,6 +19,8 @@ _Floats = NDArray[np.float64]
 #: Kinds of rows: what a group of observations is called, and the unit of its residuals.
 Kinds = tuple[tuple[str, str], ...]
 
+#: Approximate orientations that place the block, as messages call them.
+DATUM = "datum from orientations"
 #: Standard deviation of softened control in units of an image point's on the ground.
 _SOFT = 3.0
 #: Iterations with Huber's weights before gross errors may lose all influence.
@@ -60,10 +62,11 @@ def kinds_of(model: Model) -> tuple[Kinds, NDArray[np.int64]]:
     block = model.block
     if block.positions is not None:
         at = len(kinds)
-        kinds += [("observed positions, horizontal", "m"), ("observed positions, height", "m")]
+        what = DATUM if block.datum else "observed positions"
+        kinds += [(f"{what}, horizontal", "m"), (f"{what}, height", "m")]
         of.append(np.tile([at, at, at + 1], len(model.position)))
     if block.attitudes is not None:
-        kinds.append(("observed attitudes", "rad"))
+        kinds.append((f"{DATUM}, angles" if block.datum else "observed attitudes", "rad"))
         of.append(np.full(3 * len(model.attitude), len(kinds) - 1))
     return tuple(kinds), np.concatenate(of).astype(np.int64)
 

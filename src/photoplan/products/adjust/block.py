@@ -140,6 +140,7 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
         bend=make_bend(frame, images, cameras, nadir, curved=curved, refracted=project.orientation.refraction),
         projections=projections,
         on_map=on_map(frame),
+        datum=adjustment.datum == "orientations",
     )
     return Prepared(inputs, frame, block, near)
 

@@ -25,8 +25,12 @@ from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.products.init.match import some
 from photoplan.project.cameras import size_of
+from photoplan.project.posed import stated_pose
 
 Floats = NDArray[np.float64]
+#: Standard deviations of orientations that place a block, where none is stated: horizontal, height (metres), angles
+#: (degrees).
+DATUM_SIGMA, DATUM_ANGLE = (3.0, 5.0), 3.0
 #: Part of the measurements that may be wrong in a way that makes one think of the whole file.
 _FEW = 0.02
 
@@ -50,6 +54,8 @@ class AdjustInputs:
     files: tuple[Path, ...]
     notes: tuple[str, ...]
     """What a user should know of how the files were read."""
+    lost: tuple[tuple[str, str], ...] = ()
+    """Images that cannot be oriented to begin with, and why."""
 
 
 def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
@@ -90,6 +96,9 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
         keep = np.array([n in measured for n in ground.names], bool)
         names_kept = tuple(n for n in ground.names if n in measured)
         ground = GroundPoints(names_kept, ground.XYZ[keep], ground.sigma[keep], ground.check[keep])
+    wanted = set(names)
+    images = tuple(image for image in project.posed if image.name in wanted)
+    datum = project.adjustment.datum == "orientations"
     table = _positions(project, names, notes)
     if table is not None:
         files += image_files(table.path)
@@ -98,13 +107,13 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
     sigma = None if observations.sigma_attitude is None else observations.sigma_attitude
     radians = None if sigma is None else float(angle_in_radians(np.array(sigma), unit))
     attitudes = None if table is None else table.attitudes(radians)
+    if datum:
+        positions, attitudes = _datum(project, images, radians, notes)
     if table is not None and table.R_ground_camera is not None and attitudes is None:
         notes.append(
             f"{table.path.name}: attitudes are start values only; they become observations with sigma_attitude in "
             "[observations]"
         )
-    wanted = set(names)
-    images = tuple(image for image in project.posed if image.name in wanted)
     return AdjustInputs(
         project=project,
         images=images,
@@ -239,6 +248,42 @@ def _ground(project: Project, parts: list[GroundPoints]) -> GroundPoints:
             "in [observations], or columns sigma_xy and sigma_z with the points (0: held fixed)"
         )
     return GroundPoints(names, XYZ, sigma, check)
+
+
+def _datum(
+    project: Project, images: Sequence[Image], sigma_attitude: float | None, notes: list[str]
+) -> tuple[ObservedPositions, ObservedAttitudes]:
+    """The orientations that the project states, as what places the block."""
+    if project.observations.positions is not None:
+        raise InputError(
+            "`datum` is set to orientations, and the project has observed positions, which place the block already; "
+            "leave `datum` out, or remove positions from [observations]"
+        )
+    oriented = [image for image in images if image.center is not None and image.angles is not None]
+    if not oriented:
+        raise InputError(
+            "`datum` is set to orientations, and no image of the project has center and angles; give control points "
+            "or observed positions instead"
+        )
+    names = tuple(image.name for image in oriented)
+    poses = [stated_pose(project, image) for image in oriented]
+    plane, height = project.observations.sigma_position or DATUM_SIGMA
+    angle = np.radians(DATUM_ANGLE) if sigma_attitude is None else sigma_attitude
+    notes.append(
+        f"the block lies where the orientations of {len(names)} images place it: a position counts as known to "
+        f"{plane:g} m, {height:g} m in height, angles to {np.degrees(angle):g}°; other values are sigma_position and "
+        "sigma_attitude in [observations]"
+    )
+    return (
+        ObservedPositions(
+            images=names,
+            XYZ=np.array([pose.center for pose in poses]),
+            sigma=np.array([plane, plane, height]),
+            strip=("",) * len(names),
+            time=np.arange(len(names), dtype=float),
+        ),
+        ObservedAttitudes(names, np.array([pose.R_ground_camera for pose in poses]), np.full(3, angle)),
+    )
 
 
 def _positions(project: Project, names: Sequence[str], notes: list[str]) -> PositionTable | None:

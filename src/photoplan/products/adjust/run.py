@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.errors import DatumDefect, GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import disk_error
 from photoplan.io.geopackage import write_point_layers, write_residuals
@@ -62,6 +62,9 @@ class AdjustRequest:
     project: Path
     calibrate: tuple[str, ...] = ()
     """``CAMERA=c,x0,y0,k1`` each; empty: as [adjustment] states."""
+    datum: Literal["observations", "orientations"] | None = None
+    """What places the block: observations (control, observed positions), or the orientations that the project states;
+    None: as [adjustment] states."""
     images: tuple[str, ...] = ()
     """Names or patterns; empty: all."""
     robust: bool = True
@@ -94,6 +97,8 @@ class AdjustReport:
     orientations: int
     """Images whose orientation was written into the project."""
     data: dict[str, Any]
+    not_oriented: tuple[tuple[str, str], ...] = ()
+    """Images that were asked for and could not be oriented: name and reason."""
 
     def json_fields(self) -> dict[str, Any]:
         """Those of ``report.json``, with the files."""
@@ -123,6 +128,9 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     if not (math.isfinite(request.critical) and request.critical > 0):
         raise UsageError(f"`critical` {request.critical:g}; a positive number of standard deviations is needed")
     project = load_project(request.project)
+    if request.datum is not None:
+        own = project.adjustment.model_copy(update={"datum": request.datum})
+        project = project.model_copy(update={"adjustment": own})
     free = _free(project, request.calibrate)
     names = project.select(request.images or None)
     if not request.dry_run:
@@ -138,7 +146,15 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
         correlation=request.correlation,
         iterations=request.iterations,
     )
-    prepared, adjusted = _adjusted(inputs, free, settings, events)
+    try:
+        prepared, adjusted = _adjusted(inputs, free, settings, events)
+    except DatumDefect as error:
+        if project.adjustment.datum == "orientations" or not known_poses(inputs):
+            raise
+        raise DatumDefect(
+            f"{error}; or set `datum` to orientations: the block then lies where the orientations in the project "
+            "place it, to the accuracy of these"
+        ) from None
     result = map_result(prepared, adjusted)
     refuse_impossible(result)
     title = f"Bundle adjustment of {request.project.resolve().parent.name}"
@@ -147,9 +163,13 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     figures = summarise(title, result, settings, time.perf_counter() - begun)
     figures = replace(figures, notes=(*cause_notes(causes, result), *figures.notes))
     data = block_json(figures, result)
+    reasons = dict((*result.prepared.inputs.lost, *adjusted.left_out))
+    images = [image.name for image in inputs.images if image.name not in adjusted.images]
+    lost = tuple((name, reasons.get(name, "no reason is known")) for name in images)
+    data["not_oriented"] = [{"name": name, "reason": reason} for name, reason in lost]
     if request.dry_run:
-        return AdjustReport((), figures, 0, data)
-    return _write(request, project, result, figures, data)
+        return AdjustReport((), figures, 0, data, lost)
+    return _write(request, project, result, figures, data, lost)
 
 
 def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events: Events) -> tuple[Prepared, Adjusted]:
@@ -192,7 +212,7 @@ def _begun(
         if not (settings.robust and few and known_poses(inputs)):
             return first
     except GeometryError as error:
-        if not known_poses(inputs):
+        if isinstance(error, DatumDefect) or not known_poses(inputs):
             raise
         failure, why = error, "from them the adjustment does not converge"
     events.talk(f"{why}: starting again without approximate orientations")
@@ -262,11 +282,16 @@ def _used(prepared: Prepared) -> str:
 
 
 def _write(
-    request: AdjustRequest, project: Project, result: MapResult, figures: AdjustFigures, data: dict[str, Any]
+    request: AdjustRequest,
+    project: Project,
+    result: MapResult,
+    figures: AdjustFigures,
+    data: dict[str, Any],
+    lost: tuple[tuple[str, str], ...],
 ) -> AdjustReport:
     folder, adjusted = request.folder, result.adjusted
     with recording("adjust", request, [request.project, *result.prepared.inputs.files]) as record:
-        changes = _changes(result)
+        changes = _changes(result, lost)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -302,11 +327,11 @@ def _write(
             "rejected",
         )
         record((*written, request.project), pick(figures, *figures_of_block))
-    return AdjustReport(written, figures, len(adjusted.images) + len(adjusted.projections), data)
+    return AdjustReport(written, figures, len(adjusted.images) + len(adjusted.projections), data, lost)
 
 
-def _changes(result: MapResult) -> ProjectChanges:
-    """Entries of the project file: orientations with standard deviations, and calibrated cameras."""
+def _changes(result: MapResult, lost: Sequence[tuple[str, str]]) -> ProjectChanges:
+    """Entries of the project file: orientations with standard deviations, calibrated cameras, what stays approximate."""
     project, block = result.prepared.inputs.project, result.prepared.block
     images: dict[str, dict[str, Any]] = {}
     for k, name in enumerate(result.adjusted.images):
@@ -314,7 +339,10 @@ def _changes(result: MapResult) -> ProjectChanges:
             "center": _rounded(result.poses[k].center, decimals_of(result.sigma_center[k])),
             "angles": _rounded(result.angles[k], 10),
             **stated_accuracy(result.covariances[k]),
+            "approximate": None,
         }
+    stated = [project.image(name) for name, _ in lost]
+    images |= {image.name: {"approximate": True} for image in stated if image.center is not None}
     images |= {name: dict(found.entries) for name, _, found in result.corrections}
     sigmas = {found.name: found.sigmas for found in result.cameras}
     cameras = {

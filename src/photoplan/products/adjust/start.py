@@ -15,7 +15,6 @@ from photoplan.orientation.start.block import StartImage, start_block
 from photoplan.products.adjust.cameras import block_camera
 from photoplan.products.adjust.frame import block_frame
 from photoplan.products.adjust.inputs import AdjustInputs
-from photoplan.products.init.match import some
 from photoplan.project.posed import stated_pose
 
 #: Farther from its image, no control point is believed, metres.
@@ -77,12 +76,10 @@ def started(
     oriented = [name for name in without if name in found]
     if oriented:
         notes.append(f"{len(oriented)} images were oriented from control and tie points to begin with")
-    lost = [name for name in without if name not in found]
-    if lost:
-        why = "; ".join(dict.fromkeys(reasons.get(name, "no reason is known") for name in lost))
-        notes.append(f"{len(lost)} images could not be oriented and are left out: {some(lost)} ({why})")
+    lost = tuple((name, reasons.get(name, "no reason is known")) for name in without if name not in found)
     names = [image.name for image in (*images, *inputs.projected)]
-    return replace(inputs, images=images, points=inputs.points.of_images(names), notes=tuple(notes)), found
+    points = inputs.points.of_images(names)
+    return replace(inputs, images=images, points=points, notes=tuple(notes), lost=lost), found
 
 
 def _refuse_far(inputs: AdjustInputs, known: Mapping[str, Pose]) -> None:

@@ -81,7 +81,7 @@ def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: 
         boresight=_boresight(result),
         gross=_gross(result),
         worst=_worst(result, used),
-        left_out=adjusted.left_out,
+        left_out=(*inputs.lost, *adjusted.left_out),
         normalised=adjusted.normalised[used].ravel(),
         critical=settings.critical,
         robust=settings.robust,

@@ -140,7 +140,7 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     names = project.select(request.images or None)
     fixed = _check(request, project, names)
     found = survey(project, names, request.resolution, events)
-    notes = [f"left out, sees no terrain: {line}" for line in found.blind]
+    notes = [f"left out: {line}" for line in found.blind]
     workers = tiles_in_flight(request.workers, request.memory, BASE_MEMORY + found.kept_bytes, found.tile_bytes)
     if request.dry_run:
         return BalanceReport(found, tuple(notes))

@@ -49,7 +49,8 @@ class Looked:
 
 
 def look_at(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Looked], list[str]]:
-    """Images that see terrain, and a line for each that sees none."""
+    """Oriented images that see terrain, and a line for each of the others."""
+    names, blind = project.oriented(names, approximate=force)
     scenes: dict[str, Scene] = {}
     seen: dict[str, tuple[JudgedView | None, ImagePlausibility]] = {}
     for place in map_order(project, names):
@@ -61,7 +62,7 @@ def look_at(project: Project, names: Sequence[str], force: bool, events: Events)
     if not force:
         _refuse_faults(project, seen, scenes)
         _refuse_feet(list(scenes.values()))
-    looked, blind = [], []
+    looked = []
     for name, scene in ((name, scenes[name]) for name in names):
         if scene.footprint.bounds is None:
             blind.append(_sees_no_terrain(scene, name))

@@ -115,7 +115,7 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     check_vectors(request.path)
     executor_factory(request.executor, request.workers)
     found = survey(project, names, request.resolution, events)
-    notes = tuple(f"left out, sees no terrain: {line}" for line in found.blind)
+    notes = tuple(f"left out: {line}" for line in found.blind)
     images = _images(found)
     kept = BASE_MEMORY + _MAP * found.grid.window.size
     workers = tiles_in_flight(request.workers, request.memory, kept, _image_bytes(found, images))
