@@ -46,7 +46,7 @@ def test_images_with_common_ground_are_paired() -> None:
 def test_neighbours_by_position_are_paired(monkeypatch: pytest.MonkeyPatch) -> None:
     X = np.array([[0, 0, 0], [10, 0, 0], [20, 0, 0], [1000, 0, 0.0]])
     assert pairs_by_distance(X) == [(0, 1), (0, 2), (1, 2)]
-    monkeypatch.setattr("photoplan.matching.pairs._NEIGHBOURS", 1)
+    monkeypatch.setattr("photoplan.matching.pairs.NEIGHBOURS", 1)
     assert pairs_by_distance(X) == [(0, 1), (1, 2)]
     assert pairs_by_distance(X[:1]) == [] and all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
 

@@ -40,8 +40,10 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Orientations, points and cameras from all measurements of a project at once.
 
     Measurements are the files that [observations] names. Orientations and calibrated cameras are written into the
-    project file (the one before is kept as *.previous.toml), a report and the points into the output folder. Images that
-    cannot be oriented do not stop the others; they are listed at the end (exit code 4), and products leave them out.
+    project file (the one before is kept as *.previous.toml), a report and the points into the output folder.
+
+    Images that cannot be oriented do not stop the others; they are listed at the end (exit code 4), and products leave
+    them out.
     """
     from photoplan.cli.telling import Telling
     from photoplan.errors import ImagesLeftOut

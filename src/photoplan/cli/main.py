@@ -63,8 +63,8 @@ def photoplan() -> None:
 
     A job goes: init → (fiducials → tie → adjust) → check → ortho. Results are printed on stdout, talk and progress
     on stderr.
-    Exit codes: 0 done, 1 failed, 2 wrong use, 3 bad input, 4 finished, but tiles or images failed, 5 out of disk or memory,
-    130 interrupted.
+    Exit codes: 0 done, 1 failed, 2 wrong use, 3 bad input, 4 finished, but tiles or images failed, 5 out of disk or
+    memory, 130 interrupted.
     """
 
 

@@ -19,6 +19,13 @@ if TYPE_CHECKING:
 @click.option("--pairs", default="auto", show_default=True, metavar="auto|all|FILE", help="Which images are compared.")
 @click.option("--scale", type=float, help="Look for features in images reduced to this, e.g. 0.5 [by their size].")
 @click.option("--features", type=int, default=4000, show_default=True, help="Features per image.")
+@click.option(
+    "--levels",
+    type=click.IntRange(1, 4),
+    default=4,
+    show_default=True,
+    help="Kinds of features tried where images stay unconnected: coarser, then more; 1: as stated only.",
+)
 @click.option("--per-image", type=int, default=500, show_default=True, help="Tie points that an image is to have.")
 @click.option("--no-refine", is_flag=True, help="Features as they are, without least-squares matching.")
 @click.option("--ignore-orientation", is_flag=True, help="Work as if no image had a position.")
@@ -58,13 +65,17 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         if picture is not None:
             show(picture)
         _print(found)
-    if not quiet:
-        _talk(found)
+    _talk(found, quiet)
+
+
+def _scales(found: TieReport) -> list[str]:
+    kinds = dict.fromkeys((t.scale, t.features) for t in found.tried)
+    return [f"1/{1 / scale:.0f}" + (f" ({count})" if k else "") for k, (scale, count) in enumerate(kinds)]
 
 
 def _print(found: TieReport) -> None:
     rows = [
-        ("images", f"{len(found.images)}, features at scale 1/{found.factor}"),
+        ("images", f"{len(found.images)}, features at scale " + ", ".join(_scales(found))),
         ("pairs", f"{found.pairs} tried ({found.chosen}), {found.verified} verified"),
         ("tracks", f"{found.tracks} found, {found.ambiguous} ambiguous ones dropped"),
         ("tie points", f"{found.points}, standard deviation {found.sigma:.2g} px (median)"),
@@ -88,11 +99,11 @@ def _print(found: TieReport) -> None:
         show(f"{name:{width}}  {count:6}")
 
 
-def _talk(found: TieReport) -> None:
-    for note in found.notes:
+def _talk(found: TieReport, quiet: bool) -> None:
+    for note in () if quiet else found.notes:
         say(note)
     if len(found.parts) > 1:
         say(f"no overlap: {len(found.unconnected)} of {len(found.images)} images do not hang together with the others:")
         for part in found.parts[1:]:
             say(f"  {', '.join(part)}")
-        say("they cannot be adjusted together; give --pairs all, more --features, or leave them out")
+        say(found.advice)

@@ -116,7 +116,7 @@ def _tile_features(
     valid = np.isfinite(grey)
     found, descriptors = sift.detectAndCompute(to_bytes(grey, *limits), None)
     if not found:
-        return _none()
+        return no_features()
     xy = np.array([k.pt for k in found], np.float64)
     scale = np.array([k.size for k in found]) / 2
     at = xy + np.array([wide.col, wide.row])
@@ -153,7 +153,8 @@ def _spread(features: Features, settings: FeatureSettings, size: tuple[int, int]
     return features.where(np.sort(best[: settings.count]))
 
 
-def _none() -> Features:
+def no_features() -> Features:
+    """Return no feature at all."""
     empty = np.empty(0)
     return Features(
         xy=np.empty((0, 2)), scale=empty, angle=empty, strength=empty, descriptors=np.empty((0, 128), np.uint8)
@@ -161,7 +162,7 @@ def _none() -> Features:
 
 
 def _joined(parts: list[Features]) -> Features:
-    parts = [_none(), *parts]
+    parts = [no_features(), *parts]
     return Features(
         *(np.concatenate([getattr(p, n) for p in parts]) for n in ("xy", "scale", "angle", "strength", "descriptors"))
     )

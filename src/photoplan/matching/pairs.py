@@ -17,7 +17,7 @@ Pair = tuple[int, int]
 #: Smaller part of a footprint that a pair shares.
 _LEAST_SHARE = 0.05
 #: Nearest or most similar images that an image is compared with, at most.
-_NEIGHBOURS = 20
+NEIGHBOURS = 20
 #: Farthest of the nearest images, in median distances to the nearest one.
 _REACH = 6.0
 #: Coarse features that a pair shares at least.
@@ -76,7 +76,7 @@ def pairs_by_distance(positions: NDArray[np.float64]) -> list[Pair]:
     distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     np.fill_diagonal(distance, np.inf)
     limit = _REACH * float(np.median(distance.min(axis=1)))
-    near = np.argsort(distance, axis=1, kind="stable")[:, :_NEIGHBOURS]
+    near = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBOURS]
     found = {
         (min(i, int(j)), max(i, int(j))) for i in range(n) for k, j in enumerate(near[i]) if distance[i, j] <= limit
     }
@@ -93,7 +93,7 @@ def pairs_by_likeness(coarse: Sequence[Features]) -> list[Pair]:
         shared[i, j] = shared[j, i] = len(match_features(coarse[i], coarse[j]))
     found: set[Pair] = set()
     for i, row in enumerate(shared):
-        best = np.argsort(-row, kind="stable")[:_NEIGHBOURS]
+        best = np.argsort(-row, kind="stable")[:NEIGHBOURS]
         found |= {(min(i, int(j)), max(i, int(j))) for j in best if row[j] >= _LEAST_SHARED}
     return sorted(found)
 

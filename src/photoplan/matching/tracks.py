@@ -115,6 +115,38 @@ def build_tracks(features: Sequence[Features], pairs: Sequence[PairMatches], sam
     return TracksFound(every.where(~again & ~bad[track]), int(bad.sum()))
 
 
+def joined_tracks(parts: Sequence[Tracks]) -> Tracks:
+    """Tracks of several levels as one, each with numbers of its own."""
+    start = np.cumsum([0, *(part.count for part in parts)])
+    rest = (np.concatenate([getattr(p, n) for p in parts]) for n in ("image", "xy", "scale", "angle", "sigma"))
+    return Tracks(np.concatenate([p.track + k for p, k in zip(parts, start)]), *rest)
+
+
+#: Points that an image shares with at least two oriented ones, from which a model grows to it.
+_GROWS = 20
+
+
+def weak_images(count: int, tracks: Tracks) -> list[int]:
+    """Images to which no model grows that begins with the pair of most common points.
+
+    An image is added when `_GROWS` of its points are seen in two images of the model.
+    """
+    table = np.zeros((count, tracks.count), bool)
+    table[tracks.image, tracks.track] = True
+    common = table.astype(np.float32) @ table.T.astype(np.float32)
+    np.fill_diagonal(common, 0.0)
+    if not common.any():
+        return list(range(count))
+    model = np.zeros(count, bool)
+    model[list(np.unravel_index(int(common.argmax()), common.shape))] = True
+    while True:
+        known = table[model].sum(axis=0) >= 2
+        new = ~model & (table[:, known].sum(axis=1) >= _GROWS)
+        if not new.any():
+            return [int(k) for k in np.flatnonzero(~model)]
+        model |= new
+
+
 def connected_parts(count: int, tracks: Tracks) -> list[list[int]]:
     """Images that hang together by tracks, the largest part first; an image without any is a part of its own."""
     total = count + tracks.count

@@ -19,7 +19,14 @@ from photoplan.orientation.bundle.correlation import correlation_of, effects_of_
 from photoplan.orientation.bundle.loop import Loop, Progress
 from photoplan.orientation.bundle.model import Model, build_model
 from photoplan.orientation.bundle.normal import check_rank, reduce_normals
-from photoplan.orientation.bundle.result import Solution, Weighted, result_of, solution_of
+from photoplan.orientation.bundle.result import (
+    Solution,
+    Weighted,
+    refitted_sigmas,
+    result_of,
+    solution_of,
+    with_common_errors,
+)
 from photoplan.orientation.bundle.robust import (
     first_taken_out,
     judged_control,
@@ -93,6 +100,8 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
                 break
             loose |= lost
         solution = solution_of(model, state, weights_of(model, active), settings.covariance)
+        if turn == 0 and settings.variance_components and settings.covariance:
+            block = replace(block, observations=refitted_sigmas(solution))
         if not settings.robust or turn == _ROUNDS - 1:
             break
         judged = solution.judged()
@@ -101,13 +110,22 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
         if next_active.equals(active):
             break
         active = next_active
-    weighted = _weighted(loop, solution, active, settings)
+    if block.observations is not model.block.observations:
+        model, state, selection, lost = _rebuilt(block, model, state, active, lost)
+        state = loop.run(model, state, weights_of(model, active))
+        solution = solution_of(model, state, weights_of(model, active), settings.covariance)
+    weighted = _weighted(loop, solution, selection, active, settings)
     check_rank(model, weighted.solution.state, weighted.solution.reduced)
     return replace(result_of(selection, weighted, active, loop.count), other_control=alternative)
 
 
-def _weighted(loop: Loop, solution: Solution, active: Active, settings: AdjustSettings) -> Weighted:
-    """The solution with the accuracies that residuals show: variance components, and correlated image points."""
+def _weighted(
+    loop: Loop, solution: Solution, selection: Selection, active: Active, settings: AdjustSettings
+) -> Weighted:
+    """The solution with the accuracies that residuals show: variance components, and correlated image points.
+
+    Positions and attitudes that agree among each other far better than stated may all be off by the rest.
+    """
     model, state = solution.model, solution.state
     correlations: tuple[Correlation, ...] = ()
     if settings.correlation and settings.covariance:
@@ -116,7 +134,8 @@ def _weighted(loop: Loop, solution: Solution, active: Active, settings: AdjustSe
         correlations = correlation_of(model, solution.normalised()[image].reshape(-1, 2), used)
     effects = effects_of_rows(model, correlations, len(solution.e)) if correlations else None
     factors: _Floats | None = None
-    for _ in range(_COMPONENTS):
+    common = False
+    for _ in range(2 * _COMPONENTS):
         if settings.variance_components and settings.covariance:
             factors = solution.trusted(solution.factors(factors))
         elif effects is None:
@@ -124,8 +143,16 @@ def _weighted(loop: Loop, solution: Solution, active: Active, settings: AdjustSe
         weight = weights_of(model, active, factors)
         state = loop.run(model, state, weight if effects is None else weight / effects)
         solution = solution_of(model, state, weight, settings.covariance, effects)
-        if factors is None or np.allclose(solution.trusted(solution.factors(factors)), factors, rtol=0.02):
+        if factors is not None and not np.allclose(solution.trusted(solution.factors(factors)), factors, rtol=0.02):
+            continue
+        block = model.block if factors is None or common else with_common_errors(solution, factors)
+        if block is model.block:
             break
+        common = True
+        model = build_model(block, selection.images, selection.measured, selection.points)
+        if effects is not None:
+            effects = effects_of_rows(model, correlations, model.rows)
+        solution = solution_of(model, state, weights_of(model, active, factors), settings.covariance, effects)
     return Weighted(solution, solution.factors(factors), correlations)
 
 

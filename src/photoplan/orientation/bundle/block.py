@@ -93,8 +93,12 @@ class Block:
     """Its standard deviation; 0: held fixed."""
     drift: str = "none"
     """none, shift or linear: of observed positions in each strip."""
+    common: tuple[float, float, float] | None = None
+    """Standard deviations of an error that all observed positions share, metres; None: there is none."""
     boresight: bool = False
     """Whether three rotations between observed attitudes and camera are unknowns."""
+    boresight_sigma: float = 0.0
+    """Their standard deviation a priori, radians; 0: not known."""
     start_points: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     """Start values of points, where they are known; others are intersected."""
     bend: Bend | None = None
@@ -277,6 +281,8 @@ class Adjusted:
     """(3,), radians; zero where it was no unknown."""
     boresight_sigma: NDArray[np.float64]
     strips: tuple[AdjustedStrip, ...]
+    common: tuple[float, float, float] | None
+    """See `Block.common`; found from positions that agree among each other far better than stated."""
     groups: tuple[Group, ...]
     sigma0: float
     """Standard deviation of unit weight: 1 where the stated standard deviations are right."""

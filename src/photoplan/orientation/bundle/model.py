@@ -16,7 +16,7 @@ from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.errors import InputError, UsageError
 from photoplan.orientation.bundle.block import PARAMETERS, Block, BlockCamera, BlockProjection
-from photoplan.orientation.bundle.unknowns import LEVER, CameraState, layout_of
+from photoplan.orientation.bundle.unknowns import BORESIGHT, COMMON, LEVER, CameraState, layout_of
 
 #: Standard deviation of coordinates that are held fixed, in units of an image point's on the ground: small against
 #: anything that is measured, in any unit of length, and large enough for the arithmetic.
@@ -322,4 +322,8 @@ def _known(block: Block, columns: Layout) -> tuple[tuple[str, int, float, float]
                     known.append((f"camera {name}", k, before.parameter(what), given.prior_sigma[what]))
     if columns.get(LEVER) is not None:
         known += [(LEVER, k, block.lever_arm[k], block.lever_arm_sigma) for k in range(3)]
+    if columns.get(COMMON) is not None and block.common is not None:
+        known += [(COMMON, k, 0.0, block.common[k]) for k in range(3)]
+    if columns.get(BORESIGHT) is not None and block.boresight_sigma > 0:
+        known += [(BORESIGHT, k, 0.0, block.boresight_sigma) for k in range(3)]
     return tuple(known)

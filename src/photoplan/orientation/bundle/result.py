@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.optimize import nnls
 
+from photoplan.adjustment.chances import chance_chi_square
 from photoplan.adjustment.robust import ENOUGH, variance_factors
 from photoplan.cameras.correctable import Corrections
+from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import GeometryError
 from photoplan.geometry.rotation import rotation_vector
 from photoplan.orientation.bundle.block import (
@@ -18,6 +21,7 @@ from photoplan.orientation.bundle.block import (
     AdjustedCamera,
     AdjustedCorrections,
     AdjustedStrip,
+    Block,
     Correlation,
     Group,
 )
@@ -156,6 +160,70 @@ def solution_of(
     )
 
 
+#: Redundancy from which standard deviations of image points are fitted, classes of them, and the ratio of large to
+#: small ones (deciles) below which they are all alike.
+_FITTED, _CLASSES, _ALIKE = 200.0, 8, 1.2
+
+
+def refitted_sigmas(solution: Solution) -> ImagePoints:
+    """Image points whose standard deviations have the form that residuals show, group by group: √(a s² + b).
+
+    Matching states what noise makes of a patch's place; what it does not know of (relief inside of the patch, shutter,
+    moving leaves) comes to all points alike. If it were scaled as well, a few points would get nearly all the weight,
+    and formal accuracies would be too good. The median keeps its stated value: factors of the groups tell the size.
+    """
+    model, seen = solution.model, solution.model.block.observations
+    every = kinds_of_measurements(model)
+    of = every[model.observation]
+    r = np.nan_to_num(solution.redundancies[model.parts.image]).reshape(-1, 2)
+    used = (solution.weight[model.parts.image] > 0).reshape(-1, 2) & (r > 0.05)
+    sigma = seen.sigma.copy()
+    for kind in np.unique(of):
+        mine = used & (of == kind)[:, None]
+        s, v, red = model.sigma[mine], solution.found.image[mine], r[mine]
+        if red.sum() < _FITTED or np.quantile(s, 0.9) < _ALIKE * np.quantile(s, 0.1):
+            continue
+        classes = np.array_split(np.argsort(s, kind="stable"), _CLASSES)
+        square = np.array([(s[c] ** 2).mean() for c in classes])
+        found = np.array([(v[c] ** 2).sum() / red[c].sum() for c in classes])
+        if not (found > 0).all():
+            continue
+        (a, b), _ = nnls(np.column_stack([square, np.ones(_CLASSES)]) / found[:, None], np.ones(_CLASSES))
+        middle = float(np.median(s))
+        own = every == kind
+        sigma[own] = np.sqrt(a * sigma[own] ** 2 + b) * (middle / np.sqrt(a * middle**2 + b))
+    return seen if np.array_equal(sigma, seen.sigma) else replace(seen, sigma=sigma)
+
+
+#: Found over stated accuracy below which the rest of what is stated is an error that all share; chance of as little
+#: without one.
+_BETTER, _CHANCE = 0.7, 0.01
+
+
+def with_common_errors(solution: Solution, factors: _Floats) -> Block:
+    """The block with an error that all observed positions share, and one of all attitudes, where residuals hide them.
+
+    What all positions have in common leaves no residuals: it moves the block, or bends its camera. So of a stated
+    variance what residuals show is each position's own, and the rest may be common.
+    """
+    block, (kinds, of) = solution.model.block, kinds_of(solution.model)
+    hidden = {}
+    for k, (name, _) in enumerate(kinds):
+        r = float(solution.redundancies[: len(of)][of == k].sum())
+        f2 = float(factors[k]) ** 2
+        clear = f2 < _BETTER**2 and chance_chi_square(f2 * r, r) > 1.0 - _CHANCE
+        hidden[name] = float(np.sqrt(1.0 - f2)) if r > ENOUGH and clear else 0.0
+    plane, height = (hidden.get(f"observed positions, {what}", 0.0) for what in ("horizontal", "height"))
+    if block.positions is not None and block.drift == "none" and max(plane, height) > 0:
+        s = np.median(block.positions.sigma, axis=0)
+        x, y, z = np.maximum(s * [plane, plane, height], 1e-3 * s).tolist()
+        block = replace(block, common=(x, y, z))
+    turn = hidden.get("observed attitudes", 0.0)
+    if block.attitudes is not None and not block.boresight and turn > 0:
+        block = replace(block, boresight=True, boresight_sigma=turn * float(np.median(block.attitudes.sigma)))
+    return block
+
+
 @dataclass(frozen=True, eq=False)
 class Weighted:
     """The last solution and how its observations were weighted."""
@@ -203,6 +271,7 @@ def result_of(selection: Selection, weighted: Weighted, active: Active, iteratio
         boresight=rotation_vector(state.boresight),
         boresight_sigma=_sigma(solution, BORESIGHT, variance),
         strips=_strips(solution, variance),
+        common=model.block.common,
         groups=_groups(solution, weighted.factors),
         sigma0=sigma0,
         redundancy=solution.redundancy,

@@ -15,7 +15,7 @@ from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.geometry.rotation import rotation_vector, skew
 from photoplan.orientation.bundle.block import BlockProjection
 from photoplan.orientation.bundle.model import Model
-from photoplan.orientation.bundle.unknowns import BORESIGHT, DRIFT, IMAGES, LEVER, CameraState, State
+from photoplan.orientation.bundle.unknowns import BORESIGHT, COMMON, DRIFT, IMAGES, LEVER, CameraState, State
 
 _Floats = NDArray[np.float64]
 _Index = NDArray[np.int64]
@@ -107,7 +107,7 @@ def _residuals(model: Model, state: State, rays: _Rays, seen: list[_Seen]) -> Re
         antenna = state.images.centers[model.position] + state.images.rotations[model.position] @ state.lever
         shift, rate = state.drift[model.strip_of, :3], state.drift[model.strip_of, 3:]
         drift = shift + rate * model.tau[:, None]
-        position = antenna + drift - block.positions.XYZ[model.position_row]
+        position = antenna + drift + state.common - block.positions.XYZ[model.position_row]
     if block.attitudes is not None:
         observed = block.attitudes.R_ground_camera[model.attitude_row]
         turned = np.swapaxes(observed, 1, 2) @ state.images.rotations[model.attitude] @ state.boresight
@@ -258,6 +258,7 @@ def _direct_rows(model: Model, state: State, found: Residuals, entries: _Entries
         entries.put(rows, LEVER, np.zeros(n, np.int64), R * white)
         drift = eye if block.drift == "shift" else np.concatenate([eye, eye * model.tau[:, None, None]], axis=2)
         entries.put(rows, DRIFT, model.strip_of, drift * white)
+        entries.put(rows, COMMON, np.zeros(n, np.int64), eye * white)
     n = len(model.attitude)
     if block.attitudes is not None and n:
         rows = model.parts.attitude.start + np.arange(3 * n).reshape(n, 3)

@@ -17,13 +17,14 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import UNKNOWNS, Pose
-from photoplan.geometry.rotation import small_rotations
+from photoplan.geometry.rotation import rotation_vector, small_rotations
 from photoplan.orientation.bundle.block import Block
 
 _Floats = NDArray[np.float64]
 
 #: Keys of the kinds of unknowns; those of a camera are "camera NAME".
 IMAGES, LEVER, BORESIGHT, DRIFT = "images", "lever arm", "boresight", "drift"
+COMMON = "common error of positions"
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +120,10 @@ class Turn:
     R: _Floats
     """(3, 3)."""
 
+    def value(self, parameter: int) -> float:
+        """Rotation about an axis, radians."""
+        return float(rotation_vector(self.R)[parameter])
+
     def moved(self, step: _Floats) -> Turn:
         """See `Unknowns`."""
         return Turn(self.R @ small_rotations(step)[0])
@@ -159,9 +164,14 @@ class State:
         """Interior orientation of a camera."""
         return cast(CameraState, self.blocks[f"camera {name}"])
 
-    def known(self, key: str) -> CameraState | Vectors:
+    @property
+    def common(self) -> _Floats:
+        """Error that all observed positions share, (3,)."""
+        return cast(Vectors, self.blocks[COMMON]).values[0]
+
+    def known(self, key: str) -> CameraState | Vectors | Turn:
         """Blocks of which something may be known beforehand."""
-        return cast("CameraState | Vectors", self.blocks[key])
+        return cast("CameraState | Vectors | Turn", self.blocks[key])
 
     def corrections(self, key: str) -> _Floats:
         """Values of a set of corrections, (owners, parameters)."""
@@ -202,6 +212,7 @@ def layout_of(
         raise UsageError(f"drift {block.drift!r}; allowed are none, shift, linear")
     lever = block.positions is not None and block.lever_arm_sigma > 0
     boresight = block.boresight and block.attitudes is not None and not set(block.attitudes.images).isdisjoint(images)
+    common = block.positions is not None and block.common is not None
     drift = tuple(f"drift of {{}} in {axis}" for axis in "XYZXYZ"[:width])
     return Layout.of(
         [
@@ -213,6 +224,7 @@ def layout_of(
             Kind(LEVER, ("",), tuple(f"lever arm {axis}" for axis in "xyz") if lever else ()),
             Kind(BORESIGHT, ("",), tuple(f"boresight about {axis}" for axis in "xyz") if boresight else ()),
             Kind(DRIFT, strips, drift, "strip"),
+            Kind(COMMON, ("",), tuple(f"{COMMON} in {axis}" for axis in "XYZ") if common else ()),
             *(Kind(each.key, each.owners, each.parameters, each.owner) for each in sets),
         ]
     )
@@ -235,6 +247,7 @@ def start_state(
         LEVER: Vectors(np.array([block.lever_arm], float)),
         BORESIGHT: Turn(np.eye(3)),
         DRIFT: Vectors(np.zeros((len(strips), 6))),
+        COMMON: Vectors(np.zeros((1, 3))),
         **{each.key: Vectors(np.array(each.values, float)) for each in sets},
     }
     for name in cameras:

@@ -331,7 +331,7 @@ def _write(
 
 
 def _changes(result: MapResult, lost: Sequence[tuple[str, str]]) -> ProjectChanges:
-    """Entries of the project file: orientations with standard deviations, calibrated cameras, what stays approximate."""
+    """Entries of the project file: orientations with their accuracy, calibrated cameras, what stays approximate."""
     project, block = result.prepared.inputs.project, result.prepared.block
     images: dict[str, dict[str, Any]] = {}
     for k, name in enumerate(result.adjusted.images):

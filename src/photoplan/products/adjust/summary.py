@@ -105,6 +105,13 @@ def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
             or 1 / _CONTRADICTED < group.factor < _CONTRADICTED
         ):
             continue
+        if adjusted.common is not None and group.name.startswith("observed positions") and group.factor < 1:
+            better, rest = 1 / max(group.factor, 1e-9), adjusted.common[2 * group.name.endswith("height")]
+            out.append(
+                f"{group.name}: they agree among each other {better:.1f} times better than stated; the rest, "
+                f"{rest:.2g} m, counts as an error that all of them share"
+            )
+            continue
         how = "small" if group.factor > 1 else "large"
         ratio = max(group.factor, 1 / group.factor) if group.factor > 0 else np.inf
         advice = ""

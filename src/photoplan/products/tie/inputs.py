@@ -27,9 +27,10 @@ from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.io.raster import RasterReader
-from photoplan.matching.features import Features, FeatureSettings, extract_features
+from photoplan.matching.features import Features, FeatureSettings, extract_features, no_features
 from photoplan.matching.grey import GreyImage
 from photoplan.matching.pairs import (
+    NEIGHBOURS,
     Guide,
     all_pairs,
     match_features,
@@ -261,14 +262,22 @@ class FeatureStore:
     images: tuple[TieImage, ...]
     settings: FeatureSettings
     log: Store
-    """Its key holds the settings."""
+    """Its key holds the settings of the first level."""
+    level: int = 0
+    """Position of the settings among those that are tried."""
     names: tuple[tuple[str, ...], ...] = field(init=False)
     """What the features of each image depend on beside the settings."""
     _cached: Callable[[int], Features] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         names = tuple(
-            ("features", fingerprint(i.path).digest, repr(i.grey.area), *([i.geometry] if i.geometry else []))
+            (
+                "features",
+                fingerprint(i.path).digest,
+                repr(i.grey.area),
+                *([i.geometry] if i.geometry else []),
+                *([repr(self.settings)] if self.level else []),
+            )
             for i in self.images
         )
         object.__setattr__(self, "names", names)
@@ -284,18 +293,34 @@ class FeatureStore:
         return [(*name, repr(i.calibration), _place(i)) for name, i in zip(self.names, self.images)]
 
 
-def find_features(store: FeatureStore, run: Steps) -> list[Features]:
-    """Features of all images, without their descriptors."""
-    images = store.images
+def find_features(store: FeatureStore, which: Sequence[int], run: Steps) -> list[Features]:
+    """Features of some images, without their descriptors; the others have none."""
     found = run(
-        lambda i: extract_features(i.grey, store.settings), images, store.names, lambda i: int(np.prod(i.grey.size))
+        lambda i: extract_features(i.grey, store.settings),
+        [store.images[k] for k in which],
+        [store.names[k] for k in which],
+        lambda i: int(np.prod(i.grey.size)),
     )
-    return [
-        Features(
-            xy=f.xy, scale=f.scale, angle=f.angle, strength=f.strength, descriptors=np.empty((len(f), 0), np.uint8)
-        )
-        for f in found
-    ]
+    out = [no_features()] * len(store.images)
+    for k, f in zip(which, found):
+        bare = np.empty((len(f), 0), np.uint8)
+        out[k] = Features(xy=f.xy, scale=f.scale, angle=f.angle, strength=f.strength, descriptors=bare)
+    return out
+
+
+def further_pairs(images: Sequence[TieImage], weak: Sequence[int]) -> set[tuple[int, int]]:
+    """Pairs of weakly connected images with the others: all of a small block, else twice the usual neighbours."""
+    if len(images) <= FEW_IMAGES:
+        return {(min(i, j), max(i, j)) for i in weak for j in range(len(images)) if i != j}
+    places = [image.position for image in images]
+    if any(place is None for place in places):
+        return set()
+    XYZ = np.array(places, float)
+    found = set()
+    for i in weak:
+        near = np.argsort(np.linalg.norm(XYZ - XYZ[i], axis=1), kind="stable")[1 : 2 * NEIGHBOURS + 1]
+        found |= {(min(i, int(j)), max(i, int(j))) for j in near}
+    return found
 
 
 def like_pairs(store: FeatureStore) -> list[tuple[int, int]]:
