@@ -22,6 +22,7 @@ from photoplan.orientation.bundle.normal import check_rank, reduce_normals
 from photoplan.orientation.bundle.result import (
     Solution,
     Weighted,
+    evened_sigmas,
     refitted_sigmas,
     result_of,
     solution_of,
@@ -47,6 +48,8 @@ _FAR = 10.0
 _AGAIN = 3
 #: Rounds of data snooping, and of variance components.
 _ROUNDS, _COMPONENTS = 8, 6
+#: Rounds after which standard deviations of image points are fitted to residuals.
+_REFITTED = 2
 
 
 def adjust_block(block: Block, settings: AdjustSettings | None = None, progress: Progress | None = None) -> Adjusted:
@@ -74,6 +77,10 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
     alternative: tuple[str, ...] = ()
     selection, XYZ, lost = _selected(block, active, frozenset(), wait=settings.robust)
     model = build_model(block, selection.images, selection.measured, selection.points)
+    stated, refit = block.observations.sigma, settings.variance_components and settings.covariance
+    if refit:
+        block = replace(block, observations=evened_sigmas(model))
+        model = build_model(block, selection.images, selection.measured, selection.points)
     state = _started(model, XYZ)
     _check(model, state, active)
     passes: list[tuple[State, Active, tuple[str, ...]]] = []
@@ -100,14 +107,15 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
                 break
             loose |= lost
         solution = solution_of(model, state, weights_of(model, active), settings.covariance)
-        if turn == 0 and settings.variance_components and settings.covariance:
-            block = replace(block, observations=refitted_sigmas(solution))
+        if refit and turn < _REFITTED:
+            block = replace(block, observations=refitted_sigmas(solution, stated))
         if not settings.robust or turn == _ROUNDS - 1:
             break
         judged = solution.judged()
         next_active = snooped(model, state, judged, active, settings.critical)
         next_active, alternative = judged_control(model, state, next_active, judged.scales, settings.critical)
-        if next_active.equals(active):
+        as_weighted = block.observations is model.block.observations
+        if next_active.equals(active) and (as_weighted or turn >= _REFITTED):
             break
         active = next_active
     if block.observations is not model.block.observations:

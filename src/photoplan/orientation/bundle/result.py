@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.optimize import nnls
 
 from photoplan.adjustment.chances import chance_chi_square
-from photoplan.adjustment.robust import ENOUGH, variance_factors
+from photoplan.adjustment.robust import ENOUGH, MEDIAN_1D, variance_factors
 from photoplan.cameras.correctable import Corrections
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import GeometryError
@@ -165,33 +165,55 @@ def solution_of(
 _FITTED, _CLASSES, _ALIKE = 200.0, 8, 1.2
 
 
-def refitted_sigmas(solution: Solution) -> ImagePoints:
+def evened_sigmas(model: Model) -> ImagePoints:
+    """Image points of which each group has one standard deviation, to begin with, where stated ones differ.
+
+    Nearer to what residuals show than those that matching states, see `refitted_sigmas`, which needs such a beginning.
+    """
+    seen, kinds = model.block.observations, kinds_of_measurements(model)
+    sigma = seen.sigma.copy()
+    for kind in np.unique(kinds[model.observation]):
+        s = seen.sigma[kinds == kind]
+        if s.size >= _FITTED and np.quantile(s, 0.9) >= _ALIKE * np.quantile(s, 0.1):
+            sigma[kinds == kind] = np.median(s)
+    return seen if np.array_equal(sigma, seen.sigma) else replace(seen, sigma=sigma)
+
+
+def refitted_sigmas(solution: Solution, stated: _Floats) -> ImagePoints:
     """Image points whose standard deviations have the form that residuals show, group by group: √(a s² + b).
 
     Matching states what noise makes of a patch's place; what it does not know of (relief inside of the patch, shutter,
     moving leaves) comes to all points alike. If it were scaled as well, a few points would get nearly all the weight,
-    and formal accuracies would be too good. The median keeps its stated value: factors of the groups tell the size.
+    and formal accuracies would be too good. The median keeps its stated value: factors of the groups show the size.
+
+    Parameters
+    ----------
+    solution : Solution
+    stated : ndarray, shape (k, 2)
+        Standard deviations s of the block's measurements as they were stated, pixels.
     """
     model, seen = solution.model, solution.model.block.observations
-    every = kinds_of_measurements(model)
-    of = every[model.observation]
-    r = np.nan_to_num(solution.redundancies[model.parts.image]).reshape(-1, 2)
-    used = (solution.weight[model.parts.image] > 0).reshape(-1, 2) & (r > 0.05)
-    sigma = seen.sigma.copy()
-    for kind in np.unique(of):
-        mine = used & (of == kind)[:, None]
-        s, v, red = model.sigma[mine], solution.found.image[mine], r[mine]
+    kinds = kinds_of_measurements(model)
+    # What was taken out belongs to the form as well: points with the smallest s are the first to go.
+    v = np.abs(residuals_of_all(model, solution.state))
+    r = np.full_like(v, np.nan)
+    r[model.observation] = np.nan_to_num(solution.redundancies[model.parts.image]).reshape(-1, 2)
+    r[~np.isfinite(r)] = np.nanmean(r)
+    sigma = stated.copy()
+    for kind in np.unique(kinds[model.observation]):
+        own = kinds == kind
+        mine = own[:, None] & np.isfinite(v) & (r > 0.1)
+        s, size, red = stated[mine], v[mine] / np.sqrt(r[mine]), r[mine]
         if red.sum() < _FITTED or np.quantile(s, 0.9) < _ALIKE * np.quantile(s, 0.1):
             continue
         classes = np.array_split(np.argsort(s, kind="stable"), _CLASSES)
         square = np.array([(s[c] ** 2).mean() for c in classes])
-        found = np.array([(v[c] ** 2).sum() / red[c].sum() for c in classes])
+        found = np.array([(np.median(size[c]) / MEDIAN_1D) ** 2 for c in classes])
         if not (found > 0).all():
             continue
         (a, b), _ = nnls(np.column_stack([square, np.ones(_CLASSES)]) / found[:, None], np.ones(_CLASSES))
         middle = float(np.median(s))
-        own = every == kind
-        sigma[own] = np.sqrt(a * sigma[own] ** 2 + b) * (middle / np.sqrt(a * middle**2 + b))
+        sigma[own] = np.sqrt(a * stated[own] ** 2 + b) * (middle / np.sqrt(a * middle**2 + b))
     return seen if np.array_equal(sigma, seen.sigma) else replace(seen, sigma=sigma)
 
 
