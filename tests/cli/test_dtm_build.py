@@ -69,6 +69,11 @@ class TestBuilt:
         assert "system not stated" not in text and "heights: EPSG:5773" in text
         assert left(tmp_path) == [] or left(tmp_path) == [".model.gpkg.lock"]
 
+    def test_a_level_surface_is_reported_even_quietly(self, photoplan: Here, tmp_path: Path) -> None:
+        level = write_text(tmp_path / "p.csv", ground(60) * [1, 1, 0])
+        said = photoplan("dtm", "build", level, "-o", tmp_path / "m.gpkg", "--crs", "EPSG:32633", "-q", "--no-report")
+        assert said.code == 0 and "heights are 0 m: the surface is level" in said.err
+
     def test_json_gives_the_figures(self, photoplan: Here, survey: Path, tmp_path: Path) -> None:
         said = photoplan("dtm", "build", survey, "-o", tmp_path / "m.gpkg", "--json", "-q", "--no-report")
         assert said.code == 0 and said.err == ""

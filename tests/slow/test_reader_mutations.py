@@ -57,6 +57,7 @@ from photoplan.io.series.file import read_series
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.model_read import ModelReader
 from photoplan.io.terrain.options import ReadOptions, read_code_table
+from photoplan.io.tile_log import TileLog
 from photoplan.products.describe import describe
 from photoplan.project.open_terrain import open_terrain
 
@@ -243,6 +244,18 @@ def run_record(folder: Path) -> Path:
     return folder / "m.run.json"
 
 
+def tile_log(folder: Path) -> Path:
+    with TileLog(folder / "a.tiles", "key") as log:
+        for k in range(5):
+            log.append(k, bytes(range(40 * k)), (k, 1), {"seconds": 0.5, "names": ["a"]})
+    return folder / "a.tiles"
+
+
+def read_tile_log(path: Path) -> Any:
+    with TileLog(path, "key") as log:
+        return [log.read(k) for k in sorted(log.finished)]
+
+
 GRID = MapGrid(left=0.0, top=100.0, resolution=1.0, width=100, height=100, crs=CRS)
 POINTS = "x,y,z,code\n" + "".join(f"{k}.5,{k * 2},{100 + k / 7:.3f},1\n" for k in range(40))
 CONTROL = "name,x,y,z,sigma_xy,sigma_z,role\n" + "".join(
@@ -340,6 +353,7 @@ READERS = [
     Reader("series", frames, read_series, mutated="series.toml"),
     Reader("image metadata", copied("brighton/images/DJI_0018.jpg"), read_image_metadata, "binary"),
     Reader("image info", image, describe, "binary"),
+    Reader("tile log", tile_log, read_tile_log, "binary"),
     Reader("run record", run_record, describe, "json"),
 ]  # fmt: skip
 
