@@ -188,8 +188,14 @@ def test_an_unknown_camera_constant_is_found_and_written(folder: Path) -> None:
     both = run(folder, "--free", "c")
     assert isinstance(both.exception, UsageError)
     assert "cannot be found for 2 images one by one" in str(both.exception)
-    wrong = run(folder, "--free", "c,k1", "--images", "b")
-    assert "allows c, x0, y0" in str(wrong.exception)
+    wrong = run(folder, "--free", "c,k9", "--images", "b")
+    assert "allows c, x0, y0, k1" in str(wrong.exception)
+    radial = run(folder, "--free", "k1", "--images", "b")
+    assert radial.exit_code == 0, radial.output
+    assert "  k1 " in radial.stdout
+    lens = load_project(path).cameras["cam"].lens
+    assert lens.type == "brown"
+    assert abs(lens.k1) < 4 * load_project(path).cameras["cam"].sigma["k1"]
 
 
 def test_fault_16_images_without_enough_control(folder: Path) -> None:

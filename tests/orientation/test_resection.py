@@ -16,6 +16,7 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.pose import Pose
@@ -77,6 +78,43 @@ def test_curvature_and_refraction_at_6_km(curvature: str) -> None:
     assert found.rms < 1e-5
     plain = resect(points, AERIAL, NoLens())
     assert np.abs(plain.pose.center - pose.center).max() > 0.05, "the effect is there"
+
+
+@pytest.mark.parametrize("start", [NoLens(), Brown(k1=-0.02), OpenCV(k4=0.001)], ids=["none", "brown", "opencv"])
+def test_coefficients_of_the_lens_are_found(start: Lens) -> None:
+    """Radial and decentring distortion of one image over hills, exactly and within their standard deviations."""
+    rng = np.random.default_rng(61)
+    interior = Interior.digital((4000, 3000), (3100.0, 3100.0), (12.0, -8.0))
+    more = {"k4": 0.001} if isinstance(start, OpenCV) else {}
+    true = type(start)(k1=-0.08, k2=0.02, **more) if more else Brown(k1=-0.08, k2=0.02, p1=1e-3)
+    free = ("c", "x0", "y0", "k1", "k2") if more else ("c", "x0", "y0", "k1", "k2", "p1")
+    pose = Pose(at(0, 0, 1200.0), rotation_opk(0.5, 0.2, 0.4))
+    X = ground_below(rng, pose, 60, 500.0, interior)
+    middle = Interior.digital((4000, 3000), (3050.0, 3050.0))
+    exact = resect(measured(FrameCamera(interior, true, pose), X, rng, 0.0), middle, start, ResectSettings(free))
+    assert [getattr(exact.lens, k) for k in free[3:]] == pytest.approx([getattr(true, k) for k in free[3:]], abs=1e-7)
+    assert np.abs(exact.pose.center - pose.center).max() < 1e-3
+    noisy = resect(measured(FrameCamera(interior, true, pose), X, rng, 0.3), middle, start, ResectSettings(free))
+    off = [getattr(noisy.lens, k) - getattr(true, k) for k in free[3:]]
+    assert (np.abs(off) < 4.0 * np.sqrt(np.diag(noisy.covariance))[9:]).all()
+    assert (np.sqrt(np.diag(noisy.covariance))[9:] < 0.05).all()
+
+
+def test_fault_16_coefficients_that_points_do_not_determine_are_named() -> None:
+    """Points on one circle about the principal point tell k1 not from the camera constant."""
+    rng = np.random.default_rng(62)
+    pose = Pose(at(0, 0, 1500.0), rotation_opk(0.0, 0.0, 0.7))
+    around = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    t = 0.4 * np.column_stack([np.cos(around), np.sin(around)])
+    far = rng.uniform(1200.0, 1800.0, 12)
+    X = pose.to_ground(np.column_stack([t * far[:, None], -far]))
+    points = measured(frame(pose), X, rng, 0.0)
+    with pytest.raises(GeometryError, match=r"12 control points do not determine .*k1"):
+        resect(points, AERIAL, NoLens(), ResectSettings(free=("k1", "c")))
+    with pytest.raises(GeometryError, match=r"4 control points for 9 unknowns \(pose, k1, k2, k3\); at least 5"):
+        resect(
+            measured(frame(pose), X[::3], rng, 0.5), AERIAL, NoLens(), ResectSettings(free=("k1", "k2", "k3")), name="a"
+        )
 
 
 @pytest.mark.slow
@@ -315,8 +353,8 @@ def test_fault_16_the_dangerous_cylinder() -> None:
 
 
 def test_unknown_names_of_parameters_are_refused() -> None:
-    with pytest.raises(UsageError, match=r"'k1'; resection of one image allows c, x0, y0"):
-        ResectSettings(free=("c", "k1"))
+    with pytest.raises(UsageError, match=r"'k9'; resection of one image allows c, x0, y0, k1"):
+        ResectSettings(free=("c", "k9"))
 
 
 def test_the_direct_start_is_the_same_every_time() -> None:

@@ -24,7 +24,11 @@ _DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 @click.option("--control", multiple=True, type=PATH, metavar="FILE", help="Instead of the project's.")
 @click.option("--sigma-image", type=POSITIVE, help="Of image points, pixels [the project's].")
 @click.option("--sigma-control", type=click.FloatRange(0), nargs=2, metavar="XY Z", help="Metres [the project's].")
-@click.option("--free", metavar="c,x0,y0", help="Parameters of the camera that are unknowns; one image only.")
+@click.option(
+    "--free",
+    metavar="c,x0,y0,k1",
+    help="Parameters of the camera that are unknowns (also k2, k3, p1, p2, b1, b2); one image only.",
+)
 @click.option("--unknown-camera-constant", is_flag=True, help="Not even about known; one image only.")
 @click.option("--critical", type=click.FloatRange(2, 20), default=4.0, show_default=True,
               help="Normalised residual from which a point is a gross error.")  # fmt: skip

@@ -297,6 +297,10 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     project = inputs.project
     described = project.cameras[image.camera]
     interior, lens = interior_of(described, image), lens_of(described)
+    # By the names that coefficients have with y up.
+    settings = replace(
+        settings, free=block_camera(image.camera, described, interior, dict.fromkeys(settings.free)).free
+    )
     rows = control_rows(inputs, image.name)
     given = measured_control(inputs, rows)
     frame = block_frame(project, given.XYZ if rows else np.zeros((1, 3)))
@@ -348,12 +352,12 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
 def _calibration(project: Project, image: Image, found: Resected) -> tuple[Calibrated, dict[str, Any]]:
     """What an image says of its camera, and the entries that the description gets."""
     described = project.cameras[image.camera]
-    start = block_camera(image.camera, described, interior_of(described, image), dict.fromkeys(found.free))
+    start = block_camera(image.camera, described, interior_of(described, image))
     adjusted = AdjustedCamera(
         name=image.camera,
         c=found.interior.c,
         principal_point=found.interior.principal_point,
-        lens=lens_of(described),
+        lens=found.lens,
         free=found.free,
         covariance=found.covariance[6:, 6:],
     )

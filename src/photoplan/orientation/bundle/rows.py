@@ -326,11 +326,11 @@ def _by_parameters(camera: CameraState, rays: _Rays, mine: _Index) -> _Floats:
         elif name in ("x0", "y0"):
             J[:, int(name == "y0"), column] = 1.0
         else:
-            J[:, :, column] = camera.c * _by_coefficient(camera, name, t, rays.real[mine])
+            J[:, :, column] = camera.c * by_coefficient(camera, name, t, rays.real[mine])
     return rays.outer[mine] @ J
 
 
-def _by_coefficient(camera: CameraState, name: str, t: _Floats, real: _Floats) -> _Floats:
+def by_coefficient(camera: CameraState, name: str, t: _Floats, real: _Floats) -> _Floats:
     """∂ real tangent coordinates / ∂ a coefficient of the lens, (n, 2)."""
     lens = camera.lens
     x, y = t[:, 0], t[:, 1]

@@ -18,9 +18,13 @@ from photoplan.cameras.base import project
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
+from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.field import field_limited
+from photoplan.cameras.lenses.none import NoLens
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import Pose
+from photoplan.orientation.bundle.rows import by_coefficient
+from photoplan.orientation.bundle.unknowns import CameraState
 from photoplan.orientation.resection.direct import DirectPose, moved, resect_direct, tangent_derivatives
 from photoplan.orientation.resection.model import (
     CameraOf,
@@ -62,6 +66,7 @@ class _State:
 
     pose: Pose
     interior: Interior
+    lens: Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +122,8 @@ def resect(
         The points do not determine the unknowns; the message names these.
     """
     settings = settings or ResectSettings()
+    if isinstance(lens, NoLens) and set(settings.free) - {"c", "x0", "y0"}:
+        lens = Brown()
     task = _Task(points=points, lens=lens, settings=settings, camera_of=camera_of, name=name)
     unknowns = 6 + len(settings.free)
     if 2 * len(points) < unknowns or len(points) < 3:
@@ -138,7 +145,7 @@ def _start(task: _Task, interior: Interior, near: Pose | None) -> tuple[_State, 
     """State and inliers of the direct solution."""
     if task.settings.camera_constant_known:
         found = _direct(task, interior, near)
-        return _State(found.pose, interior), found.inliers.copy()
+        return _State(found.pose, interior, task.lens), found.inliers.copy()
     width = max(interior.size) / _pixels_per_unit(interior)
     best: tuple[float, Interior, DirectPose] | None = None
     reason = ""
@@ -149,14 +156,14 @@ def _start(task: _Task, interior: Interior, near: Pose | None) -> tuple[_State, 
         except InputError as error:  # a lens may fold back within the wide field of a short camera constant
             reason = str(error)
             continue
-        r = _pixels(task, _State(found.pose, tried))
+        r = _pixels(task, _State(found.pose, tried, task.lens))
         size = np.sort(np.where(np.isfinite(r).all(axis=1), np.linalg.norm(r, axis=1), np.inf))
         cost = float(size[: len(size) // 2 + 2].sum())
         if best is None or cost < best[0]:
             best = cost, tried, found
     if best is None:
         raise GeometryError(f"no camera constant from 0.3 to 10 image widths fits; {reason}")
-    return _State(best[2].pose, best[1]), best[2].inliers.copy()
+    return _State(best[2].pose, best[1], task.lens), best[2].inliers.copy()
 
 
 def _direct(task: _Task, interior: Interior, near: Pose | None) -> DirectPose:
@@ -184,8 +191,8 @@ def _pixels_per_unit(interior: Interior) -> float:
 
 def _pixels(task: _Task, state: _State) -> Array:
     """Residuals without covariances: computed minus measured, (n, 2)."""
-    frame = oriented_camera(state.interior, task.lens, state.pose)
-    camera = frame if task.camera_of is None else task.camera_of(state.interior, task.lens, state.pose)
+    frame = oriented_camera(state.interior, state.lens, state.pose)
+    camera = frame if task.camera_of is None else task.camera_of(state.interior, state.lens, state.pose)
     return project(camera, task.points.XYZ) - task.points.xy
 
 
@@ -193,7 +200,8 @@ def _equations(task: _Task, state: _State) -> _Equations:
     """Observation equations at a state; derivatives are those of central projection."""
     points, interior = task.points, state.interior
     free = task.settings.free
-    lens = field_limited(task.lens, interior)
+    lens = field_limited(state.lens, interior)
+    camera = _camera_state(task, state)
     t, by_pose, by_X, depth = tangent_derivatives(state.pose, points.XYZ)
     real = lens.distort(t)
     plane = interior.c * real + interior.principal_point
@@ -201,7 +209,11 @@ def _equations(task: _Task, state: _State) -> _Equations:
     by_t = interior.c * to_pixel @ lens.jacobian(t)
     columns = [by_t @ by_pose]
     for name in free:
-        columns.append((to_pixel @ real[..., None]) if name == "c" else to_pixel[..., :, [("x0", "y0").index(name)]])
+        if name in ("x0", "y0"):
+            columns.append(to_pixel[..., :, [("x0", "y0").index(name)]])
+        else:
+            moves = real if name == "c" else interior.c * by_coefficient(camera, name, t, real)
+            columns.append(to_pixel @ moves[..., None])
     A = np.concatenate(columns, axis=2)
     to_ground = by_t @ by_X
     S = to_ground @ points.covariance @ np.swapaxes(to_ground, 1, 2)
@@ -214,7 +226,11 @@ def _equations(task: _Task, state: _State) -> _Equations:
     root = np.asarray(np.linalg.cholesky(S), float)
     v = np.linalg.solve(root, residuals[..., None])[..., 0]
     distance = float(np.linalg.norm(points.XYZ - state.pose.center, axis=1).mean())
-    units = np.array([distance] * 3 + [1.0] * 3 + [interior.c] * len(free))
+    # A coefficient's natural size moves the outermost point by its distance from the principal point.
+    radius = max(float(np.nanmax(np.linalg.norm(t, axis=1), initial=0.0)), 1e-9)
+    power = {"k1": 2, "k2": 4, "k3": 6, "p1": 1, "p2": 1, "b1": 0, "b2": 0}
+    own = [interior.c if name in ("c", "x0", "y0") else radius ** -power[name] for name in free]
+    units = np.array([distance] * 3 + [1.0] * 3 + own)
     return _Equations(
         A=np.asarray(np.linalg.solve(root, A), float), v=v, root=root, residuals=residuals, units=units, sound=sound
     )
@@ -233,15 +249,22 @@ def _adjusted(task: _Task, state: _State, use: NDArray[np.bool_]) -> tuple[_Stat
 
 def _stepped(task: _Task, state: _State, step: Array) -> _State | None:
     """The state after a step; None if it makes no camera."""
-    interior = state.interior
-    values = {"c": interior.c, "x0": interior.principal_point[0], "y0": interior.principal_point[1]}
-    for name, d in zip(task.settings.free, step[6:]):
-        values[name] += float(d)
-    if not 0.05 < values["c"] / interior.c < 20.0:
-        return None
+    interior, lens = state.interior, state.lens
     if task.settings.free:
-        interior = replace(interior, c=values["c"], principal_point=(values["x0"], values["y0"]))
-    return _State(moved(state.pose, step), interior)
+        try:
+            camera = _camera_state(task, state).moved(step[None, 6:])
+        except InputError:
+            return None
+        if not 0.05 < camera.c / interior.c < 20.0:
+            return None
+        interior, lens = replace(interior, c=camera.c, principal_point=(camera.x0, camera.y0)), camera.lens
+    return _State(moved(state.pose, step), interior, lens)
+
+
+def _camera_state(task: _Task, state: _State) -> CameraState:
+    """The camera of a state as a block knows it."""
+    interior = state.interior
+    return CameraState(interior.c, *interior.principal_point, state.lens, task.settings.free)
 
 
 def _cleaned(task: _Task, state: _State, use: NDArray[np.bool_]) -> Resected:
@@ -347,6 +370,7 @@ def _result(task: _Task, state: _State, equations: _Equations, use: NDArray[np.b
     return Resected(
         pose=state.pose,
         interior=state.interior,
+        lens=state.lens,
         covariance=tests.cofactor * tests.sigma0**2,
         free=task.settings.free,
         residuals=equations.residuals,

@@ -14,11 +14,12 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.pose import UNKNOWNS, Pose
+from photoplan.orientation.bundle.block import PARAMETERS
 
 Array = NDArray[np.float64]
 
-#: Parameters of the interior orientation that can be unknowns.
-FREE = ("c", "x0", "y0")
+#: Parameters of the camera that can be unknowns.
+FREE = PARAMETERS
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +57,7 @@ class ResectSettings:
     """How a resection is done."""
 
     free: tuple[str, ...] = ()
-    """Parameters of the interior orientation that are unknowns: c, x0, y0."""
+    """Parameters of the camera that are unknowns: c, x0, y0, and coefficients of the lens by their names with y up."""
     camera_constant_known: bool = True
     """False: c is an unknown, and the stated one is not even a start value."""
     critical: float = 4.0
@@ -77,6 +78,7 @@ class Resected:
     pose: Pose
     interior: Interior
     """As given, or with the parameters that were free."""
+    lens: Lens
     covariance: Array
     """(6 + k, 6 + k): projection centre in metres, small rotations about the camera's x, y, z axes in radians
     (R ← R · exp[δ]×), then the free parameters in the unit of the image plane."""
