@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
-from tools.command import Here
+from tools.command import Here, inside
 from tools.film_scan import Film, Scan
 from tools.recorded import recorded
 
@@ -211,3 +211,18 @@ def test_fault_15_nothing_to_orient(photoplan: Here, tmp_path: Path) -> None:
     assert "none of 1 images is the scan of a film" in said.err
     assert photoplan("interior", path, "--images", "b").code == 2
     assert photoplan("interior", tmp_path / "nothing.toml").code == 3
+
+
+def test_the_size_of_a_scan_that_is_there_is_not_asked_for(tmp_path: Path, shared: Path) -> None:
+    """The example of the how-to page on film states no size."""
+    text = (shared / "cases/film_size/project.toml").read_text()
+    (tmp_path / "project.toml").write_text(text)
+    said = inside("interior", tmp_path / "project.toml")
+    assert said.code == 3
+    assert "and its file cannot be read; give the scan, or state the size" in said.err
+    with rasterio.open(tmp_path / "s.tif", "w", driver="GTiff", width=1100, height=1100, count=1, dtype="uint8"):
+        pass
+    said = inside("interior", tmp_path / "project.toml")
+    assert said.code == 0, said.err
+    assert "sigma0" in said.out
+    assert (tmp_path / "project.toml").read_text() == text

@@ -104,7 +104,10 @@ class FilmEntry(CameraEntry):
     def check_fiducials(self, fiducials: Fiducials, sized: bool, name: str) -> None:
         """Marks of a scan are the camera's, and enough."""
         if not sized:
-            raise ValueError("size = [width, height] of the scan is stated neither here nor for its camera")
+            raise ValueError(
+                "size = [width, height] of the scan is stated neither here nor for its camera, and its file "
+                "cannot be read; give the scan, or state the size"
+            )
         unknown = [n for n in fiducials if n not in self.fiducials_mm]
         if unknown:
             raise ValueError(

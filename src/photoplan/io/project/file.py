@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,20 @@ from pydantic import ValidationError
 from photoplan.errors import InputError
 from photoplan.geometry.crs import require_projected_metres
 from photoplan.geometry.heights import check_height_system, require_metric_heights
+from photoplan.io.names import resolve_input
 from photoplan.io.naming import write_atomically
 from photoplan.io.plain_files import read_toml
 from photoplan.io.project.errors import explain
 from photoplan.io.project.model import Project
 from photoplan.io.project.write import project_text
+from photoplan.io.raster_info import read_info
 
 
 def load_project(path: str | Path) -> Project:
     """Read and check a project file.
 
-    Inputs that it names are not opened here; their paths, the CRS and the height systems are checked.
+    Inputs that it names are not opened here, except film scans whose size the project does not state; their paths, the
+    CRS and the height systems are checked.
 
     Raises
     ------
@@ -30,7 +34,24 @@ def load_project(path: str | Path) -> Project:
     """
     path = Path(path)
     data, text = read_toml(path)
-    return parse_project(data, path.resolve().parent, str(path), text)
+    folder = path.resolve().parent
+    return parse_project(_with_sizes(data, folder), folder, str(path), text)
+
+
+def _with_sizes(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Entries of a project with the sizes of measured film scans that only the files state."""
+    images, cameras = data.get("images"), data.get("cameras")
+    if not isinstance(images, list) or not isinstance(cameras, dict):
+        return data
+    sized = []
+    for image in images:
+        camera = cameras.get(image.get("camera")) if isinstance(image, dict) else None
+        if isinstance(camera, dict) and image.get("fiducials") and "size" not in {**camera, **image}:
+            # What is wrong with the file is said where it is opened.
+            with suppress(InputError, TypeError):
+                image = {**image, "size": [*read_info(resolve_input(folder, image["file"])).size]}
+        sized.append(image)
+    return {**data, "images": sized}
 
 
 def parse_project(data: dict[str, Any], folder: Path, source: str, text: str = "") -> Project:
