@@ -108,6 +108,18 @@ def test_json_says_marks_affine_and_what_was_found(scans, photoplan: Here) -> No
     assert affine["redundancy"] == 2
 
 
+def test_marks_that_are_turned_are_tried_and_named(scans, tmp_path: Path, photoplan: Here) -> None:  # type: ignore[no-untyped-def]
+    """A description without `rotation`, though the crosses lie diagonal."""
+    folder, truth = scans
+    (tmp_path / "camera.toml").write_text(CAMERA.replace(", rotation = 45.0", ""))
+    said = photoplan("fiducials", folder / "a.tif", "--camera", tmp_path / "camera.toml", "--json")
+    assert said.code == 0, said.err
+    (image,) = json.loads(said.out)["images"]
+    assert any("turned by 45°: add 45 to the entry rotation" in note for note in image["notes"]), image["notes"]
+    for mark in image["marks"]:
+        assert (mark["x"], mark["y"]) == pytest.approx(truth["a"][mark["name"]], abs=0.1)
+
+
 def test_lines_name_every_mark_and_what_is_missing(scans, photoplan: Here) -> None:  # type: ignore[no-untyped-def]
     folder, _ = scans
     said = photoplan("fiducials", folder / "b.tif", "--camera", folder / "camera.toml")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,6 +44,12 @@ class MarkPattern:
         x0, y0, x1, y1 = (factor * side for side in self.window)
         parts = tuple(MarkPart(factor * part.outline, part.tone) for part in self.parts)
         return MarkPattern(self.name, parts, self.background, (x0, y0, x1, y1))
+
+    def turned(self, degrees: float) -> MarkPattern:
+        """The same mark turned anticlockwise about its reference point, in the same window."""
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        R = np.array([[c, s], [-s, c]])
+        return replace(self, parts=tuple(MarkPart(part.outline @ R, part.tone) for part in self.parts))
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,10 @@ DEFORMED_MM = 0.1
 RIVALS = 4
 """Look-alikes that are named."""
 OTHER_SIZES = (0.8, 0.9, 1.12, 1.25)
+#: Directions of crosses, degrees, that are tried where none is found as described; the usual one first.
+OTHER_DIRECTIONS = (45.0, 22.5, 67.5)
+#: Mean correlation below which other directions are tried although marks are found, and by which these must fit better.
+_SURE, _BETTER = 0.9, 0.05
 """Sizes of the marks against the description that are tried where the described one is not found."""
 STATED_TOLERANCE = 0.03
 """Part by which the resolution that a file states may be wrong."""
@@ -62,7 +66,8 @@ class FiducialSearch:
 def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = FiducialSearch()) -> FiducialResult:
     """All marks of a scan, without any approximate values.
 
-    Where none is found though the scan's resolution is known, marks of neighbouring sizes are tried.
+    If they are not found, crosses are tried in other directions. If none is found though the scan's resolution is
+    known, marks of neighbouring sizes are tried.
 
     Raises
     ------
@@ -72,8 +77,10 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
         The marks that were found lie on a line.
     """
     try:
-        return _find(scan, layout, known)
+        found = _find(scan, layout, known)
     except MarksNotFound as error:
+        if (turned := _turned(scan, layout, known)) is not None:
+            return turned
         # A search for every size among all resolutions would take minutes.
         if known.pixel_mm is None or any(mark.found for mark in error.sought):
             raise
@@ -86,6 +93,41 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
             "description"
         )
         return replace(found, notes=(said, *found.notes))
+    # Rings fit without their crosses, too, but worse.
+    if (fits := _correlation(found)) < _SURE:
+        turned = _turned(scan, layout, replace(known, pixel_mm=found.pixel_mm))
+        if turned is not None and _correlation(turned) > fits + _BETTER:
+            return turned
+    return found
+
+
+def _correlation(result: FiducialResult) -> float:
+    """Mean correlation of the marks that were found."""
+    return float(np.mean([mark.correlation for mark in result.marks]))
+
+
+def _turned(scan: Scan, layout: MarkLayout, known: FiducialSearch) -> FiducialResult | None:
+    """Marks whose crosses lie in another direction than described, if so many agree that it cannot be chance."""
+    found: list[tuple[float, FiducialResult]] = []
+    # A search among all resolutions takes as long as the first one: only the usual other direction is tried then.
+    for degrees in OTHER_DIRECTIONS if known.pixel_mm is not None else OTHER_DIRECTIONS[:1]:
+        other = layout.with_turned_marks(degrees)
+        if other is None:
+            return None
+        try:
+            result = _find(scan, other, known, wide=known.pixel_mm is None)
+        except PhotoplanError:
+            continue
+        if result.fit.redundancy and result.sigma0_um < 1000 * DEFORMED_MM:
+            found.append((degrees, result))
+    if not found:
+        return None
+    degrees, result = max(found, key=lambda each: _correlation(each[1]))
+    said = (
+        f"the marks do not fit as described, but with their crosses turned by {degrees:g}°: add {degrees:g} to the entry "
+        "rotation in the camera's description of its marks"
+    )
+    return replace(result, notes=(said, *result.notes))
 
 
 def _resized(scan: Scan, layout: MarkLayout, known: FiducialSearch, factor: float) -> FiducialResult | None:

@@ -23,6 +23,10 @@ RIVAL = 0.85
 """Share of the chosen candidate's correlation from which another one is reported."""
 
 
+#: Marks with arms, which lie in any direction.
+TURNABLE = ("cross", "ring_cross", "dot_cross")
+
+
 @dataclass(frozen=True, eq=False)
 class MarkLayout:
     """Calibrated marks and what each looks like."""
@@ -56,6 +60,12 @@ class MarkLayout:
     def with_marks(self, factor: float) -> MarkLayout:
         """The same places with marks of another size."""
         return replace(self, patterns=tuple(pattern.scaled(factor) for pattern in self.patterns))
+
+    def with_turned_marks(self, degrees: float) -> MarkLayout | None:
+        """The same places with marks turned anticlockwise; None if this changes nothing or a mark is an example."""
+        if any(isinstance(p, MarkExample) or p.name not in TURNABLE for p in self.patterns):
+            return None
+        return replace(self, patterns=tuple(p.turned(degrees) for p in self.patterns if isinstance(p, MarkPattern)))
 
     @property
     def extent(self) -> float:
