@@ -124,8 +124,8 @@ def _turned(scan: Scan, layout: MarkLayout, known: FiducialSearch) -> FiducialRe
         return None
     degrees, result = max(found, key=lambda each: _correlation(each[1]))
     said = (
-        f"the marks do not fit as described, but with their crosses turned by {degrees:g}°: add {degrees:g} to the entry "
-        "rotation in the camera's description of its marks"
+        f"the marks do not fit as described, but with their crosses turned by {degrees:g}°: add {degrees:g} to the "
+        "entry rotation in the camera's description of its marks"
     )
     return replace(result, notes=(said, *result.notes))
 
