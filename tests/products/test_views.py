@@ -298,3 +298,21 @@ def test_fault_06_a_bound_on_memory_is_kept_or_refused(small: Block, tmp_path: P
     words = [small.terrain, "--from", X0, Y0, "--azimuth", 0, "--size", 50, 40, "-o", tmp_path / "v.png"]
     said = inside("view", *words, "--memory", "10MB")
     assert said.code == 2 and "at least" in said.err
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3])
+def test_class_rasters_keep_their_classes(small: Block, tmp_path: Path, samples: int) -> None:
+    """Every colour of the picture is one of the colour table, or the sky; nothing in between."""
+    table = {0: (250, 10, 10), 1: (10, 240, 20), 2: (30, 20, 230), 3: (200, 200, 40)}
+    with rasterio.open(small.terrain) as terrain:
+        profile = {"crs": terrain.crs, "transform": terrain.transform, "width": terrain.width, "height": terrain.height}
+    rng = np.random.default_rng(8)
+    classes = rng.integers(0, 4, (1, profile["height"], profile["width"]), dtype=np.uint8)
+    with rasterio.open(tmp_path / "c.tif", "w", driver="GTiff", count=1, dtype="uint8", **profile) as file:
+        file.write(classes)
+        file.write_colormap(1, table)
+    look = LookRequest(contents=(ContentRequest.parse(str(tmp_path / "c.tif")),), samples=samples, sky=(1, 2, 3))
+    _, picture = made(ViewRequest(small.terrain, STAND, tmp_path / "v.tif", look=look))
+    found = {tuple(map(int, colour)) for colour in np.moveaxis(picture[:3], 0, -1).reshape(-1, 3)}
+    assert found <= {*table.values(), (1, 2, 3), tuple(look.nodata)}
+    assert {*table.values()} <= found

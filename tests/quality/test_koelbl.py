@@ -119,3 +119,23 @@ def shares(angle, phase):
     found = spread_of_edge(measured).spread.side()[:3]
     print(angle, phase, np.round(found, 4))
     return found, measured
+
+
+@pytest.mark.parametrize("side", [[0.61, 0.17, 0.02, 0.005], [0.7, 0.13, 0.02], [0.5, 0.2, 0.05]])
+@pytest.mark.parametrize("shift", [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0])
+def test_intervals_cover_edges_that_lie_inside_a_pixel(side: list[float], shift: float) -> None:
+    """Kölbl's discrete model: one pixel of the object is mixed, then all are spread. The MTF50 is known."""
+    spread = np.array([*side[:0:-1], *side])
+    spread /= spread.sum()
+    frequency = np.linspace(0.0, 0.5, 5001)
+    reach = np.arange(len(spread)) - len(spread) // 2
+    modulation = np.cos(2.0 * np.pi * np.multiply.outer(frequency, reach)) @ spread
+    true = float(frequency[np.flatnonzero(modulation < 0.5)[0]])
+    profile = np.convolve([1.0] * 40 + [shift] + [0.0] * 39, spread, "same")
+    profile[:4], profile[-4:] = 1.0, 0.0
+    image = 5000.0 + 10000.0 * np.repeat(profile[None], 64, axis=0)
+    image += np.random.default_rng(5).normal(0.0, 20.0, image.shape)
+    low, high = measure_edge(image).mtf50_interval
+    assert low <= true <= high
+    # What an interval that holds everything would hold as well is no information.
+    assert low > 0.5 * true

@@ -84,20 +84,20 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
         # A search for every size among all resolutions would take minutes.
         if known.pixel_mm is None or any(mark.found for mark in error.sought):
             raise
-        others = [(factor, found) for factor in OTHER_SIZES if (found := _resized(scan, layout, known, factor))]
+        others = [(factor, each) for factor in OTHER_SIZES if (each := _resized(scan, layout, known, factor))]
         if not others:
             raise
-        factor, found = max(others, key=lambda other: sum(mark.correlation for mark in other[1].marks))
+        factor, best = max(others, key=lambda other: sum(mark.correlation for mark in other[1].marks))
         said = (
             f"the marks are not found as described, but {factor:g} times as large; mend their sizes in the camera's "
             "description"
         )
-        return replace(found, notes=(said, *found.notes))
+        return replace(best, notes=(said, *best.notes))
     # Rings fit without their crosses, too, but worse.
     if (fits := _correlation(found)) < _SURE:
-        turned = _turned(scan, layout, replace(known, pixel_mm=found.pixel_mm))
-        if turned is not None and _correlation(turned) > fits + _BETTER:
-            return turned
+        other = _turned(scan, layout, replace(known, pixel_mm=found.pixel_mm))
+        if other is not None and _correlation(other) > fits + _BETTER:
+            return other
     return found
 
 

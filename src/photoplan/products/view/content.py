@@ -176,10 +176,13 @@ class Resampled:
     span: tuple[float, float]
     """Values that become black and white."""
     photos: bool
+    classes: bool = False
+    """Whether its values are numbers of classes, which are never mixed."""
 
     def paint(self, scene: ViewScene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
         """See `ViewLayer`."""
-        rule = AnchorRule.of(scene.kernel, 0.02, tilted=True)
+        kernel = "nearest" if self.classes else scene.kernel
+        rule = AnchorRule.of(kernel, 0.02, tilted=True)
         rows, window = tuple(range(len(self.sources))), scene.tile.window
         owners = None
         if self.photos:
@@ -190,7 +193,7 @@ class Resampled:
         plan = ProductPlan(
             name="view", sources=tuple(map(str, rows)), target=scene.target, rule=rule, tiles=tiles, owners=owners
         )
-        painted = render(plan, Tile(0, window, rows), self.sources, scene, scene.kernel)
+        painted = render(plan, Tile(0, window, rows), self.sources, scene, kernel)
         if painted.values is None or painted.valid is None:
             return under, np.zeros(under.shape[1:], bool)
         return in_colours(painted.values, self.span), painted.valid
@@ -287,7 +290,8 @@ def _raster(path: Path, ground: ViewGround) -> ViewLayer:
         else crs_step(ground.crs, placement.crs, ground.bounds, placement.middle[0])
     )
     source = Source(MapProjection(placement, carry), reader)
-    return Resampled((source,), (reader.path,), grey_span(reader), photos=False)
+    # A colour table belongs to numbers of classes: colours in between mean nothing.
+    return Resampled((source,), (reader.path,), grey_span(reader), photos=False, classes=reader.info.palette)
 
 
 def in_colours(values: NDArray[Any], span: tuple[float, float]) -> Colours:

@@ -17,7 +17,7 @@ from photoplan.io.fingerprint import fingerprint
 from photoplan.io.matrix_file import MatrixFile
 from photoplan.plan.tiles import Tile
 from photoplan.products.view.camera import CameraRequest, view_camera
-from photoplan.products.view.content import Colours, ContentRequest, ViewLayer, ViewScene, open_layers
+from photoplan.products.view.content import Colours, ContentRequest, Resampled, ViewLayer, ViewScene, open_layers
 from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.overlay import Overlay
 from photoplan.products.view.photo import PhotoRequest, ViewPhoto
@@ -222,7 +222,12 @@ class ViewJob:
             look = partial(view.surface.look, target) if view.matrix is None else partial(from_matrix, view)
             scene = ViewScene.of(target, Tile(tile.index, fine), look, view.surface, self.address.look.kernel)
             colours = colours_of(scene, view, self.address.look)
-            means = colours.reshape(3, part.height, n, part.width, n).mean(axis=(2, 4))
+            samples = colours.reshape(3, part.height, n, part.width, n)
+            if any(isinstance(layer, Resampled) and layer.classes for layer in view.layers):
+                # Pixels on the border of two classes belong to one of them.
+                means = samples[:, :, n // 2, :, n // 2]
+            else:
+                means = samples.mean(axis=(2, 4))
             at = part.slices(window)
             picture[:, at[0], at[1]] = np.clip(np.rint(means), 0, 255)
             tally.add(_counts(target, scene.seen))
