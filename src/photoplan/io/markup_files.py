@@ -44,7 +44,7 @@ def parse_yaml(text: str, path: Path) -> Any:
                 raise InputError(f"{path}:{line}: nested deeper than {MAX_DEPTH} levels")
         _refuse_repeated_keys(yaml.compose(text, yaml.SafeLoader), path)
         return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         raise InputError(f"{where}: not valid YAML ({getattr(error, 'problem', None) or error})") from None

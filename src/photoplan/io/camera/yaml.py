@@ -55,7 +55,7 @@ def _camera(values: Any, where: str) -> CameraEntry:
     if not isinstance(values, dict):
         raise InputError(f"{where}: {values!r} given; needed are `type`, `im_size` and `focal_len`")
     kind = values.get("type")
-    if kind not in _COEFFICIENTS:
+    if not isinstance(kind, str) or kind not in _COEFFICIENTS:
         raise InputError(f"{where}: type {kind!r}; allowed are {', '.join(_COEFFICIENTS)}")
     unknown = sorted(str(k) for k in values if k not in _COMMON and k not in _COEFFICIENTS[kind])
     if unknown:
