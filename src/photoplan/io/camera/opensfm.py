@@ -67,7 +67,7 @@ def _camera(values: Any, where: str) -> CameraEntry:
     if not _is_camera(values):
         raise InputError(f"{where}: projection_type is missing")
     kind = values["projection_type"]
-    if kind not in _COEFFICIENTS:
+    if not isinstance(kind, str) or kind not in _COEFFICIENTS:
         raise InputError(f"{where}: projection_type {kind!r} is not supported; allowed are {', '.join(_COEFFICIENTS)}")
     size = finite([values.get("width"), values.get("height")], f"{where}: width and height", 2)
     w, h = int(size[0]), int(size[1])
