@@ -131,17 +131,18 @@ def weak_images(count: int, tracks: Tracks) -> list[int]:
 
     An image is added when `_GROWS` of its points are seen in two images of the model.
     """
-    table = np.zeros((count, tracks.count), bool)
-    table[tracks.image, tracks.track] = True
-    common = table.astype(np.float32) @ table.T.astype(np.float32)
-    np.fill_diagonal(common, 0.0)
-    if not common.any():
+    image, track = tracks.image, tracks.track
+    table = coo_matrix((np.ones(len(tracks), np.int32), (image, track)), shape=(count, tracks.count)).tocsr()
+    common = (table @ table.T).tocoo()
+    apart = common.row < common.col
+    if not apart.any():
         return list(range(count))
+    best = np.flatnonzero(apart)[np.argmax(common.data[apart])]
     model = np.zeros(count, bool)
-    model[list(np.unravel_index(int(common.argmax()), common.shape))] = True
+    model[[common.row[best], common.col[best]]] = True
     while True:
-        known = table[model].sum(axis=0) >= 2
-        new = ~model & (table[:, known].sum(axis=1) >= _GROWS)
+        known = np.bincount(track[model[image]], minlength=tracks.count) >= 2
+        new = ~model & (np.bincount(image[known[track]], minlength=count) >= _GROWS)
         if not new.any():
             return [int(k) for k in np.flatnonzero(~model)]
         model |= new

@@ -104,6 +104,11 @@ class TieRequest:
         """The table that is written."""
         return self.output or self.project.resolve().parent / "tie_points.csv"
 
+    @property
+    def pairs_table(self) -> Path:
+        """The table of all pairs beside it."""
+        return self.table.with_name(f"{self.table.stem}_pairs.csv")
+
 
 @dataclass(frozen=True)
 class TriedPair:
@@ -247,7 +252,7 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
         report = _report(names, chosen, levels, len(pairs), verified, tracks, notes)
         report = replace(report, output=output, refined=refined, loops=loops, sources=tuple(images), found=tracks)
         report = replace(report, tried=tried, advice=_advice(request, report, tried))
-        _write_pairs(output, tried)
+        _write_pairs(request.pairs_table, tried)
         write_run_record(
             output,
             key=key,
@@ -276,8 +281,11 @@ def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
     inputs = [request.project, *(file for file in input_files(project) if file not in points)]
     if output.suffix.lower() in (".png", ".matches", ".json"):
         raise UsageError(f"{output}: a table is written; give it a name such as tie_points.csv")
+    if request.pairs not in ("auto", "all"):
+        inputs.append(Path(request.pairs))
     if not request.dry_run:
-        check_output(output, inputs, overwrite=request.overwrite)
+        for file in (output, request.pairs_table):
+            check_output(file, inputs, overwrite=request.overwrite)
     return output
 
 
@@ -357,13 +365,13 @@ def _climb(request: TieRequest, levels: list[_Level], run: Steps, events: Events
         levels.append(_matched(store, features, pairs, VerifySettings(threshold=2.0 * reduced), run, events))
 
 
-def _write_pairs(output: Path, tried: Sequence[TriedPair]) -> None:
-    """A table of all pairs at all levels beside the points."""
+def _write_pairs(path: Path, tried: Sequence[TriedPair]) -> None:
+    """Write a table of all pairs at all levels."""
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([field.name for field in fields(TriedPair)])
     writer.writerows(astuple(each) for each in tried)
-    write_atomically(output.with_name(f"{output.stem}_pairs.csv"), text.getvalue().encode())
+    write_atomically(path, text.getvalue().encode())
 
 
 def _advice(request: TieRequest, report: TieReport, tried: Sequence[TriedPair]) -> str:
