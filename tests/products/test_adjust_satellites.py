@@ -118,7 +118,7 @@ def test_fault_14_axes_of_control_exchanged_are_refused(tmp_path: Path) -> None:
     moved = [lines[0], *(f"{n},{y},{x},{z}" for n, x, y, z in (line.split(",") for line in lines[1:]))]
     (tmp_path / "control.csv").write_text("\n".join(moved))
     said = inside("adjust", str(path))
-    assert said.code == 3 and "coordinates of control do not fit" in said.err
+    assert said.code == 3 and "are X and Y exchanged" in said.err
 
 
 def flown(
