@@ -240,7 +240,7 @@ def test_the_record_answers_for_the_product(plan: OrthoPlan, pristine: Block, tm
     execute(plan, tmp_path, Run(2, quicklook=False))
     record = json.loads((tmp_path / "one_ortho.run.json").read_text())
     assert {Path(i["path"]).name for i in record["inputs"]} == {"one.tif", "dem.tif"}
-    assert all(i["size"] == Path(i["path"]).stat().st_size for i in record["inputs"])
+    assert all(i["size"] == (tmp_path / i["path"]).stat().st_size for i in record["inputs"])
     assert record["settings"]["kernel"] == "bicubic"
     assert record["grid"]["crs"] == CRS
     assert record["heights"] == {"terrain": "same", "orientation": "same", "working": "same"}

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sqlite3
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyogrio
 import pytest
 import rasterio
 import shapely
+from tools.command import inside
 from tools.small_block import CRS, NAMES, Block, make_project, texture, write_image, write_terrain
 
 from photoplan.errors import InputError, UsageError
@@ -213,3 +218,50 @@ def test_a_changed_setting_makes_another_plan(small: Block, planned: tuple[Path,
     make_project(small)
     again = plan_orthophotos(load_project(small.project), **SETTINGS)  # type: ignore[arg-type]
     assert not {p.key for p in again.products} & {p.key for p in plan.products}
+
+
+def changed(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    with closing(sqlite3.connect(path)) as db, db:
+        header = json.loads(db.execute("SELECT content FROM photoplan_plan").fetchone()[0])
+        change(header)
+        db.execute("UPDATE photoplan_plan SET content = ?", (json.dumps(header),))
+        db.execute("DROP TRIGGER IF EXISTS x")
+
+
+@pytest.mark.parametrize(
+    "name", ["../../evil", "/tmp/evil", "a/b", "..", "..\\evil", ".hidden", "CON", "a\nb", "", 7, None]
+)
+def test_fault_11_a_name_inside_a_plan_leads_nowhere(
+    planned: tuple[Path, OrthoPlan], tmp_path: Path, name: Any
+) -> None:
+    path, _ = planned
+    before = {*tmp_path.rglob("*"), *path.parent.parent.rglob("*")}
+
+    def change(header: dict[str, Any]) -> None:
+        header["products"][0]["name"] = name
+
+    changed(path, change)
+    with pytest.raises(InputError):
+        read_plan(path)
+    ran = inside("run", path, "-o", tmp_path / "out" / "deep")
+    assert ran.code == 3, ran.err
+    assert {*tmp_path.rglob("*"), *path.parent.parent.rglob("*")} == before
+
+
+def test_fault_11_two_products_of_one_name_are_refused(planned: tuple[Path, OrthoPlan]) -> None:
+    def change(header: dict[str, Any]) -> None:
+        header["products"][0]["name"] = header["products"][1]["name"].upper()
+
+    changed(planned[0], change)
+    with pytest.raises(InputError, match="would both write"):
+        read_plan(planned[0])
+
+
+@pytest.mark.parametrize("output", ["../../elsewhere", "/tmp/elsewhere", "../..", "linked", "\0"])
+def test_fault_11_a_plan_does_not_choose_a_folder_outside(planned: tuple[Path, OrthoPlan], output: str) -> None:
+    path, _ = planned
+    (path.parent / "linked").symlink_to(path.parents[2])
+    changed(path, lambda header: header.update(output=output))
+    assert read_plan(path)[1] is None
+    ran = inside("run", path)
+    assert ran.code == 2 and "outside its own folder; give --output" in ran.err, ran.err

@@ -140,7 +140,7 @@ def test_the_record_and_the_check_name_the_filter(small: Block, filter_file: Pat
     add_to_image(small, 'restore = "sharper.toml"')
     path = ortho(small, tmp_path / "products")
     record = json.loads(path.with_name("one_ortho.run.json").read_text())
-    assert str(filter_file) in [each["path"] for each in record["inputs"]]
+    assert filter_file.resolve() in [(path.parent / each["path"]).resolve() for each in record["inputs"]]
     assert "sharper to the right" in record["images"][0]["restored"]
     checked = {each.image: each.notes for each in check_project(load_project(small.project)).images}
     gain = sharpening().noise_gain

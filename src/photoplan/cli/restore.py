@@ -148,7 +148,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
         if asked.design is not None:
             path = keep_filter(kept or request.folder / FILTER_NAME, plan.filter, overwrite=request.overwrite)
             events.talk(f"filter: {path}")
-        report = restore_images(request, events)
+        report = restore_images(request, events, more=page is not None)
     written = None
     if page is not None and report.images:
         written = page.write(restore_page(found, plan.jobs, report))

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from photoplan.cli.options import NEW_FOLDER, PATH, executing
+from photoplan.errors import UsageError
 
 
 @click.command("run")
@@ -25,4 +26,7 @@ def command(plan: Path, output: Path | None, **options: Any) -> None:
     how = running.How.from_options(options)
     with running.telling(how) as events:
         loaded, folder = read_plan(plan)
-        running.execute_and_report(loaded, output or folder, how, events)
+        folder = output or folder
+        if folder is None:
+            raise UsageError(f"{plan}: states a folder of products outside its own folder; give `output`")
+        running.execute_and_report(loaded, folder, how, events)

@@ -63,8 +63,15 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     for line in plan.blind:
         events.talk(f"  left out: {line}")
     failed = None
+
+    def then(results: list[ProductResult]) -> None:
+        if settings.accuracy:
+            _tell_accuracy(results, how.quicklook, events)
+        if settings.sources:
+            _draw_sources(results, events)
+
     try:
-        execute(plan, folder, how.run(events))
+        execute(plan, folder, how.run(events), then)
     except TilesFailed as error:
         failed = error
     seconds = time.perf_counter() - started
@@ -74,10 +81,6 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     if failed is not None:
         raise failed
     events.talk(_summary(results, plan, seconds))
-    if settings.accuracy:
-        _tell_accuracy(results, how.quicklook, events)
-    if settings.sources:
-        _draw_sources(results, events)
     if how.quicklook:
         events.talk(f"quick look: {folder / 'overview.png'}")
 

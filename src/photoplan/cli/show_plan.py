@@ -7,6 +7,7 @@ from pathlib import Path
 from photoplan.cli.options import How
 from photoplan.cli.output import can_draw, show, show_json
 from photoplan.events import Events
+from photoplan.io.naming import together
 from photoplan.products.orthophoto.plan import OrthoPlan
 from photoplan.products.orthophoto.plan_file import PlanFigures, check_plan_path, compile_figures, write_plan
 from photoplan.products.orthophoto.quadtree import PlanSquares, plan_squares
@@ -20,9 +21,10 @@ def show_plan(
     if plan_file is not None:
         check_plan_path(plan_file, plan, how.overwrite)
     figures = compile_figures(plan, events)
-    if plan_file is not None:
-        write_plan(plan_file, plan, figures, folder, how.overwrite, squares)
-        if squares is not None:
+    with together():
+        if plan_file is not None:
+            write_plan(plan_file, plan, figures, folder, how.overwrite, squares)
+        if plan_file is not None and squares is not None:
             _draw(plan, squares, plan_file.with_name(f"{plan_file.stem}_quadtree.png"), how, events)
     if how.as_json:
         more = {} if squares is None else {"quadtree": squares.counts}

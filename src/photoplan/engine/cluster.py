@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pickle
 import secrets
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
@@ -20,6 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from photoplan.codec import NotData, decode, encode
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import Events
 
@@ -128,7 +127,10 @@ class Parcel:
             raise ResourceError(f"{path}: a worker's tile cannot be read ({error.strerror}); run again") from error
         if hashlib.blake2b(content).digest() != self.digest:
             raise ResourceError(f"{path}: a worker's tile came damaged; run the same command again")
-        return pickle.loads(content)
+        try:
+            return decode(content)
+        except NotData as error:
+            raise ResourceError(f"{path}: a worker's tile cannot be read ({error}); run again") from error
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ class RemoteJob:
         made = self.job(task)
         if self.folder is None:
             return made
-        content = pickle.dumps(made, protocol=5)
+        content = encode(made)
         path = Path(self.folder) / secrets.token_hex(8)
         path.write_bytes(content)
         return Parcel(str(path), hashlib.blake2b(content).digest())
@@ -240,11 +242,10 @@ class Cluster(Executor):
         self.versions = [dict(each) for each in {tuple(sorted(a.versions.items())) for a in answers.values()}]
 
     def prepared(self, job: Callable[[Any], Any], folder: Path | None) -> RemoteJob:
-        """A job as workers get it, with an empty folder for results where they see it."""
+        """A job as workers get it; they leave results in the folder if they see it."""
         shared = folder if self.shares_folder else None
         if shared is not None:
-            shutil.rmtree(shared, ignore_errors=True)
-            shared.mkdir()
+            shared.mkdir(exist_ok=True)
         return RemoteJob(job, source_fingerprint(), None if shared is None else os.fspath(shared.resolve()))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:

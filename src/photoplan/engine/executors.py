@@ -179,6 +179,11 @@ class Workers:
         """Versions on a cluster's workers; None: they are those of this process."""
         return None if self._cluster is None else self._cluster.versions
 
+    @property
+    def shares_folder(self) -> bool:
+        """Whether a cluster sees the folder of the products."""
+        return self._cluster is not None and self._cluster.shares_folder
+
     def prepared(self, job: Callable[[Any], Any], folder: Path | None) -> Callable[[Any], Any]:
         """A job as the workers get it; a cluster may leave results in the folder."""
         return job if self._cluster is None else self._cluster.prepared(job, folder)

@@ -9,11 +9,10 @@ of which needs all of the one before (a terrain model, tie points), runs them th
 from __future__ import annotations
 
 import math
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from contextvars import copy_context
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.codec import storable
 from photoplan.engine.cluster import opened
 from photoplan.engine.executors import PULSE, Workers, run_tiles
 from photoplan.engine.shares import Shared
@@ -31,6 +31,8 @@ from photoplan.events import Events
 
 Output = tuple[NDArray[Any], NDArray[np.bool_] | None]
 """Values of a tile, shape (bands, height, width), and their validity, (height, width); None: all are valid."""
+Scratch = Callable[[], AbstractContextManager[Path]]
+"""Gives a new folder that is removed after its use, such as `photoplan.io.naming.scratch` of a folder."""
 T = TypeVar("T")
 
 
@@ -48,12 +50,13 @@ class Task(Protocol):
         ...
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class Made:
     """What became of one tile."""
 
-    layers: tuple[Output | None, ...]
-    """One for each sink; None: not one valid pixel."""
+    layers: tuple[Any, ...]
+    """An `Output` or the result of a step, one for each sink; None: not one valid pixel."""
     record: Mapping[str, Any] = field(default_factory=dict)
     """Figures that the product adds up, kept with the tile: numbers and lists of numbers. Names that begin with
     ``worst`` are maxima, all others sums."""
@@ -136,8 +139,8 @@ class Work(Generic[T]):
     sinks: Sequence[Sink]
     complete: Callable[[Tally], T]
     """Called when all tiles are there or have failed, with the sinks still open; in a thread of its own."""
-    scratch: Path | None = None
-    """A folder beside the outputs that is this product's while its sinks are open, for results on their way."""
+    scratch: Scratch | None = None
+    """Makes a folder beside the outputs for results on their way from a cluster."""
 
 
 @dataclass(frozen=True)
@@ -273,7 +276,10 @@ class Runner(Generic[T]):
                     for sink in work.sinks:
                         sink.append_empty(index)
         waiting = (tile for tile in work.tiles if tile.index not in finished)
-        with Shared(self.workers.prepared(work.job, work.scratch)) as job:
+        with (
+            nullcontext() if work.scratch is None or not self.workers.shares_folder else work.scratch() as folder,
+            Shared(self.workers.prepared(work.job, folder)) as job,
+        ):
             for outcome in run_tiles(waiting, job, self.workers, self._in_flight, lambda: self._pulse(job)):
                 tile = outcome.task
                 if outcome.error is None:
@@ -286,8 +292,6 @@ class Runner(Generic[T]):
                 job.ended(tile)
                 self._events.done(1, tile.pixels, *job.under_way())
                 self._settle_done()
-        if work.scratch is not None:
-            shutil.rmtree(work.scratch, ignore_errors=True)
         return tally
 
     def _pulse(self, job: Shared) -> None:
@@ -332,7 +336,8 @@ def _store(sinks: Sequence[Sink], index: int, made: Made) -> None:
         if layer is None:
             sink.append_empty(index, made.record)
         else:
-            sink.append(index, *layer, made.record)
+            pixels, valid = layer
+            sink.append(index, pixels, valid, made.record)
 
 
 def _complete(work: Work[T], tally: Tally, stack: ExitStack) -> T:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 from photoplan.engine.cluster import Question
 from photoplan.engine.executors import Workers, open_workers
-from photoplan.engine.run import Made, Runner, Tally, Work
+from photoplan.engine.run import Made, Runner, Scratch, Tally, Work
 from photoplan.errors import TilesFailed
 from photoplan.events import SILENT, Events
 
@@ -102,8 +101,8 @@ class Steps:
         Keeps results; None: they end with the process.
     root : str
         What results depend on beside the store's key.
-    scratch : Path, optional
-        Where results of a cluster may lie on their way.
+    scratch : callable, optional
+        Makes a folder where results of a cluster may lie on their way.
     """
 
     def __init__(
@@ -113,7 +112,7 @@ class Steps:
         events: Events = SILENT,
         store: Store | None = None,
         root: str = "",
-        scratch: Path | None = None,
+        scratch: Scratch | None = None,
     ) -> None:
         self._name, self._workers, self._events, self._store, self._root = name, workers, events, store, root
         self._scratch, self._calls = scratch, 0
@@ -185,7 +184,7 @@ def steps(
     *,
     executor: str = "threads",
     question: Question | None = None,
-    scratch: Path | None = None,
+    scratch: Scratch | None = None,
 ) -> Iterator[Steps]:
     """Steps by workers that end with the context: threads of this process, or what `executor_factory` knows.
 

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.codec import storable
 from photoplan.errors import UsageError
 
 Six = tuple[float, float, float, float, float, float]
 
 
+@storable
 @dataclass(frozen=True, order=True, slots=True)
 class Window:
     """A rectangle of pixels: `col`, `row` of its first pixel, `width`, `height` in pixels (zero: empty)."""

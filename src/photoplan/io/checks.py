@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import sqlite3
 import stat
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,6 +68,25 @@ IMAGE_LIMITS = RasterLimits()
 """For images: up to 316,000 pixels a side."""
 TERRAIN_LIMITS = RasterLimits(max_pixels=1e12, max_ratio=1000.0)
 """For terrain grids: a country at 1 m, most of it empty."""
+
+
+def open_database(path: Path, most: int = 256 << 20) -> sqlite3.Connection:
+    """Open a GeoPackage of others for reading: no functions in its schema, no value larger than `most` bytes."""
+    # A file that a GIS has just open may have a log beside it, which must be looked at; else nothing may change, and
+    # SQLite need not lock anything: this works in read-only folders too.
+    waiting = path.with_name(path.name + "-wal")
+    quiet = "" if waiting.exists() and waiting.stat().st_size else "&immutable=1"
+    db = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{quiet}", uri=True, check_same_thread=False)
+    db.execute("PRAGMA trusted_schema = OFF")
+    db.execute("PRAGMA cell_size_check = ON")
+    db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most)
+    return db
+
+
+def plain_tables(db: sqlite3.Connection) -> set[str]:
+    """Return the names of the plain tables: a view under one of our names could compute without end."""
+    query = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
+    return {str(name) for (name,) in db.execute(query)}
 
 
 def check_plain_file(path: str | os.PathLike[str], what: str = "raster") -> Path:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio.raw
 import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
 from photoplan.io.disk import disk_error, library_error
-from photoplan.io.lock import FileLock
-from photoplan.io.naming import give_name, together
+from photoplan.io.geopackage import write_vector
+from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.naming import give_name, scratch, together
 from photoplan.io.product import check_output
 
 #: Ending of the name and the driver that writes it.
@@ -116,13 +114,9 @@ def write_contours(
     files = contour_files(path, labels is not None)
     for file in files:
         check_output(file, inputs, overwrite=overwrite)
-    folder = path.with_name(f".{path.name}.partial")
     try:
-        lock = FileLock(path.with_name(f".{path.name}.lock"))
-        lock.acquire()
-        try:
-            # A run that was killed may have left its folder.
-            shutil.rmtree(folder, ignore_errors=True)
+        with FileLock(lock_of(path)), scratch(path.parent) as made:
+            folder = made / "files"
             folder.mkdir()
             if path.suffix.lower() == ".dxf":
                 _write_dxf(folder / path.name, lines, labels)
@@ -132,9 +126,6 @@ def write_contours(
             with together():
                 for part in sorted(folder.iterdir(), key=lambda p: (p.name == path.name, p.name)):
                     give_name(part, path.with_name(part.name))
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-            lock.release()
     except RuntimeError as error:
         raise library_error(path, error) from error
     except OSError as error:
@@ -204,8 +195,8 @@ def _write_layer(
     crs: str,
     append: bool,
 ) -> None:
-    pyogrio.raw.write(
-        os.fspath(path),
+    write_vector(
+        path,
         geometry=shapely.to_wkb(np.asarray(shapes, object), output_dimension=3),
         field_data=list(columns.values()),
         fields=list(columns),

@@ -5,12 +5,15 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import stat
+import tempfile
 from pathlib import Path
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
 
 #: Bytes that must be free where a library says no more than that it cannot write.
 _TRIAL = 1 << 20
+_RECEIVED: set[Path] = set()
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM}
 
 
@@ -30,16 +33,99 @@ def library_error(path: Path, error: BaseException) -> PhotoplanError:
 
     A trial does: as much as the file is likely to need is written beside it, and removed.
     """
-    trial = path.with_name(f".{path.name}.{os.getpid()}.trial")
     try:
-        with trial.open("wb") as file:
+        with tempfile.TemporaryFile(dir=path.parent, buffering=0) as file:
             write_all(file.fileno(), bytes(_TRIAL))
             os.fsync(file.fileno())
     except OSError as reason:
         return disk_error(path, reason)
-    finally:
-        trial.unlink(missing_ok=True)
     return UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written")
+
+
+def received(folder: Path) -> None:
+    """Take a folder, such as that of a project, as one that may come from elsewhere, see `refuse_outward`."""
+    _RECEIVED.add(folder.absolute())
+
+
+def refuse_outward(folder: Path) -> None:
+    """Refuse to write through a link inside a received folder that leads out of it.
+
+    Raises
+    ------
+    UsageError
+        Naming the link and where it leads.
+    """
+    folder = Path(os.path.abspath(folder))  # noqa: PTH100 - `resolve` would follow the links
+    for place in (folder, *folder.parents):
+        for home in _RECEIVED.intersection(place.parents):
+            if place.is_symlink() and not place.resolve().is_relative_to(home.resolve()):
+                raise UsageError(
+                    f"{place}: is a link that leads out of the folder of the project; to write there, give "
+                    f"{place.resolve()} itself as output"
+                )
+
+
+def open_own(path: Path, flags: int = os.O_RDWR | os.O_CREAT) -> int:
+    """Open a working file of ours, such as a lock, and return its descriptor; links are not followed.
+
+    A folder that came from elsewhere may hold a link under the name: to a file that is not to be changed, or a device
+    or pipe that would never end.
+
+    Raises
+    ------
+    UsageError
+        A link, a folder, a device or a file that has a second name is there.
+    OSError
+        The system cannot.
+    """
+    writes = flags & (os.O_RDWR | os.O_WRONLY)
+    foreign = UsageError(f"{path}: must be a plain file of photoplan, and is a link or something else; remove it")
+
+    def refuse_other() -> None:
+        try:
+            state = os.lstat(path)
+        except FileNotFoundError:
+            return
+        if not stat.S_ISREG(state.st_mode) or (writes and state.st_nlink > 1):
+            raise foreign
+
+    if flags & os.O_CREAT:
+        refuse_outward(path.parent)
+    # Windows has no flag that keeps links from being followed: names are looked at before and after.
+    refuse_other()
+    plain = ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY", "O_NOINHERIT")
+    for name in plain:
+        flags |= getattr(os, name, 0)
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as error:
+        raise foreign if error.errno == errno.ELOOP else error from None
+    try:
+        refuse_other()
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise foreign
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def read_own(path: Path, most: int = 256 << 20) -> bytes:
+    """Return the content of a file that photoplan wrote, such as a run record; links and devices are not read.
+
+    Raises
+    ------
+    OSError
+        There is no such plain file, or it is larger than `most` bytes.
+    """
+    try:
+        descriptor = open_own(path, os.O_RDONLY)
+    except UsageError as error:
+        raise OSError(errno.ELOOP, str(error)) from error
+    with os.fdopen(descriptor, "rb") as file:
+        if os.fstat(descriptor).st_size > most:
+            raise OSError(errno.EFBIG, f"larger than {most} bytes")
+        return file.read(most)
 
 
 def free_megabytes(path: Path) -> int:
@@ -58,6 +144,7 @@ def make_folder(folder: Path) -> None:
     UsageError
         It cannot be made.
     """
+    refuse_outward(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -23,6 +23,8 @@ CACHE_BYTES = 32 << 20
 """GDAL's block cache of the whole process; its default of a twentieth of the memory is not bounded enough."""
 GDAL_ERRORS = (RasterioError, CPLE_BaseError)
 """What may come out of a call of rasterio: its own errors, and GDAL's where it does not translate them."""
+FIXED_DATE = "2000-01-01T00:00:00.000Z"
+"""The date of change in GeoPackages: with the time of writing two runs would not make equal files."""
 _HANDLES_PER_THREAD = 4
 _DAMAGE = re.compile(r"corrupt|premature|truncat|too short|not enough data|invalid|bad huffman|crc|checksum", re.I)
 _open_lock = threading.RLock()
@@ -41,6 +43,7 @@ def gdal_settings(**more: Any) -> rasterio.Env:
         "GTIFF_REPORT_COMPD_CS": True,
         "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".nothing",
         "GDAL_HTTP_TIMEOUT": 1,
+        "OGR_CURRENT_DATE": FIXED_DATE,
     }
     return rasterio.Env(**(settings | more))
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.observed import ImagePoints
 from photoplan.io.disk import disk_error, library_error
-from photoplan.io.naming import give_name
+from photoplan.io.gdal import FIXED_DATE
+from photoplan.io.naming import give_name, scratch
 from photoplan.io.tables import write_table
 
 
@@ -33,6 +34,12 @@ class VectorLayer:
     """Values of each field, (n,)."""
 
 
+def write_vector(path: Path, **layer: Any) -> None:
+    """Write a layer as `pyogrio.raw.write`, without the time of writing."""
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": FIXED_DATE})
+    pyogrio.raw.write(os.fspath(path), **layer)
+
+
 def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str | None) -> None:
     """Write layers as one GeoPackage, which appears complete or not at all and replaces an older one.
 
@@ -45,15 +52,14 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str | None)
     ResourceError
         The disk is full.
     """
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.gpkg")
     try:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial.unlink(missing_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with scratch(path.parent) as folder:
+            partial = folder / path.name
             warnings.filterwarnings("ignore", "'crs' was not provided")
             for layer in layers:
-                pyogrio.raw.write(
-                    os.fspath(partial),
+                write_vector(
+                    partial,
                     geometry=shapely.to_wkb(np.array([*layer.shapes], object)),
                     field_data=list(layer.columns.values()),
                     fields=list(layer.columns),
@@ -64,8 +70,6 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str | None)
                     append=partial.exists(),
                 )
             give_name(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
     except OSError as error:
         raise disk_error(path, error) from error
     except RuntimeError as error:

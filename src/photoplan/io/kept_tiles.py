@@ -16,6 +16,7 @@ import rasterio.windows
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.io.disk import read_own
 from photoplan.io.gdal import GDAL_ERRORS, gdal_settings, open_raster
 from photoplan.io.storage import BlockCoder
 from photoplan.io.tile_log import TileLog, checksum_of
@@ -64,7 +65,7 @@ class KeptTiles:
     def _recorded(self, name: str) -> Iterator[tuple[int, str, int, int, int, dict[str, Any]]]:
         """What `told` said of a file; nothing if there is no such record."""
         try:
-            text = json.loads(self.record.read_text(encoding="utf-8"))["tiles"][name]
+            text = json.loads(read_own(self.record))["tiles"][name]
             found = json.loads(zlib.decompressobj().decompress(base64.b64decode(text), _MOST))
             for index, key, checksum, moved, count, figures in found:
                 yield int(index), str(key), int(checksum), int(moved), int(count), dict(figures)

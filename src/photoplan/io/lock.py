@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
-from photoplan.errors import RunLocked
-from photoplan.io.disk import disk_error
+from photoplan.errors import RunLocked, UsageError
+from photoplan.io.disk import disk_error, open_own
 
 try:
     import fcntl
@@ -30,7 +31,7 @@ class FileLock:
     RunLocked
         On entry, if another run holds it.
     UsageError
-        On entry, if the file cannot be made (folder absent or read-only).
+        On entry, if the file cannot be made (folder absent or read-only), or is a link or not a lock.
     ResourceError
         On entry, if the disk is full.
     """
@@ -50,7 +51,7 @@ class FileLock:
         """Take the lock, or say who holds it."""
         while self._descriptor is None:
             try:
-                descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
+                descriptor = open_own(self._path)
             except OSError as error:
                 raise disk_error(self._path, error, "made") from error
             if not _try_lock(descriptor):
@@ -63,8 +64,12 @@ class FileLock:
             # The holder before may have removed the file between our opening and locking it: then this lock guards
             # a file without a name, and the next run would make a new one.
             if _same_file(descriptor, self._path):
+                if not re.fullmatch(rb"\s*[0-9]*\s*", os.read(descriptor, 64)):
+                    os.close(descriptor)
+                    raise UsageError(f"{self._path}: is not a lock file of photoplan; move it away")
                 self._descriptor = descriptor
                 try:
+                    os.lseek(descriptor, 0, os.SEEK_SET)
                     os.ftruncate(descriptor, 0)
                     os.write(descriptor, f" {os.getpid()}\n".encode())
                 except OSError as error:
@@ -96,6 +101,6 @@ def _try_lock(descriptor: int) -> bool:
 
 def _same_file(descriptor: int, path: Path) -> bool:
     try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
+        return os.path.samestat(os.fstat(descriptor), path.lstat())
     except OSError:
         return False

@@ -11,8 +11,13 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 
+_ABSOLUTE = re.compile(r"(?<![\w./<\\-])(?:/|[A-Za-z]:[/\\])[^\s<>\"'&;:,()\[\]]+[/\\][^\s<>\"'&;:,()\[\]]+")
+
 #: Bytes of a stem at most; file systems allow 255 for a name, and products add a few suffixes.
 MAX_BYTES = 120
+
+#: And of a whole name.
+MAX_NAME = 240
 
 #: Device names that Windows reserves, with or without a suffix.
 _RESERVED = {"con", "prn", "aux", "nul", "clock$"} | {f"{d}{i}" for d in ("com", "lpt") for i in "0123456789¹²³"}
@@ -45,6 +50,30 @@ def safe_stem(name: str) -> str:
         mark = hashlib.sha256(text.encode()).hexdigest()[:8]
         stem = stem.encode()[: MAX_BYTES - 9].decode(errors="ignore") + "_" + mark
     return stem
+
+
+def file_in(folder: Path, name: str) -> Path:
+    """Path of a file that is called `name`, wherever the name comes from; it cannot lead out of the folder.
+
+    Raises
+    ------
+    InputError
+        The name holds more than one part, cannot be a file's on every system, or would be hidden.
+    """
+    name = name if isinstance(name, str) else ""  # what comes from JSON may be anything
+    stem, dot, _ = name.partition(".")
+    if (
+        len(name.encode(errors="replace")) > MAX_NAME
+        or not name
+        or name.strip(". ") != name
+        or not all(c.isalnum() or c in "-_. " for c in name)
+        or f"{stem}{dot}".rstrip(".").casefold() in _RESERVED
+    ):
+        raise InputError(
+            f"{name[:200]!r} cannot be the name of a file; letters, digits, '-', '_' and inner '.' are accepted, up to "
+            f"{MAX_NAME} bytes"
+        )
+    return folder / name
 
 
 def unique_stems(names: Iterable[str]) -> dict[str, str]:
@@ -244,3 +273,27 @@ def relative_path(file: Path, folder: Path) -> str:
         return Path(os.path.relpath(target, folder.absolute().resolve())).as_posix()
     except ValueError:  # another drive
         return target.as_posix()
+
+
+def stated_path(file: Path | str, folder: Path) -> str:
+    """Path of a file as records and reports in a folder state it: from there; its name on another drive."""
+    try:
+        return Path(os.path.relpath(Path(file).absolute(), folder.absolute())).as_posix()
+    except ValueError:
+        return Path(file).name
+
+
+def stated_text(text: str, folder: Path) -> str:
+    """Text for files in a folder, in which absolute paths are written from there: it shows nothing of a disk."""
+    for here in dict.fromkeys((folder.absolute(), folder.resolve())):
+        for up, place in enumerate([here, *here.parents][:-1]):
+            pattern = rf"(?<![\w./\\-]){re.escape(str(place))}(?:[/\\]|(?=[\s\"'<>,;:)]|$))"
+            text = re.sub(pattern, "../" * up, text) if up else re.sub(pattern, _inside, text)
+    for found in sorted(set(_ABSOLUTE.findall(text)), key=len, reverse=True):
+        if os.path.lexists(found):
+            text = text.replace(found, stated_path(found, folder))
+    return text
+
+
+def _inside(found: re.Match[str]) -> str:
+    return "" if found[0][-1] in "/\\" else "."

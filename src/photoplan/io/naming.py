@@ -4,19 +4,111 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from hashlib import sha256
+from itertools import count
 from pathlib import Path
-from typing import Any
 
-from photoplan.errors import PhotoplanError, UsageError
-from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.errors import PhotoplanError, RunLocked, UsageError
+from photoplan.io.disk import disk_error, open_own, read_own, refuse_outward, sync_file, sync_folder, write_all
 from photoplan.io.lock import FileLock, lock_of
 from photoplan.io.tile_log import log_of
 
 _Identity = tuple[int, int, int]
+#: Working folders, see `scratch`, and files of versions before them: the number is the process.
+_FOLDER = re.compile(r"\.photoplan-[0-9]+-\w+\.part")
+_OLD_FILE = re.compile(r"\..+\.([0-9]+)\.(?:part|trial|partial\.gpkg|[0-9a-f]{8}\.tif)")
+_TIDIED: set[Path] = set()
+_NOTE_BYTES = 64 << 20
+_ATTEMPTS = 5
+
+
+@contextmanager
+def scratch(folder: Path) -> Iterator[Path]:
+    """A new folder inside another one, for files that are not complete; it is removed when the context ends.
+
+    Its name cannot be known in advance and nobody else can write there, so that no library follows a link that was laid
+    out for it. A lock inside shows that its process lives: what dead ones have left behind is removed here.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written.
+    """
+    refuse_outward(folder)
+    if folder not in _TIDIED:
+        _TIDIED.add(folder)
+        _remove_dead(folder)
+    for attempt in count():
+        made = Path(tempfile.mkdtemp(prefix=f".photoplan-{os.getpid()}-", suffix=".part", dir=folder))
+        lock = FileLock(made / "lock")
+        try:
+            try:
+                lock.acquire()
+            except (RunLocked, UsageError):
+                # Another run took it for one of the dead before it was locked. Some file systems know no locks at all.
+                if attempt < _ATTEMPTS:
+                    continue
+            yield made
+            return
+        finally:
+            lock.release()
+            shutil.rmtree(made, ignore_errors=True)
+
+
+def _remove_dead(folder: Path) -> None:
+    """Remove working files of processes that are gone: plain files and folders with names of ours, never links."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            old, path = _OLD_FILE.fullmatch(entry.name), Path(entry.path)
+            if old and entry.is_file(follow_symlinks=False) and not _lives(int(old[1])):
+                path.unlink(missing_ok=True)
+            elif _FOLDER.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
+                with suppress(PhotoplanError), FileLock(path / "lock"):
+                    shutil.rmtree(path, ignore_errors=True)
+
+
+def _lives(process: int) -> bool:
+    if os.name != "posix":
+        import psutil  # noqa: PLC0415 - for Windows alone, where signal 0 would end the process
+
+        return bool(psutil.pid_exists(process))
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        pass
+    return True
+
+
+class RunMarker:
+    """A hidden file that says that a run of many products is under way; those that are complete have their names.
+
+    A run that dies leaves it, so that the next one with the same key is known to go on, whatever has been named.
+    """
+
+    def __init__(self, folder: Path, key: str) -> None:
+        self._path = folder / f".photoplan-{sha256(key.encode()).hexdigest()[:16]}.run"
+        self.interrupted = os.path.lexists(self._path)
+        """Whether an earlier run has died."""
+
+    def begin(self) -> None:
+        """Say that the run is under way."""
+        try:
+            os.close(open_own(self._path))
+        except OSError as error:
+            raise disk_error(self._path, error, "made") from error
+
+    def end(self) -> None:
+        """Say that it is complete."""
+        self._path.unlink(missing_ok=True)
 
 
 @dataclass(eq=False)
@@ -25,17 +117,23 @@ class _Group:
 
     waiting: dict[Path, _Identity | None] = field(default_factory=dict)
     """By the name to come: what has this name now."""
+    pending: dict[Path, Path] = field(default_factory=dict)
+    """Where they are till then."""
     unfinished: set[Path] = field(default_factory=set)
     """Those whose names an earlier run gave before it died."""
     then: list[Callable[[], object]] = field(default_factory=list)
     held: ExitStack = field(default_factory=ExitStack)
-    """Locks of products."""
+    """Locks of products, and working folders."""
+    folders: dict[Path, Path] = field(default_factory=dict)
 
     def take(self, part: Path, path: Path) -> None:
         if path not in self.waiting and is_unfinished(path):
             self.unfinished.add(path)
         self.waiting.setdefault(path, _identity(path))
-        part.replace(_pending(path))
+        if path.parent not in self.folders:
+            self.folders[path.parent] = self.held.enter_context(scratch(path.parent))
+        self.pending[path] = self.folders[path.parent] / f".{path.name}"
+        part.replace(self.pending[path])
 
     def give(self) -> None:
         """Give all names; whoever dies in between leaves notes that say which files are of an unfinished product."""
@@ -43,14 +141,15 @@ class _Group:
             if _identity(path) != before:
                 raise UsageError(f"{path}: another program made it meanwhile; choose another output or say `overwrite`")
         # Notes of a run that died are done with, also where this run has no such file.
-        earlier = {Path(other) for path in self.waiting for other in _noted(path)["files"]}
+        earlier = {other for path in self.waiting for other in _noted(path)[0]}
         for path in earlier - self.waiting.keys():
-            _note(path).unlink(missing_ok=True)
+            if path.parent in self.folders:
+                _note(path).unlink(missing_ok=True)
         for path in self.waiting:
-            self._write_note(path, _identity(_pending(path)))
+            self._write_note(path, _identity(self.pending[path]))
         for path in self.waiting:
-            _pending(path).replace(path)
-        for folder in {path.parent for path in self.waiting}:
+            self.pending[path].replace(path)
+        for folder in self.folders:
             sync_folder(folder)
         for action in self.then:
             action()
@@ -58,18 +157,26 @@ class _Group:
 
     def leave(self) -> None:
         """Remove what hidden files are left; notes stay where a name was given and another one was not."""
-        unnamed = [path for path in self.waiting if _pending(path).exists()]
+        unnamed = [path for path in self.waiting if self.pending[path].exists()]
         for path in self.waiting:
-            _pending(path).unlink(missing_ok=True)
+            self.pending[path].unlink(missing_ok=True)
             if path in unnamed and path in self.unfinished:
                 with suppress(OSError):
                     self._write_note(path, self.waiting[path])
             elif path in unnamed or not unnamed:
+                # The first one goes first: without it the others say nothing any more.
                 _note(path).unlink(missing_ok=True)
 
     def _write_note(self, path: Path, identity: _Identity | None) -> None:
-        files = [str(each.absolute()) for each in self.waiting]
-        _note(path).write_text(json.dumps({"files": files, "identity": identity}))
+        """Note all files of the group, the first of them first, as they are called from the folder of this one."""
+        files = [os.path.relpath(each, path.parent) for each in self.waiting]
+        note = _note(path)
+        note.unlink(missing_ok=True)
+        descriptor = open_own(note, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        try:
+            write_all(descriptor, json.dumps({"files": files, "identity": identity}).encode())
+        finally:
+            os.close(descriptor)
 
 
 _GROUP: ContextVar[_Group | None] = ContextVar("files that get their names together", default=None)
@@ -147,13 +254,11 @@ def write_atomically(path: Path, content: bytes) -> None:
     ResourceError, UsageError
         See `disk_error`.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        try:
+        with scratch(path.parent) as folder:
+            partial = folder / path.name
             partial.write_bytes(content)
             give_name(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
     except OSError as error:
         raise disk_error(path, error) from error
 
@@ -170,13 +275,13 @@ def when_named(action: Callable[[], object]) -> None:
 def standing(path: Path) -> Path:
     """Where a finished file is now: it may wait for its name."""
     group = _GROUP.get()
-    return _pending(path) if group is not None and path in group.waiting else path
+    return path if group is None else group.pending.get(path, path)
 
 
 def is_unfinished(path: Path) -> bool:
     """Whether a file is of a product whose run died before all its files had their names."""
-    now = _identity(path)
-    return now is not None and _noted(path)["identity"] == [*now]
+    files, identity = _noted(path)
+    return bool(files) and identity is not None and identity == _identity(path) and _note(files[0]).exists()
 
 
 def forget(path: Path) -> None:
@@ -184,17 +289,14 @@ def forget(path: Path) -> None:
     _note(path).unlink(missing_ok=True)
 
 
-def _noted(path: Path) -> dict[str, Any]:
-    """What a run that died has noted: all files that were to get their names, and which one this is."""
+def _noted(path: Path) -> tuple[list[Path], _Identity | None]:
+    """All files that a run which died was to name together, and the one it named `path`; nothing without a note."""
     try:
-        noted = json.loads(_note(path).read_text())
-    except (OSError, ValueError, RecursionError):
-        noted = None
-    return noted if isinstance(noted, dict) and noted.keys() == {"files", "identity"} else {"files": [], "identity": []}
-
-
-def _pending(path: Path) -> Path:
-    return path.with_name(f".{path.name}.pending")
+        noted = json.loads(read_own(_note(path), _NOTE_BYTES))
+        inode, size, time = noted["identity"]
+        return [path.parent / os.path.normpath(str(file)) for file in noted["files"]], (inode, size, time)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return [], None
 
 
 def _note(path: Path) -> Path:
@@ -204,7 +306,7 @@ def _note(path: Path) -> Path:
 def _identity(path: Path) -> _Identity | None:
     """What a file keeps when it gets another name; None: there is none."""
     try:
-        state = path.stat()
+        state = path.lstat()
     except OSError:
         return None
     return state.st_ino, state.st_size, state.st_mtime_ns
@@ -215,7 +317,9 @@ def tidy(paths: Iterable[Path]) -> None:
 
     Files that another run is writing are left alone, and so is what cannot be removed: the product is finished.
     """
-    for path in filter(is_unfinished, paths):
+    for path in paths:
+        if _noted(path)[1] != _identity(path) or not path.exists():
+            continue
         with suppress(PhotoplanError, OSError), FileLock(lock_of(path)):
             log_of(path).unlink(missing_ok=True)
             forget(path)

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pyogrio.raw
 import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.naming import give_name
+from photoplan.io.checks import open_database, plain_tables
+from photoplan.io.gdal import FIXED_DATE
+from photoplan.io.geopackage import write_vector
+from photoplan.io.naming import give_name, scratch
 from photoplan.io.plain_files import json_object
 from photoplan.io.vector_layer import read_columns
 
@@ -64,9 +66,8 @@ def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> 
     if path.exists() and not overwrite:
         raise UsageError(f"{path} exists; give `overwrite` to replace it")
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.partial.gpkg")
-    partial.unlink(missing_ok=True)
-    try:
+    with scratch(path.parent) as folder:
+        partial = folder / path.name
         for layer, (bounds, table) in {
             "tiles": (plan.tile_bounds, plan.tiles),
             "quadtree": plan.squares or ((), {}),
@@ -84,14 +85,12 @@ def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> 
             )
             db.execute(f"INSERT INTO {_HEADER} (format, content) VALUES (?, ?)", (FORMAT, json.dumps(plan.header)))
             db.execute(
-                "INSERT INTO gpkg_contents (table_name, data_type, identifier, description) "
-                "VALUES (?, 'attributes', ?, 'what photoplan needs to execute this plan')",
-                (_HEADER, _HEADER),
+                "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_change) "
+                "VALUES (?, 'attributes', ?, 'what photoplan needs to execute this plan', ?)",
+                (_HEADER, _HEADER, FIXED_DATE),
             )
         db.close()
         give_name(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _write_layer(
@@ -103,8 +102,8 @@ def _write_layer(
     kind: str,
     append: bool = False,
 ) -> None:
-    pyogrio.raw.write(
-        str(path),
+    write_vector(
+        path,
         geometry=shapely.to_wkb(geometry),
         field_data=list(columns.values()),
         fields=list(columns),
@@ -127,7 +126,10 @@ def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]
     if not path.is_file():
         raise InputError(f"{path}: no such plan")
     try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
+        with closing(open_database(path)) as db:
+            # A view under one of these names could compute without end.
+            if not {_HEADER, "tiles"} <= plain_tables(db):
+                raise sqlite3.DatabaseError(f"it has no tables {_HEADER} and tiles")
             row = db.execute(f"SELECT format, content FROM {_HEADER}").fetchone()
     except (sqlite3.Error, OverflowError, UnicodeError) as error:
         raise InputError(f"{path}: not a plan of photoplan ({error}); make one with `photoplan ortho`") from error

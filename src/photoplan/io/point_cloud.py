@@ -18,7 +18,7 @@ from photoplan.geometry.crs import parse_crs
 from photoplan.geometry.frames import Frame
 from photoplan.io.disk import disk_error
 from photoplan.io.gdal import open_raster
-from photoplan.io.naming import give_name, standing
+from photoplan.io.naming import give_name, scratch, standing
 
 CLOUD_SUFFIXES = (".las", ".laz", ".ply")
 #: What a point has: metres, standard deviation of z in metres, grey value.
@@ -69,11 +69,10 @@ def write_cloud(path: Path, heights: Path, sigmas: Path, grey: Path, crs: str, f
     UsageError, ResourceError
         The place cannot be written, or the disk is full.
     """
-    part = path.with_name(f".{path.name}.part")
     write = _write_ply if path.suffix.lower() == ".ply" else _write_las
     try:
         with ExitStack() as opened:
-            opened.callback(part.unlink, missing_ok=True)
+            part = opened.enter_context(scratch(path.parent)) / path.name
             files = [opened.enter_context(open_raster(standing(file), "GTiff")) for file in (heights, sigmas, grey)]
             count = write(part, path, files, crs, frame)
             give_name(part, path)

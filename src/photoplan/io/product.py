@@ -171,7 +171,6 @@ class ProductFile:
             log_path=self.log_path,
             what="tiles",
             check=lambda: check_output(self.path, self.inputs, overwrite=self.overwrite),
-            hidden=(self._part("plain").stem, self._part("part").stem),
             faults=GDAL_ERRORS,
         )
 
@@ -257,13 +256,10 @@ class ProductFile:
         missing = sorted(set(range(len(self._windows))) - log.finished)
         if missing:
             raise PhotoplanError(f"{self.path}: {len(missing)} tiles are missing, the first is {missing[0]}")
-        self._file.give(lambda: self._checked(log, self._assemble(log, tags or {})))
+        self._file.give(lambda folder: self._checked(log, self._assemble(log, tags or {}, folder)))
         facts = self._facts(log)
         when_named(log.remove)
         return facts
-
-    def _part(self, kind: str) -> Path:
-        return self.path.with_name(f".{self.path.name}.{kind}.tif")
 
     def _profile(self) -> dict[str, Any]:
         """What GDAL is told about the product."""
@@ -290,9 +286,9 @@ class ProductFile:
             "photometric": photometric,
         } | ({"alpha": "NO"} if self.bands != 3 else {})
 
-    def _assemble(self, log: TileLog, tags: dict[str, str]) -> Path:
-        """Make the product under a temporary name."""
-        profile, plain, part = self._profile(), self._part("plain"), self._part("part")
+    def _assemble(self, log: TileLog, tags: dict[str, str], folder: Path) -> Path:
+        """Make the product in a working folder."""
+        profile, plain, part = self._profile(), folder / "plain.tif", folder / "part.tif"
         places = [(i, *log.place(i)) for i in sorted(log.finished)]
         stored = [place for place in places if place[2] > 0]
         pixels = self._coder.pixel_bytes

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import io
-import pickle
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from dataclasses import is_dataclass
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -15,13 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.codec import NotData, decode, encode
 from photoplan.errors import InputError, PhotoplanError
 from photoplan.io.disk import disk_error
 from photoplan.io.lock import lock_of
 from photoplan.io.naming import locked
 from photoplan.io.tile_log import TileLog
 
-_ARRAYS = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
+#: Part of every key: logs of versions that kept results in another way are started afresh.
+_FORM = "codec 1"
 #: Indices from here on are those of arrays.
 _FIRST_ARRAY = 1 << 63
 _BYTES = 4
@@ -30,8 +29,7 @@ _BYTES = 4
 class ResultLog:
     """A crash-safe log of results by their names, as `photoplan.engine.run.Steps` asks for; a context manager.
 
-    Results are numbers, text, arrays, tuples, lists and dictionaries of them, and data classes of this package: data
-    only. What has other content, or calls anything, is not read.
+    Results are data, see `photoplan.codec`: reading a log that came with a project runs no code.
 
     Parameters
     ----------
@@ -69,7 +67,7 @@ class ResultLog:
     def __enter__(self) -> ResultLog:
         with ExitStack() as stack:
             stack.enter_context(self._lock)
-            self._log = TileLog(self._path, self._key)
+            self._log = TileLog(self._path, f"{_FORM} {self._key}")
             self._arrays = count(max(self._log.finished | {_FIRST_ARRAY - 1}) + 1)
             stack.pop_all()
         return self
@@ -96,11 +94,16 @@ class ResultLog:
 
     def append(self, index: int, result: Any) -> None:
         """Keep a result."""
-        self._open.append(index, pickle.dumps(result, protocol=5))
+        self._open.append(index, encode(result))
 
     def __getitem__(self, index: int) -> Any:
         """A result, read from the disk: a value of its own each time."""
-        return _Data(io.BytesIO(self._open.read(index))).load()
+        try:
+            return decode(self._open.read(index))
+        except NotData as error:
+            raise InputError(
+                f"{self._path}: a kept result is not what this version writes ({error}); delete the file, run again"
+            ) from error
 
     def keep(self, values: NDArray[np.float32]) -> int:
         """Keep an array of float32; where it is, also in a later run. Called by workers."""
@@ -128,14 +131,3 @@ class ResultLog:
     def remove(self) -> None:
         """Forget all results: their product is complete."""
         self._open.remove()
-
-
-class _Data(pickle.Unpickler):
-    """Reads values, and nothing that does anything."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        found = super().find_class(module, name) if module.split(".")[0] in ("numpy", "photoplan") else None
-        good = name in _ARRAYS if module.startswith("numpy") else isinstance(found, type) and is_dataclass(found)
-        if not good:
-            raise InputError(f"a kept result holds {module}.{name}, which is no data; delete the log, and run again")
-        return found

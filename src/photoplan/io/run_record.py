@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from functools import cache
 from hashlib import sha256
@@ -23,10 +23,12 @@ import rasterio
 
 from photoplan import __version__
 from photoplan.errors import UsageError
+from photoplan.io.disk import read_own
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.gdal import gdal_settings, not_georeferenced
+from photoplan.io.names import stated_path, stated_text
 from photoplan.io.naming import together, write_atomically
-from photoplan.plain import json_text
+from photoplan.plain import HasJsonFields, json_text, pick
 
 try:
     import resource
@@ -47,13 +49,15 @@ _DECODERS = {"dda6fb8a7330": "libjpeg 9 of the IJG", "0626c3e14946": "libjpeg-tu
 T = TypeVar("T")
 #: Fields of requests that decide no value.
 _IDLE = {"memory", "workers", "executor", "overwrite", "dry_run"}
+#: Texts from here on are no messages, but the tiles that a record keeps.
+_LONG = 100_000
 _PACKAGES = ("photoplan", "numpy", "numba", "scipy", "rasterio", "pyproj", "pyogrio", "shapely")
 
 
 def recorded_result(product: Path, key: str, result: Callable[[dict[str, Any], Any], T | None]) -> T | None:
     """What `result` makes of the entries product and settings of a product's record; None if it has no such key."""
     try:
-        record = json.loads(record_path(product).read_text(encoding="utf-8"))
+        record = json.loads(read_own(record_path(product)))
         return result(record["product"], record["settings"]) if record["key"] == key else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError, UsageError):
         return None
@@ -78,7 +82,7 @@ def refuse_foreign_record(path: Path) -> None:
 
 def _read_record(path: Path) -> dict[str, Any] | None:
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = json.loads(read_own(path))
     except (OSError, ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) and {"file", "key", "inputs", "versions"} <= record.keys() else None
@@ -86,7 +90,7 @@ def _read_record(path: Path) -> dict[str, Any] | None:
 
 def input_entry(path: Path | str, digest: str | None = None) -> dict[str, Any]:
     """How a record names an input; its digest is sampled if it is not known."""
-    return {"path": path, "sampled_sha256": digest or fingerprint(path).digest, "size": Path(path).stat().st_size}
+    return {"path": Path(path), "sampled_sha256": digest or fingerprint(path).digest, "size": Path(path).stat().st_size}
 
 
 def run_key(kind: str, settings: object, inputs: Iterable[Path | Mapping[str, Any]]) -> str:
@@ -189,8 +193,29 @@ def write_run_record(
         path = record_path(product)
         if _of_another(path, product):
             path = product.with_name(f"{product.name}.run.json")
-    write_atomically(path, (json_text(record | {"peak_memory_bytes": peak_memory_bytes()}, "record") + "\n").encode())
+    record["peak_memory_bytes"] = peak_memory_bytes()
+    write_atomically(path, stated_json(record, path.parent))
     return path
+
+
+def stated_json(values: Any, folder: Path) -> bytes:
+    """JSON for a file in a folder: paths in it are written from there, with slashes on every system."""
+    text = json_text(_stated(values, folder), "record")
+    return (text + "\n").encode()
+
+
+def _stated(value: Any, folder: Path) -> Any:
+    if isinstance(value, Path):
+        return stated_path(value, folder)
+    if isinstance(value, str):
+        return stated_text(value, folder) if len(value) < _LONG else value
+    if isinstance(value, HasJsonFields):
+        value = value.json_fields()
+    if is_dataclass(value) and not isinstance(value, type):
+        value = pick(value, *(each.name for each in fields(value)))
+    if isinstance(value, Mapping):
+        return {key: _stated(item, folder) for key, item in value.items()}
+    return [_stated(item, folder) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _entry(each: Path | Mapping[str, Any]) -> Mapping[str, Any]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from photoplan.errors import InputError
@@ -15,6 +16,7 @@ DELIMITERS = (";", "\t", ",", " ")
 #: Texts that stand for "not known".
 NOTHING = ("", "nan", "null", "none", "na", "n/a")
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?", re.ASCII)
+_FORMULA = re.compile(r"'*\s*[=+\-@\t\r\n]")
 _INFINITE = ("inf", "infinity")
 _BLOCK = 8 << 20
 """Bytes that are read at once."""
@@ -57,6 +59,31 @@ def number(text: str, where: str, decimal_comma: bool = False, empty: bool = Fal
     raise InputError(f"{where} = {text[:40]!r} is not a number{hint}")
 
 
+def plain_field(text: str) -> str:
+    """Return a field without the apostrophe by which `csv_line` keeps spreadsheets from computing it."""
+    return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
+
+
+def csv_line(fields: Iterable[object], delimiter: str = ",") -> str:
+    """Return one line of a table: numbers as they are, NaN and infinity empty, text quoted where it must be.
+
+    Names come from files of others, and spreadsheets compute fields that begin with ``=``, ``+``, ``-`` or ``@``: text
+    that is not a number gets an apostrophe before it, which our readers take off again.
+    """
+    return delimiter.join(_field(each, delimiter) for each in fields) + "\n"
+
+
+def _field(value: object, delimiter: str) -> str:
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return ""
+    text = str(value)
+    if _FORMULA.match(text) and decimal(text) is None and not has_decimal_comma(text):
+        text = f"'{text}"
+    elif text == text.strip() and not any(c in text for c in (delimiter, '"', "\n", "\r")):
+        return text
+    return '"' + text.replace('"', '""') + '"'
+
+
 def split_line(path: Path, item: Line, delimiter: str) -> tuple[str, ...]:
     """Fields of a line, stripped; quotes hold a delimiter together.
 
@@ -75,18 +102,18 @@ def split_line(path: Path, item: Line, delimiter: str) -> tuple[str, ...]:
     line, text = item
     if '"' not in text and "'" not in text:
         fields = text.split() if delimiter == " " else text.split(delimiter)
-        return tuple(field.strip() for field in fields)
+        return tuple(plain_field(field.strip()) for field in fields)
     spaced = text.expandtabs(1).strip() if delimiter == " " else text
     for quote in ('"', "'"):
         if quote not in text:
             continue
         try:
             found = next(csv.reader([spaced], delimiter=delimiter, quotechar=quote, skipinitialspace=True, strict=True))
-            return tuple(field.strip() for field in found)
+            return tuple(plain_field(field.strip()) for field in found)
         except (csv.Error, StopIteration) as error:
             if quote == '"':
                 raise InputError(f"{path}:{line}: cannot be split into columns ({error})") from None
-    return tuple(f.strip() for f in (text.split() if delimiter == " " else text.split(delimiter)))
+    return tuple(plain_field(f.strip()) for f in (text.split() if delimiter == " " else text.split(delimiter)))
 
 
 def line_blocks(path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -8,8 +8,6 @@ of any system are read. Every error names file and line.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,11 +17,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.codec import storable
 from photoplan.errors import InputError, UsageError
 from photoplan.io.appearance import looks_like
 from photoplan.io.disk import disk_error
 from photoplan.io.naming import write_atomically
-from photoplan.io.table_lines import DELIMITERS, NOTHING, Line, decimal, line_blocks, number, split_line
+from photoplan.io.table_lines import DELIMITERS, NOTHING, Line, csv_line, decimal, line_blocks, number, split_line
 
 MAX_BYTES = 1_000_000_000
 #: Lines that decide the delimiter.
@@ -54,6 +53,7 @@ class Columns:
     """What to say of a first line that is no header, and of why it is none; None: nothing of its own."""
 
 
+@storable
 @dataclass(frozen=True)
 class Dialect:
     """What a table does not say of itself; checked at birth."""
@@ -351,19 +351,15 @@ def _check_roles(roles: Sequence[str], given: int, columns: Columns, text: str) 
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a comma-separated table with a header; it appears complete or not at all, in a folder that is made.
 
-    Numbers that are not known (NaN, infinite) are empty fields.
+    Fields are written as `photoplan.io.table_lines.csv_line` does.
 
     Raises
     ------
     ResourceError, UsageError
         The disk is full, or the folder cannot be written to.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(["" if isinstance(v, float) and not math.isfinite(v) else v for v in row] for row in rows)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise disk_error(path, error) from error
-    write_atomically(path, text.getvalue().encode())
+    write_atomically(path, "".join(map(csv_line, [header, *rows])).encode())

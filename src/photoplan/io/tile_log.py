@@ -19,10 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from photoplan.errors import PhotoplanError
-from photoplan.io.disk import disk_error, write_all
+from photoplan.errors import PhotoplanError, UsageError
+from photoplan.io.disk import disk_error, open_own, write_all
 
-_MAGIC = b"PPTILES3"
+_OURS = b"PPTILES"
+_MAGIC = _OURS + b"3"
 _START = struct.Struct("<8s32sI")
 _RECORD = struct.Struct("<4sQQQIQI")
 _CHECK = struct.Struct("<I")
@@ -84,14 +85,16 @@ class TileLog:
         start = _MAGIC, hashlib.sha256(key.encode()).digest()
         self._start = _START.pack(*start, zlib.crc32(start[0] + start[1]))
         try:
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
+            self._descriptor = open_own(path)
         except OSError as error:
             raise disk_error(path, error, "made") from error
         try:
             self._end = self._scan()
-        except OSError as error:
+        except BaseException as error:
             os.close(self._descriptor)
-            raise disk_error(path, error) from error
+            if isinstance(error, OSError):
+                raise disk_error(path, error) from error
+            raise
 
     def __enter__(self) -> TileLog:
         return self
@@ -215,7 +218,11 @@ class TileLog:
         size = os.fstat(self._descriptor).st_size
         with os.fdopen(os.dup(self._descriptor), "rb") as file:
             file.seek(0)
-            if file.read(_START.size) != self._start:
+            head = file.read(_START.size)
+            if head != self._start:
+                # Of an earlier version, of another key, or cut off: it is ours. Everything else is somebody's file.
+                if head[: len(_OURS)] != _OURS[: len(head)]:
+                    raise UsageError(f"{self.path}: is not a log of finished tiles; move it away")
                 os.ftruncate(self._descriptor, 0)
                 os.lseek(self._descriptor, 0, os.SEEK_SET)
                 write_all(self._descriptor, self._start)

@@ -10,7 +10,7 @@ from photoplan.errors import PhotoplanError, ResourceError, UsageError
 from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.gdal import first_cause
 from photoplan.io.lock import FileLock, lock_of
-from photoplan.io.naming import give_name
+from photoplan.io.naming import give_name, scratch
 from photoplan.io.tile_log import TileLog
 
 
@@ -24,8 +24,6 @@ class Unfinished:
     """What the log holds, for messages: tiles."""
     check: Callable[[], None]
     """Refuses a file that must not be replaced."""
-    hidden: tuple[str, ...]
-    """How names of files begin that runs may leave: libraries make more beside their output."""
     faults: tuple[type[BaseException], ...]
     """What a library raises that cannot write."""
     _log: TileLog | None = field(default=None, init=False, repr=False)
@@ -41,7 +39,6 @@ class Unfinished:
         try:
             # The run before may have finished between the check and the lock.
             self.check()
-            self._clear()
             self._log = TileLog(self.log_path, key)
             begin(self._log)
         except BaseException:
@@ -62,8 +59,8 @@ class Unfinished:
             raise UsageError(f"{self.path}: is not open; use it in a `with` block")
         return self._log
 
-    def give(self, make: Callable[[], Path]) -> None:
-        """Give the name to what is made and compared under a temporary one.
+    def give(self, make: Callable[[Path], Path]) -> None:
+        """Give the name to what `make` writes into a working folder and compares.
 
         Raises
         ------
@@ -71,13 +68,11 @@ class Unfinished:
             It could not be written, or does not hold what was.
         """
         try:
-            try:
-                part = make()
+            with scratch(self.path.parent) as folder:
+                part = make(folder)
                 # The last look before the name is taken: another program may have made the file meanwhile.
                 self.check()
                 give_name(part, self.path)
-            finally:
-                self._clear()
         except OSError as error:
             raise disk_error(self.path, error) from error
         except UsageError:
@@ -88,8 +83,3 @@ class Unfinished:
                 f"{self.path}: could not be written ({cause}; {free_megabytes(self.path)} MB are free there); free "
                 f"some space and run the same command again: finished {self.what} are kept"
             ) from error
-
-    def _clear(self) -> None:
-        for path in self.path.parent.iterdir() if self.path.parent.is_dir() else ():
-            if path.name.startswith(self.hidden):
-                path.unlink(missing_ok=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.io.disk import disk_error, library_error
 from photoplan.io.gdal import GDAL_ERRORS, gdal_settings
-from photoplan.io.naming import give_name
+from photoplan.io.naming import give_name, scratch
 
 _TYPES = ("uint8", "uint16", "int16", "float32")
 
@@ -42,7 +40,6 @@ def write_whole_image(path: Path, values: NDArray[Any], tags: Mapping[str, str] 
     bands = values[None] if values.ndim == 2 else values
     if bands.ndim != 3 or bands.dtype.name not in _TYPES:
         raise UsageError(f"{path}: pixels of type {bands.dtype}, shape {values.shape}; allowed are {', '.join(_TYPES)}")
-    part = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tif")
     profile: dict[str, Any] = {
         "driver": "GTiff",
         "width": bands.shape[2],
@@ -56,14 +53,13 @@ def write_whole_image(path: Path, values: NDArray[Any], tags: Mapping[str, str] 
     if min(bands.shape[1:]) >= 256:
         profile |= {"tiled": True, "blockxsize": 256, "blockysize": 256}
     try:
-        try:
+        with scratch(path.parent) as folder:
+            part = folder / "part.tif"
             with gdal_settings(GDAL_PAM_ENABLED=False), rasterio.open(part, "w", **profile) as dataset:
                 dataset.write(bands)
                 dataset.update_tags(**dict(tags or {}))
             _check(part, bands, path)
             give_name(part, path)
-        finally:
-            part.unlink(missing_ok=True)
     except OSError as error:
         raise disk_error(path, error) from error
     except GDAL_ERRORS as error:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.codec import storable
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.matching.grey import GreyImage, to_bytes
@@ -41,6 +42,7 @@ class FeatureSettings:
     """Side of the parts that are worked on at once, pixels of the full image."""
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class Features:
     """Features of one image."""

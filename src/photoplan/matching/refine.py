@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from photoplan.codec import storable
 from photoplan.events import Map
 from photoplan.kernels.patch_match import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
 from photoplan.matching.grey import Grey, patches_at
@@ -42,6 +43,7 @@ class RefineSettings:
     iterations: int = 30
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class Matched:
     """Results of matching n patches between two images."""

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.codec import storable
 from photoplan.geometry.grid import Placement, Window
 from photoplan.kernels.correlation import correlate
 from photoplan.kernels.patch_match import sample_spline, spline_coefficients
@@ -103,6 +104,7 @@ class PatchSettings:
         return RefineSettings(self.radius, _NEAR + 0.5, self.correlation, self.sigma)
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class PatchDisplacements:
     """Patches and where they were found."""

@@ -12,6 +12,7 @@ from photoplan.adjustment.linear import solve
 from photoplan.adjustment.robust import cauchy
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
+from photoplan.codec import storable
 from photoplan.geometry.rotation import skew
 from photoplan.matching.features import opencv
 
@@ -45,6 +46,7 @@ class VerifySettings:
     """Part of all matches of the pair that must fit."""
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class PairMatches:
     """Verified matches of two images."""

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.codec import storable
+
 #: Side of a cell, pixels of the map.
 SIDE = 16
 #: Quantiles and single pixels that are kept of each image in a cell.
@@ -19,6 +21,7 @@ BLOCK = 8
 _SHOWN, _COMMON = 0.5, 0.25
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class Cells:
     """Rows of images in cells; rows of one cell hold the same pixels of the map."""

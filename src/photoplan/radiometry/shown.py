@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.codec import storable
+
 _Floats = NDArray[np.float32]
 _Mask = NDArray[np.bool_]
 #: Pixels over which brightness is what images differ in, and not detail.
@@ -53,6 +55,7 @@ class Shown:
         return Shown(self.row // 2, self.col // 2, sums / np.maximum(count, 1.0), count >= 2.0)
 
 
+@storable
 @dataclass(frozen=True)
 class SeamLayer:
     """An image on pixels of one size, in a store: features, and (1 − distance from the border)² or NaN."""
@@ -74,6 +77,7 @@ class SeamLayer:
         return (i, j, m, n), values[:, j - col : j - col + n]
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class SeamFeatures:
     """An image on pixels of one size, see `SeamLayer`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from pathlib import Path
 
 from photoplan.errors import UsageError
 from photoplan.io.disk import disk_error
+from photoplan.io.names import stated_text
 from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
@@ -149,12 +151,16 @@ class ReportFile:
         UsageError, ResourceError
             The folder cannot be written, or the disk is full.
         """
-        data = content if isinstance(content, bytes) else content.encode("utf-8", errors="replace")
+        if isinstance(content, str):
+            # Pictures inside are left as they are.
+            parts = re.split(r"(data:image/[^\"]*)", content)
+            parts[::2] = [stated_text(part, self.path.parent) for part in parts[::2]]
+            content = "".join(parts).encode("utf-8", errors="replace")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise disk_error(self.path, error) from None
-        write_atomically(self.path, data)
+        write_atomically(self.path, content)
         return self.path
 
 

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.codec import storable
 from photoplan.errors import InputError
 
 PointKind = Literal["mass", "spot"]
@@ -17,6 +18,7 @@ POINT_KINDS: tuple[PointKind, ...] = get_args(PointKind)
 LINE_KINDS: tuple[LineKind, ...] = get_args(LineKind)
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class PointGroup:
     """Points of one class that were measured in one way."""
@@ -48,6 +50,7 @@ class PointGroup:
         return f"{self.name}{own} (record {self.records[index]})"
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class MeasuredLine:
     """One line: its vertices in order."""
@@ -79,6 +82,7 @@ class MeasuredLine:
         _check_sigma(self.sigma, self.name)
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class Tin:
     """Triangles that a file brings along; kept for comparison, never used as measurements."""
@@ -89,6 +93,7 @@ class Tin:
     """Vertex numbers of each triangle, shape (m, 3)."""
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class MeasuredTerrain:
     """All that was measured of one terrain, in one projected CRS and one height system."""

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.codec import storable
 from photoplan.errors import InputError
 from photoplan.surfaces.measured import LineKind
 from photoplan.surfaces.representation import Representation, representation
@@ -44,6 +45,7 @@ class UnitLayout:
         return self.left + column * self.side, self.top - row * self.side
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class MeshFaces:
     """Triangles of those meshes that a bilinear patch cannot describe: where lines pass, or finer posts adjoin.
@@ -64,6 +66,7 @@ class MeshFaces:
     triangles is bilinear."""
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class Unit:
     """One computing unit (Ecker 1991, §2.1.1): posts on a grid of its own width, edges included."""

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from photoplan.adjustment.linear import solve
 from photoplan.adjustment.robust import spread
+from photoplan.codec import storable
 from photoplan.kernels.fit_covariance import block_score, minimise
 from photoplan.kernels.sides import sides_of
 from photoplan.terrain.observations import Observations
@@ -118,6 +119,7 @@ _MOST_NOISE = 10.0
 _OUTLIER = 6.0
 
 
+@storable
 @dataclass(frozen=True)
 class Covariance:
     """A covariance function: variance · correlation(distance / length), and the noise of mass points."""

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.codec import storable
 from photoplan.errors import InputError, UsageError
 from photoplan.kernels import flow as kernels
 
@@ -17,6 +18,7 @@ FlowMethod = Literal["d8", "dinf"]
 CELL_BYTES = 80
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class Flow:
     """What flows where; all arrays have the shape of the grid."""

@@ -12,7 +12,7 @@ from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation.table import ANGLE_NAMES, OrientationTable, OrientedImage, TableFormat
 from photoplan.io.plain_files import crs_beside
-from photoplan.io.table_lines import NUMBER
+from photoplan.io.table_lines import NUMBER, csv_line
 from photoplan.io.tables import Columns, Dialect, Table, read_table
 
 #: Header names (in small letters) of every role.
@@ -96,22 +96,17 @@ def _image(table: Table, k: int, values: list[float], form: TableFormat) -> Orie
     )
 
 
-def _delimiter_safe(name: str) -> str:
-    """A field of comma-separated text, quoted where it must be."""
-    return '"' + name.replace('"', '""') + '"' if any(c in name for c in ',"') or name != name.strip() else name
-
-
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """Comma-separated table with ω, φ, κ in degrees, camera to ground, and its ``.prj`` where a CRS is known."""
     require_map(block, path)
     table = block.table
     named = any(image.camera for image in table.images)
-    lines = ["name,x,y,z,omega,phi,kappa" + (",camera" if named else "")]
+    lines = ["name,x,y,z,omega,phi,kappa" + (",camera\n" if named else "\n")]
     for image, angles in zip(table.images, block.angles("opk", "deg")):
         numbers = [repr(float(v)) for v in (*image.center, *angles)]
-        camera = [_delimiter_safe(image.camera or "")] if named else []
-        lines.append(",".join([_delimiter_safe(image.name), *numbers, *camera]))
-    texts = {path: "\n".join(lines) + "\n"}
+        camera = [image.camera or ""] if named else []
+        lines.append(csv_line([image.name, *numbers, *camera]))
+    texts = {path: "".join(lines)}
     if table.crs is not None:
         texts[path.with_suffix(".prj")] = table.crs + "\n"
     return texts

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,8 @@ class ProjectChanges:
 
 def edit_project(path: Path, changes: ProjectChanges) -> Project:
     """Set entries of a project file; the file before is kept beside it as ``NAME.previous.toml``.
+
+    What is kept there already stays: the next one is ``NAME.previous-2.toml`` and so on.
 
     The changed file is checked before it replaces the old one, and appears complete or not at all.
 
@@ -70,7 +74,12 @@ def edit_project(path: Path, changes: ProjectChanges) -> Project:
     changed = document.as_string()
     project = parse_project(document.unwrap(), path.resolve().parent, str(path), changed)
     if changed != text:
-        write_atomically(path.with_suffix(".previous.toml"), before)
+        kept = path.with_suffix(".previous.toml")
+        for number in count(2):
+            if not os.path.lexists(kept) or (kept.is_file() and kept.read_bytes() == before):
+                break
+            kept = path.with_suffix(f".previous-{number}.toml")
+        write_atomically(kept, before)
         write_atomically(path, changed.replace("\n", line_end).encode())
     return project
 

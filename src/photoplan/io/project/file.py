@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from photoplan.errors import InputError
 from photoplan.geometry.crs import require_projected_metres
 from photoplan.geometry.heights import check_height_system, require_metric_heights
+from photoplan.io.disk import received
 from photoplan.io.names import resolve_input
 from photoplan.io.naming import write_atomically
 from photoplan.io.plain_files import read_toml
@@ -62,6 +63,7 @@ def parse_project(data: dict[str, Any], folder: Path, source: str, text: str = "
     InputError
         An entry is wrong.
     """
+    received(folder)
     if "folder" in data:
         raise InputError(f"{source}: unknown entry 'folder'")
     try:

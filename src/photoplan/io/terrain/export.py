@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -21,9 +19,10 @@ from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import parse_crs
 from photoplan.geometry.heights import height_label
 from photoplan.io.disk import disk_error
-from photoplan.io.lock import FileLock
-from photoplan.io.naming import give_name
+from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.naming import give_name, scratch
 from photoplan.io.product import check_output
+from photoplan.io.table_lines import csv_line
 from photoplan.io.terrain.export_mesh import MeshPart, mesh_parts
 from photoplan.surfaces.units import LineElement, Unit, UnitSource
 
@@ -55,17 +54,13 @@ def replacing(path: Path, inputs: Sequence[Path | str] = (), overwrite: bool = F
         The disk is full.
     """
     check_output(path, inputs, overwrite=overwrite)
-    part = path.with_name(f".{path.name}.part")
-    with FileLock(path.with_name(f".{path.name}.lock")):
+    with FileLock(lock_of(path)):
         check_output(path, inputs, overwrite=overwrite)
         try:
-            try:
-                yield part
+            with scratch(path.parent) as folder:
+                yield folder / path.name
                 check_output(path, inputs, overwrite=overwrite)
-                give_name(part, path)
-            finally:
-                for left in (part, part.with_name(part.name + ".faces")):
-                    left.unlink(missing_ok=True)
+                give_name(folder / path.name, path)
         except PhotoplanError:
             raise
         except OSError as error:
@@ -248,15 +243,9 @@ def write_points(
                 if kind == ".xyz":
                     file.write(_text("%.4f %.4f %.4f\n", rows[:, :3]))
                 else:
-                    ending = _csv_row([line.kind, line.name, line.code, side if line.right is not None else ""])
+                    ending = csv_line([line.kind, line.name, line.code, side if line.right is not None else ""])
                     file.write(_text("%.4f,%.4f,%.4f,%.4f," + ending.replace("%", "%%"), rows))
     return ExportFigures(posts, line_points=points)
-
-
-def _csv_row(fields: list[str]) -> str:
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerow(fields)
-    return buffer.getvalue()
 
 
 def _posts(source: UnitSource) -> Iterator[NDArray[np.float64]]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import pickle
 import struct
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.codec import NotData, decode, encode, storable
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
 from photoplan.geometry.units import agreed_metres, metres_in, metric_heights
@@ -115,35 +115,41 @@ def _decoded_apart(path: Path, options: ReadOptions, head: _Header) -> MeasuredT
     with subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=nowhere) as child:
         assert child.stdin is not None and child.stdout is not None
         try:
-            pickle.dump((path, options, head), child.stdin)
+            child.stdin.write(encode((path, options, head)))
             child.stdin.close()
-            found = pickle.load(child.stdout)
-        except (EOFError, pickle.UnpicklingError, BrokenPipeError):
+            kind, found = decode(child.stdout.read())
+        except (NotData, BrokenPipeError):
             raise _unreadable(path, head, "its decoder ended abnormally") from None
         except BaseException:
             child.kill()
             raise
-    if isinstance(found, BaseException):
-        raise found
-    assert isinstance(found, MeasuredTerrain)
+    if kind == "refused":
+        raise InputError(found)
+    if kind == "memory":
+        raise MemoryError(found)
+    if not isinstance(found, MeasuredTerrain):
+        raise _unreadable(path, head, "its decoder failed")
     return found
 
 
 def decode_from_stdin() -> None:
     """What the process of `_decoded_apart` does: a request from stdin, the points or the refusal to stdout."""
-    path, options, head = pickle.load(sys.stdin.buffer)
+    path, options, head = decode(sys.stdin.buffer.read())
     if resource is not None:
         limit = ROOM + head.count * (head.record + 2 * KEPT)
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    found: MeasuredTerrain | Exception
+    answer: tuple[str, Any]
     try:
-        found = _decoded(path, options, head)
-    except Exception as error:
-        found = error
-    pickle.dump(found, sys.stdout.buffer, pickle.HIGHEST_PROTOCOL)
+        answer = "points", _decoded(path, options, head)
+    except InputError as error:
+        answer = "refused", str(error)
+    except MemoryError as error:
+        answer = "memory", str(error)
+    sys.stdout.buffer.write(encode(answer))
 
 
+@storable
 @dataclass(frozen=True)
 class _Header:
     """What the header promises."""

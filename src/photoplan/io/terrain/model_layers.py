@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import pyogrio.raw
 import rasterio
 import shapely
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from rasterio.windows import Window as GdalWindow
 
 from photoplan.geometry.grid import Window
 from photoplan.io.gdal import gdal_settings
+from photoplan.io.geopackage import write_vector
 from photoplan.io.terrain.model_tables import GrossError
 from photoplan.kernels.sample_grid import sample_lattice
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
@@ -108,8 +108,8 @@ def write_border(path: Path, domain: Any, crs: str) -> None:
 
 
 def _write(path: Path, layer: str, shapes: NDArray[Any], columns: dict[str, NDArray[Any]], crs: str, kind: str) -> None:
-    pyogrio.raw.write(
-        str(path),
+    write_vector(
+        path,
         geometry=shapely.to_wkb(shapes, output_dimension=3 if kind.endswith("Z") else 2),
         field_data=list(columns.values()),
         fields=list(columns),

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.io.checks import open_database, plain_tables
 from photoplan.io.terrain.model_blob import MOST_BYTES, check_unit, inflate, unit_of, unpack_line
 from photoplan.io.terrain.model_tables import FORMAT, HEADER, LINES, UNITS, GrossError, ModelHeader, header_from_json
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
@@ -77,8 +78,8 @@ def is_terrain_model(path: Path) -> bool:
         with path.open("rb") as file:
             if file.read(16) != b"SQLite format 3\0":
                 return False
-        with closing(_connect(path)) as db:
-            return HEADER in _tables(db)
+        with closing(_open(path)) as db:
+            return HEADER in plain_tables(db)
     except (OSError, *_DAMAGED):
         return False
 
@@ -259,7 +260,7 @@ class ModelReader:
 
     def _tables(self) -> set[str]:
         try:
-            return _tables(self._own.get())
+            return plain_tables(self._own.get())
         except _DAMAGED as error:
             raise self._no_model(str(error)) from error
 
@@ -297,7 +298,7 @@ class _Connections(threading.local):
 
     def get(self) -> sqlite3.Connection:
         if self.db is None or self.process != os.getpid():
-            db = _connect(self.path)
+            db = _open(self.path)
             if self.identity and header_from_json(_header_text(db), self.path).identity != self.identity[0]:
                 raise InputError(f"{self.path}: has changed since it was opened; start again")
             self.db, self.process = db, os.getpid()
@@ -312,27 +313,14 @@ def _reopen(path: Path, cache_bytes: int, identity: str) -> ModelReader:
     return reader
 
 
-def _connect(path: Path) -> sqlite3.Connection:
-    # A file that a GIS has just open may have a log beside it, which must be looked at; else nothing may change, and
-    # SQLite need not lock anything: this works in read-only folders too.
-    waiting = path.with_name(path.name + "-wal")
-    quiet = "" if waiting.exists() and waiting.stat().st_size else "&immutable=1"
-    db = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{quiet}", uri=True, check_same_thread=False)
+def _open(path: Path) -> sqlite3.Connection:
+    db = open_database(path, MOST_BYTES)
     db.text_factory = lambda raw: raw.decode(errors="replace")
-    # What a stranger's file may do to us is bounded: no functions in its schema, no value larger than a unit.
-    db.execute("PRAGMA trusted_schema = OFF")
-    db.execute("PRAGMA cell_size_check = ON")
-    db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BYTES)
     return db
 
 
-def _tables(db: sqlite3.Connection) -> set[str]:
-    """Names of the plain tables: a view under one of our names could compute without end."""
-    return {str(name) for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-
-
 def _header_text(db: sqlite3.Connection) -> str:
-    if HEADER not in _tables(db):
+    if HEADER not in plain_tables(db):
         raise sqlite3.DatabaseError(f"it has no table {HEADER}")
     row: Sequence[Any] | None = db.execute(f"SELECT format, content FROM {HEADER}").fetchone()
     if row is None or row[0] != FORMAT or not isinstance(row[1], str):

@@ -19,7 +19,7 @@ import shapely
 
 from photoplan import __version__
 from photoplan.errors import PhotoplanError, UsageError
-from photoplan.io.gdal import GDAL_ERRORS
+from photoplan.io.gdal import FIXED_DATE, GDAL_ERRORS
 from photoplan.io.naming import standing, when_named
 from photoplan.io.product import check_output
 from photoplan.io.terrain.model_blob import check_unit, inflate, pack_line, pack_unit, unit_of
@@ -106,7 +106,6 @@ class ModelWriter:
             log_path=self.path.with_name(f".{self.path.name}.units"),
             what="units",
             check=lambda: check_output(self.path, self.inputs, overwrite=self.overwrite),
-            hidden=(self._part.name,),
             faults=_GPKG_ERRORS,
         )
 
@@ -176,13 +175,13 @@ class ModelWriter:
             raise PhotoplanError(f"{self.path}: {missing} units were not delivered; empty ones are added as None")
         if parts.header.layout != self.layout:
             raise UsageError(f"{self.path}: the header's layout is {parts.header.layout}, the units' {self.layout}")
-        self._file.give(lambda: self._assemble(parts))
+        self._file.give(lambda folder: self._assemble(parts, folder / "part.gpkg"))
         when_named(log.remove)
         return ModelReader(standing(self.path))
 
-    def _assemble(self, parts: ModelParts) -> Path:
+    def _assemble(self, parts: ModelParts, part: Path) -> Path:
         """Make the file under a temporary name, and compare it with the log."""
-        part, crs = self._part, parts.header.crs
+        crs = parts.header.crs
         write_units(part, self.layout, self.figures(), crs)
         write_lines(part, parts.lines, crs)
         write_gross(part, "gross_errors", parts.gross, crs)
@@ -250,10 +249,6 @@ class ModelWriter:
         if not good:
             raise PhotoplanError("it does not hold what was written")
 
-    @property
-    def _part(self) -> Path:
-        return self.path.with_name(f".{self.path.name}.part.gpkg")
-
 
 @dataclass(frozen=True)
 class _Stored:
@@ -292,8 +287,9 @@ def _make_tables(db: sqlite3.Connection) -> None:
     # A GeoPackage names its tables, so that programs which look for them know that these are meant to be there.
     for table, what in ((HEADER, "header"), (UNITS, "computing units"), (LINES, "line elements")):
         db.execute(
-            "INSERT INTO gpkg_contents (table_name, data_type, identifier, description) VALUES (?, 'attributes', ?, ?)",
-            (table, table, f"{what} of the terrain model, for photoplan"),
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_change) "
+            "VALUES (?, 'attributes', ?, ?, ?)",
+            (table, table, f"{what} of the terrain model, for photoplan", FIXED_DATE),
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from photoplan.codec import storable
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.units import metres_in
 from photoplan.io.plain_files import read_toml
@@ -34,6 +35,7 @@ MAX_BYTES = 10_000_000
 OTHER = "*"
 
 
+@storable
 @dataclass(frozen=True)
 class CodeClass:
     """What a code means."""
@@ -50,6 +52,7 @@ class CodeClass:
             raise InputError(f"sigma {self.sigma}; a standard deviation in metres, zero or more, is needed")
 
 
+@storable
 @dataclass(frozen=True)
 class CodeTable:
     """Classes of codes, layer names and survey codes."""
@@ -68,6 +71,7 @@ class CodeTable:
         return found
 
 
+@storable
 @dataclass(frozen=True)
 class ReadOptions:
     """How files of measured terrain are to be read; checked at birth."""

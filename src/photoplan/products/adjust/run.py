@@ -24,11 +24,11 @@ from photoplan.io.project.file import load_project
 from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
-from photoplan.io.run_record import recording
+from photoplan.io.run_record import recording, stated_json
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import Adjusted, AdjustSettings
 from photoplan.orientation.bundle.causes import weighed_causes
-from photoplan.plain import json_text, pick
+from photoplan.plain import pick
 from photoplan.products.adjust.block import (
     MapResult,
     Prepared,
@@ -305,7 +305,7 @@ def _write(
             adjusted.redundancies,
             adjusted.rejected,
         )
-        write_atomically(folder / "report.json", json_text(data, indent=1).encode())
+        write_atomically(folder / "report.json", stated_json(data, folder))
         files = []
         for name, kind, found in result.corrections:
             file = kind.output(project.stems[name])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from photoplan.engine.steps import steps
 from photoplan.errors import GeometryError
 from photoplan.events import Events
 from photoplan.geometry.grid import MapGrid
+from photoplan.io.naming import scratch
 from photoplan.io.project.model import Project
 from photoplan.plan.footprint import covered_tiles
 from photoplan.plan.tiles import Tile, Tiles
@@ -104,7 +106,7 @@ def sample(found: Survey, reference: Reference | None, workers: int, executor: s
     events.begin("comparing", len(seen), "tiles")
     files = [file for one in found.looked for file in one.scene.files]
     asked = question(files if reference is None else [*files, reference.path], at)
-    with steps("balance", workers, events, executor=executor, question=asked, scratch=at / ".balance.parcels") as run:
+    with steps("balance", workers, events, executor=executor, question=asked, scratch=partial(scratch, at)) as run:
         return Cells.joined(run(job, seen, pixels=lambda each: each.tile.pixels))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
+from photoplan.io.table_lines import csv_line
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
@@ -165,9 +165,8 @@ def _line_column(request: ProfileRequest, table: PointTable) -> int | None:
 
 def _write_table(part: Path, profiles: Sequence[Profile]) -> None:
     with part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["line", "distance", "x", "y", "height", "sigma"])
+        file.write(csv_line(["line", "distance", "x", "y", "height", "sigma"]))
         for p in profiles:
             for d, (x, y), z, s in zip(p.distance, p.xy, p.heights, p.sigmas):
                 height, sigma = (f"{v:.4f}" if np.isfinite(v) else "" for v in (z, s))
-                writer.writerow([p.name, f"{d:.4f}", f"{x:.4f}", f"{y:.4f}", height, sigma])
+                file.write(csv_line([p.name, f"{d:.4f}", f"{x:.4f}", f"{y:.4f}", height, sigma]))

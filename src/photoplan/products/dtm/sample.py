@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
 from photoplan.io.product import check_output
+from photoplan.io.table_lines import csv_line
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
 from photoplan.plain import pick
@@ -88,13 +88,12 @@ def dtm_sample(request: SampleRequest) -> SampleReport:
         replacing(request.output, inputs, request.overwrite) as part,
         part.open("w", encoding="utf-8", newline="") as file,
     ):
-        writer = csv.writer(file, delimiter=delimiter, lineterminator="\n")
         if request.form.header:
-            writer.writerow([*table.names, *request.names])
+            file.write(csv_line([*table.names, *request.names], delimiter))
         for points in table.parts(PART):
             heights, sigmas = _values(terrain, points.xy)
             texts = [_texts(values, request, delimiter) for values in (heights, sigmas)]
-            writer.writerows([*row, h, s] for row, h, s in zip(points.rows, *texts))
+            file.writelines(csv_line([*row, h, s], delimiter) for row, h, s in zip(points.rows, *texts))
             there = np.isfinite(heights)
             count, outside = count + len(heights), outside + int((~there).sum())
             if there.any():

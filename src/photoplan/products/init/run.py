@@ -21,6 +21,7 @@ from photoplan.io.camera.file import CameraFile, read_cameras
 from photoplan.io.camera.model import CameraEntry, Triple
 from photoplan.io.camera.opensfm import resized
 from photoplan.io.camera.rpc.file import read_rpc, rpc_beside, rpc_in
+from photoplan.io.disk import received
 from photoplan.io.names import check_input_name, relative_path, shortest_paths
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
@@ -191,8 +192,9 @@ def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     HeightSystemError
         Height systems are not declared, or the grid that joins them is missing.
     """
-    if request.path.exists() and not request.overwrite:
+    if (request.path.exists() or request.path.is_symlink()) and not request.overwrite:
         raise UsageError(f"{request.path} exists; give `overwrite` to replace it, or another folder")
+    received(request.folder)
     result = make_project(request, talk)
     try:
         request.folder.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ from photoplan.events import Events
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm, bands_of
 from photoplan.io.kept_tiles import KeptTiles
-from photoplan.io.naming import standing, together, when_named
+from photoplan.io.naming import RunMarker, scratch, standing, together, when_named
 from photoplan.io.product import ProductFacts, ProductFile, is_product
 from photoplan.io.project.model import Project
 from photoplan.io.quicklook import refuse_foreign_overview, write_overview
@@ -51,7 +51,12 @@ from photoplan.project.scenes import Scenes, ScenesAddress
 _BANDS = ImageForm(descriptions=tuple(name for name, _ in BANDS), units=tuple(unit for _, unit in BANDS))
 
 
-def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list[ProductResult]:
+def execute(
+    plan: OrthoPlan,
+    output: Path | str,
+    run: Run | None = None,
+    then: Callable[[list[ProductResult]], None] = lambda results: None,
+) -> list[ProductResult]:
     """Make all products of a plan.
 
     Parameters
@@ -61,6 +66,8 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
         Folder for `NAME_ortho.tif`, its run record, and the overview picture; made if it does not exist.
     run : Run, optional
         Workers, memory, overwriting, progress.
+    then : callable, optional
+        Makes more files of the products; the run is not complete before.
 
     Returns
     -------
@@ -96,10 +103,13 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     refuse_inputs(input_files(plan.project), index[:1])
     for path in index:
         refuse_foreign_virtual(path)
-    kept = finished_products(plan, folder, run.overwrite, picture)
+    marker = RunMarker(folder, " ".join(product.key for product in plan.products))
+    done = [] if marker.interrupted else [each for each in (picture, *index) if each is not None]
+    kept = finished_products(plan, folder, run.overwrite, None if marker.interrupted else done)
     if picture is not None and not run.overwrite:
         refuse_foreign_overview(picture)
     make_folder(folder)
+    marker.begin()
     if kept:
         run.events.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
     if plan.settings.choice is not None:
@@ -118,6 +128,8 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
             "finished, but these products lack tiles and were not written; the same command tries the tiles again:\n  "
             + "\n  ".join(failed)
         )
+    then(results)
+    marker.end()
     return results
 
 
@@ -190,7 +202,7 @@ def _work(
         count=product.plan.tiles.total,
         sinks=tuple(files.values()),
         complete=partial(_complete, plan, product, address, files, run.clock(workers)),
-        scratch=paths["picture"].with_name(f".{paths['picture'].name}.parcels"),
+        scratch=partial(scratch, folder),
     )
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from photoplan.engine.execute import OutputName
 from photoplan.errors import UsageError
+from photoplan.io.names import file_in
 from photoplan.io.naming import is_unfinished, tidy
 from photoplan.io.run_record import record_path, recorded_result, refuse_foreign_record
 from photoplan.plain import pick
@@ -71,7 +73,7 @@ class ProductResult:
 
 def outputs(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> dict[OutputName, Path]:
     """Rasters of a product: itself, where ground is hidden, which image painted a pixel, how exactly it lies."""
-    path = folder / f"{product.plan.name}.tif"
+    path = file_in(folder, f"{product.plan.name}.tif")
     asked: dict[OutputName, bool] = {
         "hidden": settings.hidden == "mark",
         "sources": settings.sources,
@@ -102,11 +104,13 @@ def all_files(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> l
     return [*paths.values(), *([seams_path(paths["picture"])] if "sources" in paths else [])]
 
 
-def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool, picture: Path | None) -> dict[str, ProductResult]:
+def finished_products(
+    plan: OrthoPlan, folder: Path, overwrite: bool, more: Sequence[Path] | None
+) -> dict[str, ProductResult]:
     """Products that exist: those of this very run, interrupted, are kept; any other is refused before any work.
 
-    When all products of a plan and their overview `picture` exist, the run was not interrupted: doing it again needs
-    `overwrite`. Sheets of a mosaic that would come out the same are kept also then.
+    When all products of a plan exist, and `more` that is made of them, the run was not interrupted: doing it again
+    needs `overwrite`; None: it was interrupted. Sheets of a mosaic that would come out the same are kept also then.
     """
     if overwrite and (plan.settings.choice is None or plan.settings.choice.sheets is None):
         return {}
@@ -124,7 +128,8 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool, picture: P
             refuse_foreign_record(record_path(files[0]))
     if overwrite:
         return kept
-    if existing or (len(kept) == len(plan.products) and (picture is None or picture.exists())):
+    complete = more is not None and len(kept) == len(plan.products) and all(path.exists() for path in more)
+    if existing or complete:
         first, *more = existing or [result.path for result in kept.values()]
         they = (
             f"and {len(more)} more exist; give `overwrite` to replace them"

@@ -18,6 +18,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MOST_TILES, MapGrid
 from photoplan.io.disk import disk_error, library_error
+from photoplan.io.names import file_in, unique_stems
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
@@ -217,14 +218,15 @@ def _outline(product: OrthoProduct, footprint: Footprint) -> NDArray[np.float64]
     return np.array([(xmin, ymin), (xmax, ymin), (xmax, ymax), (xmin, ymax)])
 
 
-def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
+def read_plan(path: Path | str) -> tuple[OrthoPlan, Path | None]:
     """Read a plan back, and make sure that it still means what it meant.
 
     Returns
     -------
     plan : OrthoPlan
-    output : Path
-        Folder that was chosen for the products.
+    output : Path or None
+        Folder that was chosen for the products; None if it is outside the folders of the plan and of its project: a
+        plan that comes from elsewhere does not decide where files are written.
 
     Raises
     ------
@@ -241,6 +243,7 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         for name, index, rows in zip(*(tiles[column].tolist() for column in ("product", "tile", "sources"))):
             listed.setdefault(name, {})[index] = tuple(map(int, rows.split()))
         products = [_product(entry, listed, settings, project) for entry in header["products"]]
+        unique_stems(file_in(folder, entry["name"]).name for entry in header["products"])
         changed = [
             p.images[0] if len(p.images) == 1 else p.plan.name
             for p, entry in zip(products, header["products"])
@@ -258,7 +261,21 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         ) from error
     if not plan.products:
         raise InputError(f"{path}: the plan has no tiles left; make it again with the command that wrote it")
-    return plan, (path.resolve().parent / header["output"]).resolve()
+    return plan, _planned_folder(path, folder, header["output"])
+
+
+def _planned_folder(path: Path, project: Path, text: Any) -> Path | None:
+    """Return the folder of the products as a plan states it; None if it leads out of the folders of plan and project.
+
+    The folder of the project counts if it holds a project file and the plan.
+    """
+    home = path.resolve().parent
+    homes = [home, *([project] if home.is_relative_to(project) and any(project.glob("*.toml")) else [])]
+    try:
+        output = (home / str(text)).resolve()
+    except (OSError, RuntimeError, ValueError):
+        return None
+    return output if any(output.is_relative_to(each) for each in homes) else None
 
 
 def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:

@@ -6,7 +6,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +18,11 @@ import shapely
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_step, nearest_turn
 from photoplan.geometry.grid import MapGrid
+from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.names import safe_stem
 from photoplan.io.naming import write_atomically
 from photoplan.io.polygons import read_features
+from photoplan.io.project.model import Project
 from photoplan.io.regions import Regions
 from photoplan.io.virtual import write_virtual
 from photoplan.products.orthophoto.finished import ProductResult
@@ -28,6 +32,7 @@ from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
 _MOST = 10_000
 #: Points along a side of a sheet's outline in degrees: lines of a map are bent there.
 _POINTS = 8
+_UNKNOWN = "0001-01-01T00:00:00Z"
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,15 +121,15 @@ def write_index(plan: OrthoPlan, path: Path, results: Sequence[ProductResult]) -
     """A STAC item beside each sheet that is there, and a VRT of them all."""
     products = {product.plan.name: product for product in plan.products}
     for result in results:
-        item = _item(products[result.path.stem], result)
+        item = _item(products[result.path.stem], result, plan.project)
         write_atomically(result.path.with_suffix(".stac.json"), item.encode())
     if results:
         write_virtual(path, [result.path for result in results])
 
 
-def _item(product: OrthoProduct, result: ProductResult) -> str:
-    """STAC item 1.0 with the projection extension; dated by when the sheet was made: a project does not know when its
-    images were taken."""
+def _item(product: OrthoProduct, result: ProductResult, project: Project) -> str:
+    """STAC item 1.0 with the projection extension, dated by the times that the images state: the time of making would
+    make two equal sheets differ."""
     grid = product.grid
     assert grid.crs is not None, "sheets are cut from maps"
     left, bottom, right, top = grid.bounds
@@ -132,11 +137,17 @@ def _item(product: OrthoProduct, result: ProductResult) -> str:
     outline = shapely.box(left, bottom, right, top) if not isinstance(clip, Regions) else clip.shapes[0][0]
     outline = shapely.segmentize(outline, max(right - left, top - bottom) / _POINTS)
     geometry, box = _in_degrees(outline, grid.crs, grid.bounds)
-    record = json.loads(result.path.with_suffix(".run.json").read_text(encoding="utf-8"))
+    known = []
+    for name in product.images:
+        with suppress(InputError):
+            time = read_image_metadata(project.resolve(project.any_image(name).file)).time
+            known += [] if time is None else [datetime.fromtimestamp(time, UTC).isoformat().replace("+00:00", "Z")]
     code = int(grid.crs.split(":")[1]) if grid.crs.upper().startswith("EPSG:") and grid.crs[5:].isdigit() else None
     properties = {
-        "datetime": record["run"]["finished"],
-        "created": record["run"]["finished"],
+        # STAC requires an interval where there is no one time; a year 1 says that no image states any.
+        "datetime": None,
+        "start_datetime": min(known, default=_UNKNOWN),
+        "end_datetime": max(known, default=_UNKNOWN),
         "gsd": grid.resolution,
         "proj:epsg": code,
         **({} if code else {"proj:wkt2": grid.crs}),

@@ -213,13 +213,16 @@ def _in_flight(request: RestoreRequest, jobs: list[Job]) -> int:
     return tiles_in_flight(wanted, request.memory if jobs else None, BASE_MEMORY, each)
 
 
-def restore_images(request: RestoreRequest, events: Events = SILENT) -> RestoreReport:
+def restore_images(request: RestoreRequest, events: Events = SILENT, more: bool = False) -> RestoreReport:
     """Restore all images; one that cannot be used does not stop the others.
 
     Parameters
     ----------
     events : Events
         Told of tiles that are done, and of each image as soon as it is written.
+    more : bool
+        Whether the caller makes more of the images, such as a report: those that are all there are then no reason to
+        refuse.
 
     Raises
     ------
@@ -234,7 +237,7 @@ def restore_images(request: RestoreRequest, events: Events = SILENT) -> RestoreR
     for job in plan.jobs:
         if kept.get(job.target):
             tidy([job.target, job.picture, job.chromatic_file, record_path(job.target)])
-    if plan.jobs and all(kept.get(job.target) for job in plan.jobs):
+    if plan.jobs and not more and all(kept.get(job.target) for job in plan.jobs):
         first = plan.jobs[0].target
         raise UsageError(f"{first}: exists already; choose another output or say `overwrite`")
     make_folder(request.folder)

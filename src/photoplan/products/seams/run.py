@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from photoplan.errors import GeometryError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import make_folder
-from photoplan.io.naming import together, when_named
+from photoplan.io.naming import scratch, together, when_named
 from photoplan.io.polygons import check_vectors, label_polygons
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
@@ -152,9 +153,9 @@ def _read(
 
     events.begin("reading", len(found.looked), "images")
     asked = question((file for one in found.looked for file in one.scene.files), request.path.parent)
-    scratch = request.path.with_name(f".{request.path.name}.parcels")
+    parcels = partial(scratch, request.path.parent)
     with steps(
-        request.path.name, request.workers, events, log, executor=request.executor, question=asked, scratch=scratch
+        request.path.name, request.workers, events, log, executor=request.executor, question=asked, scratch=parcels
     ) as run:
         return list(run(_Map(found.grid, found.tiles.side), images, kept=kept))
 

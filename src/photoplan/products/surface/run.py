@@ -15,7 +15,7 @@ from photoplan.engine.run import Tally, Work
 from photoplan.errors import UsageError
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm
-from photoplan.io.naming import together
+from photoplan.io.naming import scratch, together
 from photoplan.io.point_cloud import write_cloud
 from photoplan.io.product import ProductFile, check_output
 from photoplan.io.run_record import input_entry, write_run_record
@@ -156,7 +156,7 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
             count=len(tiles),
             sinks=tuple(files.values()),
             complete=partial(_complete, plan, files, run.clock(runner.workers)),
-            scratch=paths["heights"].with_name(f".{paths['heights'].name}.parcels"),
+            scratch=partial(scratch, folder),
         )
         result: SurfaceResult
         (result,) = runner.run([work])

@@ -20,7 +20,7 @@ from photoplan.geometry.grid import Placement
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm
 from photoplan.io.matrix_file import BANDS, MatrixFile
-from photoplan.io.naming import together, write_atomically
+from photoplan.io.naming import scratch, together, write_atomically
 from photoplan.io.product import DESCRIPTION, ProductFile, check_output
 from photoplan.io.run_record import input_entry, run_key, write_run_record
 from photoplan.io.storage import PICTURES
@@ -322,7 +322,7 @@ def view_work(plan: ViewPlan, run: Run, workers: Workers) -> Work[ViewResult]:
         count=len(tiles),
         sinks=(file,),
         complete=partial(_complete, plan, job.overlay, file, run.clock(workers)),
-        scratch=path.with_name(f".{path.name}.parcels"),
+        scratch=partial(scratch, path.parent),
     )
 
 

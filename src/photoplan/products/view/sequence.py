@@ -12,7 +12,7 @@ from typing import Any
 from photoplan.engine.executors import Workers
 from photoplan.engine.run import Kept, Work
 from photoplan.errors import PhotoplanError, UsageError
-from photoplan.io.naming import together
+from photoplan.io.naming import give_name, scratch, together
 from photoplan.io.product import check_output
 from photoplan.io.run_record import recorded_result, run_key
 from photoplan.products.run import Run
@@ -165,15 +165,13 @@ def write_film(path: Path, folder: Path, rate: float, count: int) -> None:
     PhotoplanError
         ffmpeg could not; its last words are told.
     """
-    part = path.with_name(f".{path.stem}.part.mp4")
     pictures = str(folder / "frame_%05d.png")
     words = ["ffmpeg", "-y", "-loglevel", "error", "-framerate", f"{rate:g}", "-i", pictures, "-pix_fmt", "yuv420p"]
-    words += ["-frames:v", str(count), "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", str(part)]
-    try:
-        said = subprocess.run(words, capture_output=True, text=True, check=False)
+    words += ["-frames:v", str(count), "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"]
+    with scratch(path.parent) as made:
+        part = made / "film.mp4"
+        said = subprocess.run([*words, str(part)], capture_output=True, text=True, check=False)
         if said.returncode != 0 or not part.is_file():
             last = " ".join(said.stderr.split())[-300:]
             raise PhotoplanError(f"{path}: ffmpeg could not join the pictures in {folder}, which are complete ({last})")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+        give_name(part, path)

@@ -1,0 +1,103 @@
+"""Nothing is lost: what exists stays, runs that died are completed by the same command, doubt is said also with -q."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from tools.command import inside
+from tools.forked import QUIET, Mishap, content, forked
+from tools.small_block import write_block
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs fork and signals")
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): content(p) for p in folder.rglob("*") if p.is_file()}
+
+
+class TestDemo:
+    def test_a_project_that_was_worked_on_stays(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("photoplan.cli.running.execute_and_report", lambda *a: None)
+        assert inside("demo", tmp_path / "demo", "-q").code == 0
+        project = tmp_path / "demo" / "project.toml"
+        assert inside("demo", tmp_path / "demo", "-q").code == 0, "an interrupted one goes on"
+        changed = project.read_text().replace("[[images]]", '[[images]]\nbalance = "a.toml"', 1)
+        project.write_text(changed)
+        said = inside("demo", tmp_path / "demo", "-q")
+        assert said.code == 2 and "project.toml: exists already and differs" in said.err and "--overwrite" in said.err
+        assert project.read_text() == changed
+        table = tmp_path / "demo" / "data" / "ext.csv"
+        project.unlink()
+        table.write_text("mine")
+        said = inside("demo", tmp_path / "demo", "-q")
+        assert said.code == 2 and table.read_text() == "mine" and not project.exists()
+        assert inside("demo", tmp_path / "demo", "-q", "--overwrite").code == 0
+        assert "balance" not in project.read_text() and table.read_text() != "mine"
+
+    def test_a_link_in_its_folder_is_not_followed(self, tmp_path: Path) -> None:
+        (tmp_path / "outside").mkdir()
+        (tmp_path / "demo").mkdir()
+        (tmp_path / "demo" / "data").symlink_to(tmp_path / "outside")
+        said = inside("demo", tmp_path / "demo", "-q")
+        assert said.code == 2 and "is a link that leads out" in said.err and not list((tmp_path / "outside").iterdir())
+
+
+def test_edits_of_a_project_keep_every_state_before(tmp_path: Path) -> None:
+    from photoplan.io.project.edit import ProjectChanges, edit_project
+
+    project = write_block(tmp_path).project
+    states = [project.read_text()]
+    (tmp_path / "project.previous.toml").write_text("of the user")
+    for number in range(3):
+        edit_project(project, ProjectChanges(tables={"orientation": {"refraction": number % 2 == 0}}))
+        states.append(project.read_text())
+    kept = {p.read_text() for p in tmp_path.glob("project.previous*.toml")}
+    assert kept >= {*states[:3], "of the user"}
+
+
+#: Commands of many products, and the words that make more files of them.
+RUNS = {
+    "ortho": ["ortho", "--resolution", 2, "--tile", 128, "--accuracy"],
+    "mosaic": ["mosaic", "--resolution", 2, "--tile", 128, "--sources", "--sheets", 100],
+}
+
+
+@pytest.mark.parametrize("name", [pytest.param("ortho", marks=pytest.mark.slow), "mosaic"])
+def test_fault_03_killed_at_every_name_the_same_command_completes(name: str, tmp_path: Path) -> None:
+    """Also after the last product and before its pictures: whatever has its name does not stand in the way."""
+    verb, *words = RUNS[name]
+
+    def run(folder: Path, mishap: Mishap = QUIET) -> object:
+        return forked([verb, folder / "project.toml", *words, "--workers", 1], tmp_path / "said", mishap)
+
+    write_block(tmp_path / "in")
+    shutil.copytree(tmp_path / "in", tmp_path / "quiet")
+    assert run(tmp_path / "quiet").code == 0  # type: ignore[attr-defined]
+    wanted = files(tmp_path / "quiet")
+    names = len(wanted) - len(files(tmp_path / "in"))
+    some = range(1, names + 1) if name == "ortho" else sorted({1, 2, names // 2, names - 2, names - 1})
+    for count in some:
+        folder = tmp_path / f"at{count}"
+        shutil.copytree(tmp_path / "in", folder)
+        assert run(folder, Mishap(names=count)).code == -9  # type: ignore[attr-defined]
+        again = run(folder)
+        assert again.code == 0, (count, again.err)  # type: ignore[attr-defined]
+        made = files(folder)
+        assert made.keys() == wanted.keys(), count
+        different = [each for each in wanted if made[each] != wanted[each] and not each.endswith(".run.json")]
+        assert not different, (count, different)
+        shutil.rmtree(folder)
+
+
+def test_records_say_nothing_of_the_disk(tmp_path: Path) -> None:
+    project = write_block(tmp_path / "block").project
+    said = inside("ortho", project, "--images", "one", "--resolution", 4, "-o", tmp_path / "out" / "deep")
+    assert said.code == 0, said.err
+    text = (tmp_path / "out" / "deep" / "one_ortho.run.json").read_text()
+    assert str(tmp_path) not in text and str(Path.cwd()) not in text
+    folder = tmp_path / "out" / "deep"
+    assert all((folder / each["path"]).is_file() for each in json.loads(text)["inputs"])
