@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import shutil
@@ -11,6 +12,10 @@ import pytest
 from tools.command import inside
 from tools.forked import QUIET, Mishap, content, forked
 from tools.small_block import write_block
+
+import photoplan
+from photoplan.cli.output import talking
+from photoplan.cli.telling import Telling
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs fork and signals")
 
@@ -101,3 +106,25 @@ def test_records_say_nothing_of_the_disk(tmp_path: Path) -> None:
     assert str(tmp_path) not in text and str(Path.cwd()) not in text
     folder = tmp_path / "out" / "deep"
     assert all((folder / each["path"]).is_file() for each in json.loads(text)["inputs"])
+
+
+def test_quiet_hides_progress_and_no_doubt(capsys: pytest.CaptureFixture[str]) -> None:
+    with Telling(quiet=True, terminal=False) as events:
+        events.begin("tiles", 10)
+        events.done()
+        events.talk("plan: 3 images")
+        events.talk("  note: two: sees no terrain and is left out")
+        events.talk("warning: 5 values were clipped")
+    talking(True)("found 3 images")
+    talking(True)("  warning: the positions differ by 5 m")
+    said = capsys.readouterr().err.splitlines()
+    assert [line.strip().partition(":")[0] for line in said] == ["note", "warning", "warning"]
+
+
+def test_no_command_hides_what_was_noticed_behind_quiet() -> None:
+    """Lists of notes, warnings and doubts are printed outside of conditions on `quiet`."""
+    for path in (Path(photoplan.__file__).parent / "cli").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.If) and "quiet" in ast.unparse(node.test) and "not" in ast.unparse(node.test):
+                hidden = [n.attr for part in node.body for n in ast.walk(part) if isinstance(n, ast.Attribute)]
+                assert not {"notes", "warnings", "warning", "doubt", "failed", "left_out"}.intersection(hidden), path

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import NEW_FOLDER, PATH, ending, images_option
-from photoplan.cli.output import show, show_json
+from photoplan.cli.output import say, show, show_json
 from photoplan.plain import shown_metres
 
 if TYPE_CHECKING:

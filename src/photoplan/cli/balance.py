@@ -58,9 +58,8 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
         if picture is not None:
             show(picture)
         _print(found)
-    if not quiet:
-        for note in found.notes:
-            say(note)
+    for note in found.notes:
+        say(note)
 
 
 def _print(found: BalanceReport) -> None:

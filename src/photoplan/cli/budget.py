@@ -54,5 +54,5 @@ def command(tables: bool, picture: Path | None, overwrite: bool, as_json: bool, 
 
         write_atomically(picture, draw_picture(found.typical))
     tell(found)
-    for note in () if quiet else found.notes:
+    for note in found.notes:
         say(f"note: {note}")

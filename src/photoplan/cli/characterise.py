@@ -47,8 +47,7 @@ def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
         show_json(report, written=written)
     else:
         _print(report, written)
-    if not quiet:
-        _talk(report, options["dry_run"])
+    _talk(report, options["dry_run"], quiet)
     end_with_failures(report.failed, sum(run.outcome is not None for run in report.runs), "analyses failed")
 
 
@@ -67,13 +66,16 @@ def _print(report: CharacteriseReport, written: tuple[Path, ...]) -> None:
         show(path)
 
 
-def _talk(report: CharacteriseReport, dry_run: bool) -> None:
+def _talk(report: CharacteriseReport, dry_run: bool, quiet: bool) -> None:
     """What was not done, and remarks, on stderr."""
     for note in report.notes:
         say(note)
     for run in report.runs:
-        for note in _notes(run):
-            say(note)
+        if run.missing is None or not quiet:
+            for note in _notes(run):
+                say(note)
+    if quiet:
+        return
     states = [run.state for run in report.runs]
     done = states.count("possible" if dry_run else "done")
     say(

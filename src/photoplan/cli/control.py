@@ -56,8 +56,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     for i in found.images:
         x, y, rms = (f"{v:.{digits}f}" if math.isfinite(v) else "–" for v, digits in zip((*i.shift, i.rms), (1, 1, 2)))
         show(f"{i.name:{width}} {i.tried:6} {i.matched:5} {len(i.points):5}  {x:>7} {y:>7}  {rms:>10}")
-    if not quiet:
-        for i in found.images:
-            if not len(i.points):
-                reasons = ", ".join(f"{count} {reason}" for reason, count in i.reasons.items())
-                say(f"{i.name}: no control ({reasons})")
+    for i in found.images:
+        if not len(i.points):
+            reasons = ", ".join(f"{count} {reason}" for reason, count in i.reasons.items())
+            say(f"{i.name}: no control ({reasons})")

@@ -88,10 +88,10 @@ def _convert(request: Any, as_json: bool, quiet: bool) -> None:
             show(file)
     if not quiet:
         say(f"  {done.images} images, from {done.source_format} to {done.target_format}{_nothing(request)}")
-        for note in done.notes:
-            say(f"  {note}")
-        for loss in done.lost:
-            say(f"  {done.target_format} holds {loss.text}")
+    for note in done.notes:
+        say(f"  {note}")
+    for loss in done.lost:
+        say(f"  {done.target_format} holds {loss.text}")
 
 
 def _nothing(request: Any) -> str:
@@ -129,5 +129,5 @@ def _list(request: Any, image_points: Path, control: Path, as_json: bool, quiet:
                 show(f"{r.median:10.2f} px  {fits:4}  {found.options(r.reading)}")
     if not quiet:
         say(f"  medians of {found.points} points in {found.images} images")
-        for note in found.notes:
-            say(f"  {note}")
+    for note in found.notes:
+        say(f"  {note}")

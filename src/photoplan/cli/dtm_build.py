@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import PATH, POSITIVE, beyond_area_option, ending
-from photoplan.cli.output import can_draw, show, show_json
+from photoplan.cli.output import can_draw, say, show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.dtm.build import BuildReport, BuildRequest
@@ -96,7 +96,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     for line in _summary(built):
         events.talk(line)
     if warning:
-        events.talk(warning)
+        say(warning)
 
 
 def _request(options: dict[str, Any]) -> BuildRequest:

@@ -51,5 +51,5 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         show(found.difference)
     if not quiet:
         say(f"height system: {found.height_system}")
-        for note in found.notes:
-            say(note)
+    for note in found.notes:
+        say(note)

@@ -70,9 +70,8 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
             show(image)
             if drawn[image.name] is not None:
                 show(drawn[image.name])
-        if not quiet:
-            for note in image.found.notes:
-                say(f"{image.name}: {note}")
+        for note in image.found.notes:
+            say(f"{image.name}: {note}")
     if report.written is not None and not quiet:
         say(f"{report.written}: fiducial marks of {len(report.images)} images written")
     end_with_failures(report.failed, len(report.images))

@@ -55,9 +55,9 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
         for path in (report, picture):
             if path is not None:
                 show(path)
+    if found.unmeasured:
+        say(f"marks not measured in {', '.join(found.unmeasured)}: photoplan fiducials finds them")
     if not quiet:
-        if found.unmeasured:
-            say(f"marks not measured in {', '.join(found.unmeasured)}: photoplan fiducials finds them")
         for camera in found.written:
             say(f"camera {camera!r}: interior = {options['model']!r} written to the project")
     end_with_failures(found.failed, len(found.images))

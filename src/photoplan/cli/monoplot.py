@@ -47,5 +47,5 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         show(f"median standard deviation X {X:.3f} Y {Y:.3f} Z {Z:.3f} m")
     if not quiet:
         say(f"height system: {found.height_system}")
-        for note in found.notes:
-            say(note)
+    for note in found.notes:
+        say(note)

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import click
 
 from photoplan.cli.options import PATH, ending
-from photoplan.cli.output import end_with_failures, show, show_json, talking
+from photoplan.cli.output import end_with_failures, say, show, show_json, talking
 
 
 class _MeasuredImage(Protocol):
@@ -26,15 +26,15 @@ class _Report(Protocol):
     def csv(self) -> Path | None: ...
 
 
-def say_images(report: _Report, page: Path | None, as_json: bool, talk: Callable[[str], None]) -> None:
-    """The figures of every image on stdout, or all as JSON; notes are talk."""
+def say_images(report: _Report, page: Path | None, as_json: bool) -> None:
+    """The figures of every image on stdout, or all as JSON; notes on stderr."""
     if as_json:
         show_json(report, report=page)
     for image in report.images:
         if not as_json:
             show(image)
         for note in image.notes:
-            talk(f"{image.name}: {note}")
+            say(f"{image.name}: {note}")
 
 
 def say_files(report: _Report, page: Path | None) -> None:
@@ -105,7 +105,7 @@ def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: 
         report = measure_patterns(request, talk)
         written = page.write(pattern_page(report)) if page is not None and report.images else None
         record([report.csv, written], report)
-    say_images(report, written, as_json, talk)
+    say_images(report, written, as_json)
     if not as_json:
         say_files(report, written)
     end_with_failures(report.failed, len(report.images))
@@ -160,7 +160,6 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
     from photoplan.report.mtf.page import mtf_page
     from photoplan.report.page import open_report
 
-    talk = talking(quiet)
     inputs = [*images, options["linearisation"], options["lab"]]
     page = open_report(options.pop("report"), inputs, overwrite=options["overwrite"], table=options["csv"])
     request = MtfRequest(images, **edge_options(options))
@@ -169,12 +168,12 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
             report = measure_mtf(request, events)
         written = page.write(mtf_page(report)) if page is not None and report.images else None
         record([report.csv, written], report)
-    say_images(report, written, as_json, talk)
+    say_images(report, written, as_json)
     if len(report.images) > 1:
         if not as_json:
             show(f"all {len(report.images)} images\n{group_lines(report.groups)}")
         if report.enhancement is not None and report.enhancement.enhanced:
-            talk(f"all images: {report.enhancement.warning}")
+            say(f"all images: {report.enhancement.warning}")
     if not as_json:
         say_files(report, written)
     end_with_failures(report.failed, len(report.images))

@@ -112,7 +112,7 @@ def _all_cores(context: click.Context, parameter: click.Parameter, given: int | 
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
-quiet_option = click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+quiet_option = click.option("-q", "--quiet", is_flag=True, help="No progress on stderr; warnings stay.")
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace what exists.")
 workers_option = click.option(
     "--workers", type=click.IntRange(1), callback=_all_cores, help="Worked on at once [all cores]."

@@ -14,6 +14,7 @@ import click
 from photoplan.errors import InputError, TilesFailed
 
 _PARAMETER = re.compile(r"`([a-z][a-z0-9_]*)(=False)?`")
+_DOUBT = re.compile(r"\s*(?:warning|note):")
 _REMARK = re.compile(r" \(`[a-z][a-z0-9_]*`[^()`]*\)")
 
 
@@ -69,9 +70,19 @@ def say(text: object) -> None:
     click.echo(_spelled(text), err=True)
 
 
+def is_doubt(text: str) -> bool:
+    """Whether a message says that a result is doubtful or that something was left out: `quiet` does not hide it."""
+    return _DOUBT.match(text) is not None
+
+
 def talking(quiet: bool) -> Callable[[str], None]:
-    """What says a line on stderr, or nothing if `quiet`."""
-    return (lambda text: None) if quiet else say
+    """Print messages on stderr; if `quiet`, those alone that begin with ``warning:`` or ``note:``."""
+
+    def talk(text: str) -> None:
+        if not quiet or is_doubt(text):
+            say(text)
+
+    return talk
 
 
 def can_draw(wanted: bool, talk: Callable[[str], None], what: str = "picture") -> bool:

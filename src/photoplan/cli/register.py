@@ -48,9 +48,8 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
         with Telling(quiet) as events:
             report = register(request, events)
         picture = None if drawing is None else drawing.write(draw_vectors(report))
-    if not quiet:
-        for note in report.notes:
-            say(note)
+    for note in report.notes:
+        say(note)
     if as_json:
         show_json(report, picture=picture)
         return

@@ -58,8 +58,7 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
         show_json(result, report=report)
     else:
         _show(result, report)
-    if not quiet:
-        _talk(result)
+    _talk(result, quiet)
     end_with_failures(result.failed, len(result.images), "images could not be oriented")
 
 
@@ -95,7 +94,7 @@ def _with_sigma(name: str, value: float, sigma: float) -> str:
     return f"{name} {shown_metres(value, sigma).removesuffix(' m')} ±{shown_metres(sigma, sigma)}"
 
 
-def _talk(result: ResectResult) -> None:
+def _talk(result: ResectResult, quiet: bool) -> None:
     for note in result.notes:
         say(note)
     for image in result.images:
@@ -104,5 +103,5 @@ def _talk(result: ResectResult) -> None:
     if result.left_out:
         names = ", ".join(result.left_out[:5]) + (" …" if len(result.left_out) > 5 else "")
         say(f"{len(result.left_out)} images have fewer than 3 control points: {names}")
-    if result.written:
+    if result.written and not quiet:
         say(f"{result.project}: orientation of {len(result.images)} images written")

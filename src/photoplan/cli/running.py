@@ -61,7 +61,7 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
         f"hidden {settings.hidden} · {how.workers} {how.executor}"
     )
     for line in plan.blind:
-        events.talk(f"  left out: {line}")
+        events.talk(f"  note: left out: {line}")
     failed = None
 
     def then(results: list[ProductResult]) -> None:

@@ -52,6 +52,5 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
             along += f", halfway between them by {halfway:.2f}"
         joined = f"{len(found.shapes)} of {len(found.survey.names)} images joined"
         show(f"{joined} at {found.survey.grid.resolution:g} m · {along}")
-    if not quiet:
-        for note in found.notes:
-            say(note)
+    for note in found.notes:
+        say(note)

@@ -75,7 +75,7 @@ def _pattern(scene: str, as_json: bool, quiet: bool, options: dict[str, Any]) ->
             show(image.path)
     if not quiet:
         _tell_dry(options)
-        _tell(report)
+    _tell(report, quiet)
 
 
 def _project(project: Path, as_json: bool, quiet: bool, options: dict[str, Any]) -> None:
@@ -90,10 +90,10 @@ def _project(project: Path, as_json: bool, quiet: bool, options: dict[str, Any])
     else:
         for path in (*(image.path for each in report.images for image in each.images), *report.rasters):
             show(path)
+    for each in report.images:
+        _tell(each, quiet)
     if not quiet:
         _tell_dry(options)
-        for each in report.images:
-            _tell(each)
         say(f"finest wave of the pattern: {report.grain:g} m" + (f" · {len(report.kept)} files of an earlier run kept"
                                                                  if report.kept else ""))  # fmt: skip
 
@@ -103,12 +103,13 @@ def _tell_dry(options: dict[str, Any]) -> None:
         say("dry run: nothing was written")
 
 
-def _tell(report: Any) -> None:
+def _tell(report: Any, quiet: bool) -> None:
     """What was formed, in words."""
     along = " ".join(f"{axis} {value:.4f}" for axis, value in zip("xy", report.mtf50))
-    say(
-        f"{len(report.images)} images of {report.bands} × {report.size[0]} × {report.size[1]} pixels, {report.dtype} · "
-        f"MTF50 of the model: {along} cycles per pixel"
-    )
+    if not quiet:
+        say(
+            f"{len(report.images)} images of {report.bands} × {report.size[0]} × {report.size[1]} pixels, "
+            f"{report.dtype} · MTF50 of the model: {along} cycles per pixel"
+        )
     for note in report.notes:
         say(note)

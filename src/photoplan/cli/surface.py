@@ -75,7 +75,7 @@ def command(project: Path, **options: Any) -> None:
     with Telling(how.quiet) as events:
         plan = plan_surface(stated, SurfaceSettings(**options), images or None, force=force, events=events)
         for line in plan.blind:
-            events.talk(f"  left out: {line}")
+            events.talk(f"  note: left out: {line}")
         if dry_run:
             show_json(plan.json_fields()) if how.as_json else show(plan)
             return
@@ -116,6 +116,6 @@ def _tell(result: Any, plan: Any, picture: Path | None, events: Any) -> None:
     events.talk(f"  last corrections, coarse to fine: {corrections} px")
     events.talk("  sigma0 of grey values: " + ", ".join(f"{name} {value:.3g}" for name, value in known.items()))
     for note in result.notes:
-        events.talk(f"  {note}")
+        events.talk(f"  note: {note}")
     if picture is not None:
         events.talk(f"  drawn in {picture}")

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import click
 
-from photoplan.cli.output import say
+from photoplan.cli.output import is_doubt, say
 
 #: Seconds between two lines where there is no terminal, and between two changes of the line on one.
 SELDOM, OFTEN = 30.0, 0.1
@@ -104,8 +104,8 @@ class Telling:
         return " ".join(words)
 
     def talk(self, text: str) -> None:
-        """Say something on stderr."""
-        if not self._quiet:
+        """Print a message on stderr; doubts also if `quiet`."""
+        if not self._quiet or is_doubt(text):
             self._clear()
             say(text)
 

@@ -50,6 +50,8 @@ def command(matrix: Path | None, output: Path, overwrite: bool, **options: Any) 
     for path in (output, given.get("picture"), given.get("refined")):
         if path is not None:
             show(path)
+    if found.match is not None and found.match.doubt is not None:
+        say(found.match.doubt)
     if quiet:
         return
     if not len(found.points):
@@ -59,8 +61,6 @@ def command(matrix: Path | None, output: Path, overwrite: bool, **options: Any) 
         show(f"{len(found.points)} of {found.columns} columns, {away.min():.0f} to {away.max():.0f} m away")
     for line in [] if found.match is None else told(found):
         show(line)
-    if found.match is not None and found.match.doubt is not None:
-        say(found.match.doubt)
 
 
 def told(found: Any) -> list[str]:

@@ -136,6 +136,12 @@ def free_megabytes(path: Path) -> int:
         return -1
 
 
+def make_parents(folder: Path) -> None:
+    """Make a folder and those around it; raises OSError, and as `refuse_outward`."""
+    refuse_outward(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+
+
 def make_folder(folder: Path) -> None:
     """Make a folder for products, if it is not there.
 
@@ -144,9 +150,8 @@ def make_folder(folder: Path) -> None:
     UsageError
         It cannot be made.
     """
-    refuse_outward(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_parents(folder)
     except OSError as error:
         raise UsageError(f"{folder}: no such folder, and it cannot be made ({error.strerror})") from None
 

@@ -15,7 +15,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.cameras.observed import ImagePoints
-from photoplan.io.disk import disk_error, library_error
+from photoplan.io.disk import disk_error, library_error, make_parents
 from photoplan.io.gdal import FIXED_DATE
 from photoplan.io.naming import give_name, scratch
 from photoplan.io.tables import write_table
@@ -53,7 +53,7 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str | None)
         The disk is full.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_parents(path.parent)
         with scratch(path.parent) as folder:
             partial = folder / path.name
             warnings.filterwarnings("ignore", "'crs' was not provided")

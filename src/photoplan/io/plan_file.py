@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.checks import open_database, plain_tables
+from photoplan.io.disk import make_parents
 from photoplan.io.gdal import FIXED_DATE
 from photoplan.io.geopackage import write_vector
 from photoplan.io.naming import give_name, scratch
@@ -65,7 +66,7 @@ def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> 
     """
     if path.exists() and not overwrite:
         raise UsageError(f"{path} exists; give `overwrite` to replace it")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_parents(path.parent)
     with scratch(path.parent) as folder:
         partial = folder / path.name
         for layer, (bounds, table) in {

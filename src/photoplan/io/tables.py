@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from photoplan.codec import storable
 from photoplan.errors import InputError, UsageError
 from photoplan.io.appearance import looks_like
-from photoplan.io.disk import disk_error
+from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.naming import write_atomically
 from photoplan.io.table_lines import DELIMITERS, NOTHING, Line, csv_line, decimal, line_blocks, number, split_line
 
@@ -359,7 +359,7 @@ def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[objec
         The disk is full, or the folder cannot be written to.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_parents(path.parent)
     except OSError as error:
         raise disk_error(path, error) from error
     write_atomically(path, "".join(map(csv_line, [header, *rows])).encode())

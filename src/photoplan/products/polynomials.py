@@ -11,6 +11,7 @@ from photoplan.cameras.rpc_fit import fit_rpc
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.geodetic import GeodeticGround
 from photoplan.io.camera.rpc.text import rpc_text
+from photoplan.io.disk import make_parents
 from photoplan.io.names import unique_stems
 from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
@@ -94,7 +95,7 @@ def write_polynomials(request: PolynomialsRequest) -> PolynomialsReport:
         if request.dry_run:
             return report
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_parents(folder)
         except OSError as error:
             raise InputError(f"{folder}: the folder cannot be made ({error.strerror or error})") from None
         for _, path, text in fitted:

@@ -12,7 +12,7 @@ from math import isfinite
 from pathlib import Path
 
 from photoplan.errors import UsageError
-from photoplan.io.disk import disk_error
+from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.names import stated_text
 from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
@@ -157,7 +157,7 @@ class ReportFile:
             parts[::2] = [stated_text(part, self.path.parent) for part in parts[::2]]
             content = "".join(parts).encode("utf-8", errors="replace")
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            make_parents(self.path.parent)
         except OSError as error:
             raise disk_error(self.path, error) from None
         write_atomically(self.path, content)

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.disk import disk_error
+from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.naming import write_atomically
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import OrientationTable, TableFormat
@@ -133,7 +133,7 @@ def write_orientation(block: OrientationBlock, path: str | Path, format: str, *,
         raise UsageError(f"{', '.join(present)}: exists already; choose another output or say `overwrite`")
     for file, text in texts.items():
         try:
-            file.parent.mkdir(parents=True, exist_ok=True)
+            make_parents(file.parent)
         except OSError as error:
             raise disk_error(file.parent, error) from None
         write_atomically(file, text.encode())

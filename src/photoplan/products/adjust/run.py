@@ -15,7 +15,7 @@ import numpy as np
 
 from photoplan.errors import DatumDefect, GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.io.disk import disk_error
+from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.geopackage import write_point_layers, write_residuals
 from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
@@ -196,7 +196,7 @@ def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events
     earlier = EarlierResult(poses, cameras)
     if len(started(inputs, earlier=earlier)[1]) == len(poses):
         return prepared, adjusted
-    events.talk(f"starting again with the calibrated cameras, as {lost} images could not be oriented without")
+    events.talk(f"note: starting again with the calibrated cameras, as {lost} images could not be oriented without")
     return tried(earlier=earlier)
 
 
@@ -215,7 +215,7 @@ def _begun(
         if isinstance(error, DatumDefect) or not known_poses(inputs):
             raise
         failure, why = error, "from them the adjustment does not converge"
-    events.talk(f"{why}: starting again without approximate orientations")
+    events.talk(f"note: {why}: starting again without approximate orientations")
     try:
         prepared, adjusted = tried(False)
     except (GeometryError, InputError):
@@ -293,7 +293,7 @@ def _write(
     with recording("adjust", request, [request.project, *result.prepared.inputs.files]) as record:
         changes = _changes(result, lost)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_parents(folder)
         except OSError as error:
             raise disk_error(folder, error) from error
         write_point_layers(folder / "points.gpkg", point_layers(result, figures), result.prepared.frame.crs)

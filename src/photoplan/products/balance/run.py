@@ -15,7 +15,7 @@ from photoplan.engine.run import tiles_in_flight
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.balance_file import BalanceBand, write_balance_file
-from photoplan.io.disk import make_folder
+from photoplan.io.disk import make_folder, make_parents
 from photoplan.io.lock import lock_of
 from photoplan.io.naming import locked, together
 from photoplan.io.product import check_output
@@ -295,7 +295,7 @@ def _write(request: BalanceRequest, project: Project, report: BalanceReport) -> 
     """Balance files, the table of overlaps, entries of the project."""
     found, names = report.balanced, report.survey.names
     assert found is not None and report.pairs is not None
-    request.folder.mkdir(parents=True, exist_ok=True)
+    make_parents(request.folder)
     gauge = f"{request.reference_image} stays" if request.reference_image else "the block keeps mean and contrast"
     gauge = gauge if request.reference is None else f"colours of {request.reference.name}"
     home = request.project.resolve().parent

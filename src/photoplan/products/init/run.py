@@ -21,7 +21,7 @@ from photoplan.io.camera.file import CameraFile, read_cameras
 from photoplan.io.camera.model import CameraEntry, Triple
 from photoplan.io.camera.opensfm import resized
 from photoplan.io.camera.rpc.file import read_rpc, rpc_beside, rpc_in
-from photoplan.io.disk import received
+from photoplan.io.disk import make_parents, received
 from photoplan.io.names import check_input_name, relative_path, shortest_paths
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
@@ -197,7 +197,7 @@ def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     received(request.folder)
     result = make_project(request, talk)
     try:
-        request.folder.mkdir(parents=True, exist_ok=True)
+        make_parents(request.folder)
     except OSError as error:
         raise InputError(f"{request.folder}: the folder cannot be made ({error.strerror or error})") from None
     write_project(result.path, result.project)

@@ -84,7 +84,7 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
         except PhotoplanError as error:
             failed[names[path]] = str(error)
     if encoded:
-        talk(ENCODED)
+        talk(f"note: {ENCODED}")
     done = bool(results)
     made = PatternReport(
         pattern=request.pattern,

@@ -92,7 +92,7 @@ def measure_mtf(request: MtfRequest, events: Events = SILENT) -> MtfReport:
     names = dict(zip(request.images, unique_names(request.images)))
     opened, failed = _opened(request, linearisation, names)
     if request.linearisation is None and any(image.reader.dtype == "uint8" for image in opened.values()):
-        events.talk(ENCODED)
+        events.talk(f"note: {ENCODED}")
     results: list[ImageMtf] = []
     events.begin("edges", sum(measuring.steps(image) for image in opened.values()), "tiles")
     for path, image in opened.items():

@@ -10,6 +10,7 @@ import numpy as np
 
 from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
+from photoplan.io.disk import make_parents
 from photoplan.io.filter_file import filter_text
 from photoplan.io.storage import COMPRESSIONS
 from photoplan.products.restore.design import DesignRequest, MeasuredFilter, design_restoration
@@ -93,7 +94,7 @@ def keep_filter(path: Path, filter_: RestorationFilter, *, overwrite: bool = Fal
     except (OSError, UnicodeDecodeError):
         pass
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_parents(path.parent)
     except OSError as error:
         raise UsageError(f"{path.parent}: cannot be made ({error.strerror})") from None
     return save_filter(path, filter_, overwrite=overwrite)

@@ -139,8 +139,8 @@ def make_sequence(request: SequenceRequest, plans: list[ViewPlan], run: Run) -> 
     more = sorted({*request.output.glob("frame_*.png")} - {plan.request.output for plan in plans})
     if more:
         run.events.talk(
-            f"{request.output} holds {len(more)} more pictures, of an earlier run or another path, {more[0].name} the "
-            "first of them: remove them before other programs join the pictures"
+            f"note: {request.output} holds {len(more)} more pictures, of another run or path, {more[0].name} "
+            "the first of them: remove them before other programs join the pictures"
         )
     if request.video is not None:
         write_film(request.video, request.output, request.rate, len(frames))
