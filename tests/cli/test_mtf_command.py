@@ -165,7 +165,9 @@ class TestFigures:
         said = photoplan("mtf", path)
         assert "linear: grey values are taken as light" in said.out
         assert "moves MTF50 by about 12 %" in said.err
-        off = result(photoplan, path)["summary"][0]["mtf50"]
+        quiet = photoplan("mtf", path, "--json", "-q")
+        assert "moves MTF50 by about 12 %" in quiet.err, "a doubt is printed with -q too"
+        off = json.loads(quiet.out)["summary"][0]["mtf50"]
         print(f"sRGB {right:.4f}, as linear {off:.4f}: {100 * (off / right - 1):.1f} %")
         assert abs(off / right - 1) > 0.02
 

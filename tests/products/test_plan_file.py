@@ -253,7 +253,7 @@ def test_fault_11_two_products_of_one_name_are_refused(planned: tuple[Path, Orth
         header["products"][0]["name"] = header["products"][1]["name"].upper()
 
     changed(planned[0], change)
-    with pytest.raises(InputError, match="would both write"):
+    with pytest.raises(InputError, match="two products would write the same file"):
         read_plan(planned[0])
 
 

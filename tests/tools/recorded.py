@@ -12,9 +12,11 @@ def recorded(path: Path, kind: str, *inputs: Path) -> dict[str, Any]:
     """The record that a command wrote, checked: it answers for its files, which were made from these inputs."""
     record = checked(json.loads(path.read_text("utf-8")))
     assert record["kind"] == kind and record["product"] and "overwrite" not in record["settings"]
-    files = [Path(each) for each in record["files"]]
+    files = [path.parent / each for each in record["files"]]
     assert record["file"] == files[0].name and files[0].parent == path.parent and all(each.exists() for each in files)
-    assert {str(each) for each in inputs} <= {each["path"] for each in record["inputs"]}
+    stated = [each["path"] for each in record["inputs"]]
+    assert {each.resolve() for each in inputs} <= {(path.parent / each).resolve() for each in stated}
+    assert not [each for each in (*stated, *record["files"]) if Path(each).is_absolute()]
     return record
 
 

@@ -71,6 +71,8 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
             show(path)
         for line in _figures(report):
             show(line)
+    for line in _doubts(report):
+        say(line)
     for line in _talk(report):
         events.talk(line)
     if report.not_oriented:
@@ -128,17 +130,23 @@ def _sigmas(normalised: float) -> str:
     return f", {abs(normalised):.1f} sigma" if math.isfinite(normalised) else ""
 
 
-def _talk(report: AdjustReport) -> list[str]:
+def _doubts(report: AdjustReport) -> list[str]:
+    """Gross errors and notes, which are printed with `quiet` too."""
     f = report.figures
     lines = [f"gross error: {m.what}: {m.residual}{_sigmas(m.normalised)}" for m in f.gross[:_SHOWN]]
     if len(f.gross) > _SHOWN:
         lines.append(f"and {len(f.gross) - _SHOWN} more gross errors; all are in report.json")
+    return [*lines, *f.notes]
+
+
+def _talk(report: AdjustReport) -> list[str]:
+    f = report.figures
+    lines: list[str] = []
     if f.left_out:
         reasons: dict[str, int] = {}
         for _, reason in f.left_out:
             reasons[reason] = reasons.get(reason, 0) + 1
         lines += [f"left out: {count} × {reason}" for reason, count in reasons.items()]
-    lines += list(f.notes)
     if report.orientations:
         lines.append(f"orientations of {report.orientations} images written into the project")
     return lines

@@ -88,10 +88,10 @@ def _convert(request: Any, as_json: bool, quiet: bool) -> None:
             show(file)
     if not quiet:
         say(f"  {done.images} images, from {done.source_format} to {done.target_format}{_nothing(request)}")
+        for loss in done.lost:
+            say(f"  {done.target_format} holds {loss.text}")
     for note in done.notes:
         say(f"  {note}")
-    for loss in done.lost:
-        say(f"  {done.target_format} holds {loss.text}")
 
 
 def _nothing(request: Any) -> str:

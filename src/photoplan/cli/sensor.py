@@ -37,5 +37,6 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         for path in written:
             show(path)
     differing = [f for f in found.figures if f.stated is not None and abs(f.value - f.stated) > 0.01 * abs(f.stated)]
-    for figure in differing:
-        say(f"{figure.name}: {figure.value:.4g} by {figure.source}; {figure.stated:g} is stated")
+    if not quiet:
+        for figure in differing:
+            say(f"{figure.name}: {figure.value:.4g} by {figure.source}; {figure.stated:g} is stated")

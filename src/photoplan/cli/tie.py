@@ -65,7 +65,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         if picture is not None:
             show(picture)
         _print(found)
-    _talk(found, quiet)
+    _talk(found)
 
 
 def _scales(found: TieReport) -> list[str]:
@@ -99,8 +99,8 @@ def _print(found: TieReport) -> None:
         show(f"{name:{width}}  {count:6}")
 
 
-def _talk(found: TieReport, quiet: bool) -> None:
-    for note in () if quiet else found.notes:
+def _talk(found: TieReport) -> None:
+    for note in found.notes:
         say(note)
     if len(found.parts) > 1:
         say(f"no overlap: {len(found.unconnected)} of {len(found.images)} images do not hang together with the others:")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,6 +117,10 @@ def write_contours(
         check_output(file, inputs, overwrite=overwrite)
     try:
         with FileLock(lock_of(path)), scratch(path.parent) as made:
+            # Versions before left a folder of this name when they were killed.
+            old = path.with_name(f".{path.name}.partial")
+            if old.is_dir() and not old.is_symlink():
+                shutil.rmtree(old, ignore_errors=True)
             folder = made / "files"
             folder.mkdir()
             if path.suffix.lower() == ".dxf":

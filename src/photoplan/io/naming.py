@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -15,7 +16,7 @@ from hashlib import sha256
 from itertools import count
 from pathlib import Path
 
-from photoplan.errors import PhotoplanError, RunLocked, UsageError
+from photoplan.errors import PhotoplanError, ResourceError, RunLocked, UsageError
 from photoplan.io.disk import disk_error, open_own, read_own, refuse_outward, sync_file, sync_folder, write_all
 from photoplan.io.lock import FileLock, lock_of
 from photoplan.io.tile_log import log_of
@@ -55,6 +56,9 @@ def scratch(folder: Path) -> Iterator[Path]:
                 # Another run took it for one of the dead before it was locked. Some file systems know no locks at all.
                 if attempt < _ATTEMPTS:
                     continue
+            except ResourceError as error:
+                # The caller names its own file.
+                raise OSError(errno.ENOSPC, str(error.__cause__ or error)) from error
             yield made
             return
         finally:

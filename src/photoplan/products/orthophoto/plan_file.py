@@ -18,7 +18,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MOST_TILES, MapGrid
 from photoplan.io.disk import disk_error, library_error
-from photoplan.io.names import file_in, unique_stems
+from photoplan.io.names import file_in
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
@@ -243,7 +243,9 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path | None]:
         for name, index, rows in zip(*(tiles[column].tolist() for column in ("product", "tile", "sources"))):
             listed.setdefault(name, {})[index] = tuple(map(int, rows.split()))
         products = [_product(entry, listed, settings, project) for entry in header["products"]]
-        unique_stems(file_in(folder, entry["name"]).name for entry in header["products"])
+        names = [file_in(folder, entry["name"]).name.casefold() for entry in header["products"]]
+        if len(set(names)) < len(names):
+            raise InputError(f"{path}: the plan is damaged: two products would write the same file; make it again")
         changed = [
             p.images[0] if len(p.images) == 1 else p.plan.name
             for p, entry in zip(products, header["products"])
