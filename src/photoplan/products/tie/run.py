@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass, fields, replace
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.image_points import write_image_points
 from photoplan.io.lock import lock_of
-from photoplan.io.naming import together, write_atomically
+from photoplan.io.naming import together
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
@@ -27,6 +25,7 @@ from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
+from photoplan.io.tables import write_table
 from photoplan.matching.features import Features, FeatureSettings, opencv
 from photoplan.matching.grey import Grey, ReducedImage
 from photoplan.matching.loops import Loops, close_loops
@@ -367,11 +366,7 @@ def _climb(request: TieRequest, levels: list[_Level], run: Steps, events: Events
 
 def _write_pairs(path: Path, tried: Sequence[TriedPair]) -> None:
     """Write a table of all pairs at all levels."""
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in fields(TriedPair)])
-    writer.writerows(astuple(each) for each in tried)
-    write_atomically(path, text.getvalue().encode())
+    write_table(path, [field.name for field in fields(TriedPair)], (astuple(each) for each in tried))
 
 
 def _advice(request: TieRequest, report: TieReport, tried: Sequence[TriedPair]) -> str:
