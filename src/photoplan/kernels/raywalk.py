@@ -91,11 +91,13 @@ def begin_lines(
     for i in range(paths.shape[0]):
         line, ray, span = lines[i], rays[i], spans[i]
         span[0] = span[1] = np.nan
+        if results[i] != MISS:
+            continue
         _line(paths[i], piece, bend, away[i], line)
         total = 0.0
         for k in range(7):
             total += line[k]
-        if results[i] != MISS or not np.isfinite(total):
+        if not np.isfinite(total):
             continue
         _clip(line, inside, span)
         begin, size = span[0], span[1]
@@ -245,9 +247,12 @@ def end_lines(
     """What the rays of one piece have met: see `begin_lines` and `surfaces.rays.Hits`; `away` grows by the piece."""
     line = np.empty(7)
     for i in range(paths.shape[0]):
+        begin, size = spans[i, 0], spans[i, 1]
+        if results[i] != MISS and not begin >= 0.0:
+            # Met in a piece before.
+            continue
         length = _line(paths[i], piece, bend, away[i], line)
         away[i] += length
-        begin, size = spans[i, 0], spans[i, 1]
         if not begin >= 0.0:
             continue
         if results[i] == MISS:

@@ -186,6 +186,8 @@ def follow(parts: TerrainParts, paths: ArrayLike, bend: float = 0.0, cache: Cach
     lines, rays, spans = np.empty((n, 7)), np.empty((n, 10)), np.empty((n, 2))
     frame, cache = (*parts.corner, *parts.step), OrderedDict() if cache is None else cache
     for piece in range(at.shape[1] - 1):
+        if piece and (hits.result != MISS).all():
+            break
         box = begin_lines(at, piece, bend, parts.inside, frame, away, hits.result, states, lines, rays, spans)
         if box[0] <= box[2]:
             which = np.flatnonzero(spans[:, 1] >= 0)

@@ -7,6 +7,7 @@ one box of anchors, exactly.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +28,41 @@ MOST_PIECES = 64
 _UPRIGHT = 1e-13
 #: Rays of a window that are looked at to find out how many pieces are needed.
 _SAMPLE = 49
+#: Part of a pixel by which rays may be off, where that is more than the tolerance in metres.
+_PART = 0.01
+#: Heights between which any ground lies, of the earth and of other bodies, metres.
+_HEIGHTS = (-12_000.0, 30_000.0)
+#: From so many rays on their places are polynomials of the direction; the degrees that are tried; and the length of the
+#: mean of unit directions below which they are too wide for that.
+_MANY, _DEGREES, _NARROW = 2000, (3, 5, 7), 0.8
+
+
+def _stations(reach: float, pieces: int) -> NDArray[np.float64]:
+    """Distances at which pieces of a ray end: the further away, the longer, since a pixel is larger there."""
+    return reach * (np.arange(1, pieces + 1) / pieces) ** 2
+
+
+def _turned(tangents: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit directions (n, 3) of tangents (n, 2) about the first of three axes (rows)."""
+    ways = axes[0] + tangents @ axes[1:]
+    return np.asarray(ways / np.sqrt(dot(ways, ways))[:, None])
+
+
+@lru_cache
+def _nodes(
+    degree: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Places at which polynomials are fitted and checked (n, 2), what solves them, and their powers at the latter."""
+    nodes = np.cos(np.pi * (np.arange(degree + 3) + 0.5) / (degree + 3))
+    others = np.cos(np.pi * np.arange(degree + 4) / (degree + 3))
+    fitted, checked = (np.stack(np.meshgrid(n, n), axis=-1).reshape(-1, 2) for n in (nodes, others))
+    return fitted, checked, np.linalg.pinv(_powers(fitted, degree)), _powers(checked, degree)
+
+
+def _powers(x: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """Products of powers (n, terms) of two variables (n, 2), up to a degree."""
+    u, v = np.polynomial.chebyshev.chebvander(x.T, degree)
+    return np.stack([u[:, i] * v[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
 
 
 class Bundle(Protocol):
@@ -207,30 +243,83 @@ class ViewTarget:
         ndarray, shape (n, k, 3)
         """
         pieces = 1
-        if self.warps:
-            sample = ways[:: max(1, len(ways) // _SAMPLE)]
-            while pieces < MOST_PIECES and self._off(sample, reach, pieces) > tolerance:
-                pieces *= 2
-        return self._path(ways, reach, pieces)
-
-    def _off(self, ways: NDArray[np.float64], reach: float, pieces: int) -> float:
-        """By how much the middles of pieces leave them at most."""
-        path = self._path(ways, reach, 2 * pieces)
-        with np.errstate(invalid="ignore"):  # what lies on no map is at infinity
-            off = np.linalg.norm(path[:, 1::2] - (path[:, :-1:2] + path[:, 2::2]) / 2, axis=-1)
-        return float(np.nanmax(off, initial=0.0))
-
-    def _path(self, ways: NDArray[np.float64], reach: float, pieces: int) -> NDArray[np.float64]:
-        along = reach * np.arange(1, pieces + 1)[:, None] / pieces
         unit = ways / np.sqrt(dot(ways, ways))[:, None]
-        path = np.empty((len(ways), pieces + 1, 3))
+        if self.warps:
+            sample = unit[:: max(1, len(unit) // _SAMPLE)]
+            while pieces < MOST_PIECES and not self._is_close(sample, reach, pieces, tolerance):
+                pieces *= 2
+        return self._path(unit, _stations(reach, pieces), tolerance)
+
+    def _is_close(self, unit: NDArray[np.float64], reach: float, pieces: int, tolerance: float) -> bool:
+        """Whether pieces follow rays within the tolerance wherever there may be ground."""
+        ends = np.append(0.0, _stations(reach, pieces))
+        middles = (ends[1:] + ends[:-1]) / 2
+        path, between = self._strict(unit, ends), self._strict(unit, middles)
+        with np.errstate(invalid="ignore"):  # what lies on no map is at infinity
+            off = np.linalg.norm(between - (path[:, 1:] + path[:, :-1]) / 2, axis=-1)
+            off[~self._near_ground(between)] = 0.0
+        return bool(np.nanmax(off / self._tolerances(middles, tolerance), initial=0.0) <= 1.0)
+
+    def _near_ground(self, path: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether places of paths (..., 3) are as high as ground may be."""
+        away = path[..., :2] - self.center[:2]
+        height = path[..., 2] + self.bend * dot(away, away)
+        return np.asarray((height > _HEIGHTS[0]) & (height < _HEIGHTS[1]))
+
+    def _tolerances(self, along: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
+        """By how much rays may be off at distances (k,), metres: far away a part of a pixel is more."""
+        middle = (np.array(self.bundle.size, float) - 1) / 2
+        here, beside = self.bundle.directions(np.stack([middle, middle + np.array([1.0, 0.0])]))
+        angle = float(np.linalg.norm(beside - here) / np.linalg.norm(here))
+        return np.maximum(tolerance, (_PART * angle if np.isfinite(angle) else 0.0) * along)
+
+    def _path(self, unit: NDArray[np.float64], along: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
+        """Places (n, k + 1, 3) on the map at distances (k,) of rays with unit directions (n, 3), and their start."""
+        path = np.empty((len(unit), len(along) + 1, 3))
         path[:, 0] = self.center
-        path[:, 1:] = self._on_map(self.bundle.center + along * unit[:, None])
+        smooth = self._smooth(unit, along, tolerance) if self.warps and len(unit) > _MANY else None
+        path[:, 1:] = self._strict(unit, along) if smooth is None else smooth
+        return path
+
+    def _strict(self, unit: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Places (n, k, 3) of rays on the map, less what `bend` raises them."""
+        path = self._on_map(self.bundle.center + along[:, None] * unit[:, None])
         if self.warps:
             away = path[..., :2] - self.center[:2]
             with np.errstate(invalid="ignore"):
                 path[..., 2] -= self.bend * dot(away, away)
         return path
+
+    def _smooth(
+        self, unit: NDArray[np.float64], along: NDArray[np.float64], tolerance: float
+    ) -> NDArray[np.float64] | None:
+        """`_strict` by polynomials of the direction, to a tenth of the tolerance; None: there are none.
+
+        The map is so smooth that a few hundred rays tell where ten thousands of one window are.
+        """
+        middle = unit.mean(axis=0)
+        if not np.linalg.norm(middle) > _NARROW:
+            return None
+        axes = np.linalg.svd(middle[None])[2]
+        axes[0] *= np.sign(axes[0] @ middle)
+        t = unit @ axes.T
+        t = t[:, 1:] / t[:, :1]
+        low, high = t.min(axis=0), t.max(axis=0)
+        half = np.maximum((high - low) / 2, 1e-9)
+        x = (t - (low + high) / 2) / half
+        most = self._tolerances(along, tolerance)[:, None] / 10.0
+        for degree in _DEGREES:
+            fitted, checked, solve, at_checked = _nodes(degree)
+            known = [
+                self._strict(_turned(n * half + (low + high) / 2, axes), along) - self.center for n in (fitted, checked)
+            ]
+            if not all(np.isfinite(places).all() for places in known):
+                return None
+            solved = solve @ known[0].reshape(len(fitted), -1)
+            miss = (at_checked @ solved).reshape(known[1].shape) - known[1]
+            if (np.abs(miss) <= most)[self._near_ground(known[1] + self.center)].all():
+                return np.asarray((_powers(x, degree) @ solved).reshape(len(x), len(along), 3) + self.center)
+        return None
 
     def _on_map(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         for warp in reversed(self.warps):
