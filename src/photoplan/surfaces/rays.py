@@ -177,7 +177,7 @@ def follow(parts: TerrainParts, paths: ArrayLike, bend: float = 0.0, cache: Cach
     UsageError
         The paths have another shape, or fewer than two points each.
     """
-    at = np.ascontiguousarray(paths, float)
+    at = np.asarray(paths, float)
     if at.ndim != 3 or at.shape[1] < 2 or at.shape[2] != 3:
         raise UsageError(f"paths of shape {at.shape}; n paths of two points X, Y, Z or more are needed (n, k, 3)")
     n = len(at)
@@ -186,13 +186,17 @@ def follow(parts: TerrainParts, paths: ArrayLike, bend: float = 0.0, cache: Cach
     lines, rays, spans = np.empty((n, 7)), np.empty((n, 10)), np.empty((n, 2))
     frame, cache = (*parts.corner, *parts.step), OrderedDict() if cache is None else cache
     for piece in range(at.shape[1] - 1):
-        if piece and (hits.result != MISS).all():
+        met = hits.result != MISS
+        if piece and met.all():
             break
-        box = begin_lines(at, piece, bend, parts.inside, frame, away, hits.result, states, lines, rays, spans)
+        # Of long paths only two points are near each other in memory.
+        ends = np.ascontiguousarray(at[:, piece : piece + 2])
+        box = begin_lines(ends, 0, bend, parts.inside, frame, away, hits.result, states, lines, rays, spans)
         if box[0] <= box[2]:
             which = np.flatnonzero(spans[:, 1] >= 0)
             over_parts(parts, box, which, _Rays(parts=parts, lines=lines, rays=rays, states=states, hits=hits), cache)
-        end_lines(at, piece, bend, away, rays, spans, hits.result, states, hits.XYZ, hits.along, hits.normal)
+        end_lines(ends, 0, bend, away, rays, spans, hits.result, states, hits.XYZ, hits.along, hits.normal)
+        hits.along[(hits.result != MISS) & ~met] += piece
     hits.below[:] = (hits.result == MISS) & (states == BELOW)
     hits.owner[hits.result != MISS] = 0
     return hits

@@ -55,8 +55,8 @@ def _nodes(
     """Places at which polynomials are fitted and checked (n, 2), what solves them, and their powers at the latter."""
     nodes = np.cos(np.pi * (np.arange(degree + 3) + 0.5) / (degree + 3))
     others = np.cos(np.pi * np.arange(degree + 4) / (degree + 3))
-    fitted, checked = (np.stack(np.meshgrid(n, n), axis=-1).reshape(-1, 2) for n in (nodes, others))
-    return fitted, checked, np.linalg.pinv(_powers(fitted, degree)), _powers(checked, degree)
+    fitted, checked = (np.asarray(np.stack(np.meshgrid(n, n), axis=-1).reshape(-1, 2), float) for n in (nodes, others))
+    return fitted, checked, np.asarray(np.linalg.pinv(_powers(fitted, degree)), float), _powers(checked, degree)
 
 
 def _powers(x: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
@@ -275,7 +275,7 @@ class ViewTarget:
 
     def _path(self, unit: NDArray[np.float64], along: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
         """Places (n, k + 1, 3) on the map at distances (k,) of rays with unit directions (n, 3), and their start."""
-        path = np.empty((len(unit), len(along) + 1, 3))
+        path = np.empty((len(along) + 1, len(unit), 3)).swapaxes(0, 1)
         path[:, 0] = self.center
         smooth = self._smooth(unit, along, tolerance) if self.warps and len(unit) > _MANY else None
         path[:, 1:] = self._strict(unit, along) if smooth is None else smooth
