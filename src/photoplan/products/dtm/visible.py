@@ -247,7 +247,8 @@ def _check_memory(grid: MapGrid, count: int, request: VisibleRequest) -> None:
     if need > request.memory:
         raise ResourceError(
             f"{grid.width} × {grid.height} posts and {count} observers take {advised(need / 2**30, 3)} GiB, allowed "
-            f"are {request.memory / 2**30:.1f}; give a `radius`, a coarser `resolution`, fewer observers or more `memory`"
+            f"are {request.memory / 2**30:.1f}; give a `radius`, a coarser `resolution`, fewer observers or more "
+            "`memory`"
         )
 
 
