@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import rasterio.io
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
@@ -182,6 +181,8 @@ def with_alpha_judged(info: RasterInfo, alpha: bool | None = None) -> RasterInfo
 
 def _is_picture(looks: list[NDArray[Any]]) -> bool:
     """Whether parts of an alpha band (h, w) have many values away from soft borders."""
+    from scipy.ndimage import maximum_filter  # noqa: PLC0415 - few images have alpha
+
     opaque = max(float(np.nanmax(part)) for part in looks)
     inner, every = [], []
     for part in looks:
