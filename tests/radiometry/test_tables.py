@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from tools.overlaps import block_of
+from tools.overlaps import IMAGE, PLACES, POWERS, block_of
 
 from photoplan.radiometry import adjust
 from photoplan.radiometry.balance import balanced, even_images, pairs_of, parts_of, shoulder
 from photoplan.radiometry.cells import LEVELS, PIXELS, SIDE, Cells, cells_of
 from photoplan.radiometry.ratio import factors
+from photoplan.radiometry.tone import surface
 
 LIMITS = (0.0, 255.0)
 
@@ -113,13 +114,17 @@ def test_with_a_reference_all_is_found_again(rows: int, columns: int, seeds: tup
     for seed in seeds:
         scene, truth = block_of(rows, columns, seed=seed, change=0.1, noise=2.0, reference=True)
         (found,) = balanced(scene.cells, scene.sizes, LIMITS).bands
-        table = found.state.tables - truth.tables(nodes)
+        trends, sigmas, mean = truth.compared(found)
+        table = found.state.tables * mean[:, None] - truth.tables(nodes)
         assert np.sqrt((table[:, seen] ** 2).mean(axis=1)).max() < 1.0
         assert truth.trend_errors(found).max() < 0.015
         # Beside what all images have in common, which comes from the reference.
-        error = (table - table.mean(axis=0)) / found.sigmas.tables, found.state.trends - truth.trends
-        trend = (error[1] - error[1].mean(axis=0)) / found.sigmas.trends
-        normal.append((float((error[0][:, seen] ** 2).mean()), float((trend**2).mean())))
+        error = (table - table.mean(axis=0)) / found.sigmas.tables
+        shapes = surface(*PLACES, (IMAGE, IMAGE), POWERS)
+        apart = np.log(trends) - np.log(1 + truth.trends @ shapes.T)
+        apart -= apart.mean(axis=1, keepdims=True)
+        trend = (apart - apart.mean(axis=0)) / sigmas
+        normal.append((float((error[:, seen] ** 2).mean()), float((trend**2).mean())))
     # Few images tell little about standard deviations.
     low, high = (0.9, 1.1) if len(seeds) > 1 else (0.4, 2.5)
     assert all(low <= value <= high for value in np.sqrt(np.mean(normal, axis=0)))

@@ -15,6 +15,8 @@ from photoplan.radiometry.tone import Tone, powers_of, surface
 #: Pixels of the map along the sides of an image, and from one to the next: 62 % overlap in both directions.
 IMAGE, BASE = 256, 96
 POWERS = powers_of(2)
+PLACES = tuple(each.ravel() for each in np.meshgrid(*[(np.arange(9) + 0.5) * IMAGE / 9 - 0.5] * 2))
+"""Columns and rows of an image at which trends are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +49,18 @@ class Truth:
 
     def trend_errors(self, made: AdjustedBand) -> NDArray[np.float64]:
         """Rms error of the trend over each image, (images,)."""
-        x, y = np.meshgrid(np.linspace(0, IMAGE - 1, 9), np.linspace(0, IMAGE - 1, 9))
-        shapes = surface(x, y, (IMAGE, IMAGE), POWERS).reshape(-1, len(POWERS))
-        return np.asarray(np.sqrt((((made.state.trends - self.trends) @ shapes.T) ** 2).mean(axis=1)))
+        trend, _, mean = self.compared(made)
+        shapes = surface(*PLACES, (IMAGE, IMAGE), POWERS)
+        return np.asarray(np.sqrt(((trend / mean[:, None] - (1 + self.trends @ shapes.T)) ** 2).mean(axis=1)))
+
+    def compared(self, made: AdjustedBand) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Trends found at `PLACES` of the images (images, places), their standard deviations, and the trends' means."""
+        basis, width = made.prior.basis, made.state.width
+        shapes = basis.at(*PLACES, (IMAGE, IMAGE))
+        trend = np.exp(made.state.trends @ shapes.T)
+        errors = made.errors[: len(trend) * width].reshape(len(trend), width, -1)[:, -len(basis.kinds) :]
+        sigma = np.sqrt(np.square(shapes @ errors).sum(axis=2))
+        return trend, sigma, trend.mean(axis=1)
 
 
 def block_of(

@@ -21,7 +21,9 @@ _LISTED = 12
 @images_option()
 @click.option("--reference-image", metavar="NAME", help="This image stays as it is [mean and contrast of all stay].")
 @click.option("--reference", type=PATH, metavar="FILE", help="A raster on the map whose colours the images get.")
-@click.option("--degree", type=int, default=2, show_default=True, help="Of the trend over an image; 0: tables alone.")
+@click.option(
+    "--degree", type=int, default=2, show_default=True, help="Degree of the trend over an image; 0 = tables alone."
+)
 @click.option("--factor", is_flag=True, help="One factor for each image and band instead of tables, from means.")
 @click.option("--resolution", type=float, metavar="R", help="Pixels that are compared, metres [by the images' size].")
 @click.option("-o", "--output", type=NEW_FOLDER, metavar="FOLDER", help="[balance by the project]")
@@ -76,6 +78,12 @@ def _print(found: BalanceReport) -> None:
         show(f"{both:32}  {_values(pairs.before[k]):>24}  {_values(pairs.after[k]):>24}")
     if len(pairs.images) > _LISTED:
         show(f"and {len(pairs.images) - _LISTED} more, better ones")
+    if made.modes:
+        parts = ", ".join(f"{mode.name} {100 * mode.sigma:.1f} %" for mode in made.modes)
+        show(f"standard deviations over the block, from its middle to its edge: {parts}")
+        held = [mode.name for mode in made.modes if mode.held]
+        if held:
+            show(f"overlaps do not determine {', '.join(held)}: held at what the exposures of the images suggest")
     if made.shoulder:
         show("bright and dark ends of the tables are bent to stay inside the range")
     show(f"{len(found.files)} balance files are entered in the project; `ortho` and `mosaic` apply them")

@@ -11,31 +11,30 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_diag, csr_array, eye, kron, vstack
+from scipy.sparse import csr_array, vstack
 
 from photoplan.adjustment.robust import MEDIAN_1D, cauchy
 from photoplan.radiometry.equations import Band, BandState
+from photoplan.radiometry.priors import Prior
 from photoplan.radiometry.solve import Solved
 
 _Floats = NDArray[np.float64]
 
 #: Residuals of this many standard deviations weigh half; 95 % of the efficiency are kept at normally distributed ones.
 _HALF = 2.385
-#: Standard deviations of what is known of tables and trends beforehand: the bend between two intervals of a table in
-#: parts of the range of grey values, slopes, coefficients of a trend.
-_BEND, _SLOPE, _TREND = 0.02, 1.0, 0.25
-#: That the ground is what images show in the mean, counts where nothing else tells: as an observation of so many
-#: standard deviations, and of so many times what the block moves by.
-_OWN, _MOVES = 8.0, 2.0
 #: Least slope of a table.
 _LEAST_SLOPE = 0.05
 #: What a table that may not fall weighs beside the observations; their least standard deviation, part of the range.
 _HARD, _FLOOR = 1e4, 0.001
 _ROUNDS, _CONVERGED = 30, 1e-3
+#: Observations that err together by what the model leaves out; each counts as this part of one.
+_CORRELATED = 16.0
 #: Observations whose equations are made at once, at least.
 _AT_ONCE = 120_000
 #: Parts of the ground that are left out in turn, and draws of what was known beforehand.
 _PARTS, _DRAWS = 16, 64
+#: Rounds in which variance components are estimated, and random vectors for a trace.
+_COMPONENTS, _PROBES = 15, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +59,12 @@ class AdjustedBand:
     rounds: int
     down: float
     """Part of the observations that count less than half."""
+    prior: Prior
+    """With the variance components that were found."""
+    errors: _Floats
+    """Errors of all unknowns, (unknowns, k): their sum of squares over k is the variance."""
+    prior_errors: _Floats
+    """The same if there were no observations, (unknowns, k)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +94,7 @@ class _Normals:
     """What that loses with theirs, (groups, unknowns)."""
 
 
-def adjust(band: Band, gauge: Gauge) -> AdjustedBand:
+def adjust(band: Band, gauge: Gauge, prior: Prior) -> AdjustedBand:
     """Tables and trends of one band.
 
     Parameters
@@ -97,10 +102,11 @@ def adjust(band: Band, gauge: Gauge) -> AdjustedBand:
     band : Band
         Of cells that more than one image shows; every image is in some.
     gauge : Gauge
+    prior : Prior
+        Its variance components are initial values.
     """
     images = len(gauge.parts)
-    state, span = band.start(images), float(np.ptp(band.nodes))
-    prior, wanted = _prior(band, state)
+    state, span = band.start(images, prior.common), float(np.ptp(band.nodes))
     H, held = _gauge(band, state, gauge)
     flat, robust = np.zeros((images, len(band.nodes) - 1), bool), np.ones(len(band.grey))
     rounds = 0
@@ -109,29 +115,56 @@ def adjust(band: Band, gauge: Gauge) -> AdjustedBand:
         weights = _weigh(band, state, robust, gauge.fixed is None)
         found = _normals(band, state, weights)
         robust, x = weights.robust, state.vector
+        P, wanted, component = prior.rows()
         rising, missing = _rising(band, state, flat)
         hard = _HARD * float(found.N.diagonal().max())
-        known = prior.T @ prior + hard * (rising.T @ rising)
-        N = found.N + known
+        N = found.N + P.T @ P + hard * (rising.T @ rising)
         solved = Solved.of(N, H)
-        step = solved.step(found.g + prior.T @ (wanted - prior @ x) + hard * (rising.T @ missing), held - H @ x)
+        step = solved.step(found.g + P.T @ (wanted - P @ x) + hard * (rising.T @ missing), held - H @ x)
         state = state.with_vector(x + step)
-        state = BandState(state.tables, state.trends, state.ground + found.alone - found.lost @ step)
+        state = replace(state, ground=state.ground + found.alone - found.lost @ step)
         falling = np.diff(state.tables, axis=1) < _LEAST_SLOPE * band.step * (1 - 1e-6)
         done = float(np.abs(step).max()) < _CONVERGED * span and not (falling & ~flat).any()
         if done or rounds == _ROUNDS:
             break
         flat |= falling
+        if rounds <= _COMPONENTS:
+            prior = _with_components(prior, solved, P, wanted, component, state.vector)
     weights = _weigh(band, state, robust, gauge.fixed is None)
-    variance = _without_parts(band, state, weights, solved, N) + _of_prior(solved, prior)
-    sigmas = BandState(state.tables, state.trends, np.full(len(state.ground), np.nan)).with_vector(np.sqrt(variance))
+    drawn = P.T @ np.random.default_rng(0).normal(size=(P.shape[0], _DRAWS)) / np.sqrt(_DRAWS)
+    errors = np.concatenate([_without_parts(band, state, weights, solved, N), solved.step(drawn, 0.0)], axis=1)
+    blank = replace(state, ground=np.full(len(state.ground), np.nan))
     return AdjustedBand(
-        state=state, sigmas=sigmas, sigma=weights.sigma, rounds=rounds, down=float((robust < 0.5).mean())
+        state=state,
+        sigmas=blank.with_vector(np.sqrt(np.square(errors).sum(axis=1))),
+        sigma=weights.sigma,
+        rounds=rounds,
+        down=float((robust < 0.5).mean()),
+        prior=prior,
+        errors=errors,
+        prior_errors=Solved.of(csr_array(P.T @ P), H).step(drawn, 0.0),
     )
 
 
+def _with_components(
+    prior: Prior, solved: Solved, P: csr_array, wanted: _Floats, component: NDArray[np.int64], x: _Floats
+) -> Prior:
+    """The prior with variance components re-estimated by one step of expectation and maximisation."""
+    missing, rng = wanted - P @ x, np.random.default_rng(0)
+    squares, counts = np.zeros((2, len(prior.sigmas)))
+    for k in range(len(prior.sigmas)):
+        rows = component == k
+        counts[k] = rows.sum()
+        if counts[k]:
+            probes = rng.choice([-1.0, 1.0], (int(counts[k]), _PROBES))
+            D = P[np.flatnonzero(rows)]
+            trace = float((probes * (D @ solved.step(D.T @ probes, 0.0))).sum()) / _PROBES
+            squares[k] = float(np.square(missing[rows]).sum()) + trace
+    return replace(prior, sigmas=prior.updated(squares, counts))
+
+
 def _weigh(band: Band, state: BandState, robust: _Floats, own: bool) -> _Weights:
-    """Weights at a state; `own`: whether a reference, or else the images' own mean, holds the ground."""
+    """Weights at a state; `own`: whether a reference holds the ground."""
     shown, slope = band.predicted(state)
     residual = band.grey - shown
     w = band.weight * robust * slope**2
@@ -139,8 +172,11 @@ def _weigh(band: Band, state: BandState, robust: _Floats, own: bool) -> _Weights
     size = residual / np.sqrt(np.maximum(1.0 - w / np.bincount(band.group, w)[band.group], 0.1))
     sigma = max(float(np.median(np.abs(size))) / MEDIAN_1D, _FLOOR * float(np.ptp(band.nodes)))
     robust = cauchy(size / sigma, _HALF)
-    moved, share = _held(band, state, sigma) if own else np.zeros((2, len(state.ground)))
-    return _Weights(of=band.weight * robust / sigma**2, ground=share, moved=moved, robust=robust, sigma=sigma)
+    moved, share = _held(band, state, sigma) if own and band.referred else np.zeros((2, len(state.ground)))
+    # The reference errs together with what is compared to it.
+    share /= _CORRELATED
+    of = band.weight * robust / (_CORRELATED * sigma**2)
+    return _Weights(of=of, ground=share, moved=moved, robust=robust, sigma=sigma)
 
 
 def _normals(band: Band, state: BandState, weights: _Weights) -> _Normals:
@@ -177,11 +213,8 @@ def _normals_of(band: Band, state: BandState, weights: _Weights) -> _Normals:
 
 
 def _held(band: Band, state: BandState, sigma: float) -> tuple[_Floats, _Floats]:
-    """What ground lacks to the reference, or else to what its images show in the mean, and what that weighs."""
+    """What ground lacks to the reference, and what that weighs."""
     share = np.bincount(band.group, band.weight) / np.bincount(band.group)
-    if not band.referred:
-        moved = band.own - state.ground
-        return moved, share / max(_OWN * sigma, _MOVES * float(np.sqrt(np.mean(moved**2)))) ** 2
     moved = band.beside_reference(state)
     known = np.isfinite(moved)
     moved[~known] = 0.0
@@ -202,20 +235,9 @@ def _sums(of: NDArray[np.int64], count: int) -> csr_array:
     return csr_array(parts, shape=(count, len(of)))
 
 
-def _prior(band: Band, state: BandState) -> tuple[csr_array, _Floats]:
-    """What is known of an image beforehand, as equations of weight one, the same for all."""
-    (images, nodes), terms = state.tables.shape, state.trends.shape[1]
-    bend = np.diff(np.eye(nodes), 2, axis=0) / (_BEND * np.ptp(band.nodes))
-    slope = np.diff(np.eye(nodes), axis=0) / (_SLOPE * band.step)
-    one = np.concatenate([bend, slope])
-    wanted = np.r_[np.zeros(nodes - 2), np.full(nodes - 1, 1.0 / _SLOPE), np.zeros(terms)]
-    whole = block_diag([one, np.eye(terms) / _TREND]) if terms else one
-    return csr_array(kron(eye(images), whole)), np.tile(wanted, images)
-
-
 def _gauge(band: Band, state: BandState, gauge: Gauge) -> tuple[_Floats, _Floats]:
     """Conditions H x = held on the unknowns of the images."""
-    (images, nodes), width = state.tables.shape, state.width
+    nodes, width = state.tables.shape[1], state.width
     rows: list[_Floats] = []
     held: list[float] = []
     for part in np.unique(gauge.parts):
@@ -224,35 +246,40 @@ def _gauge(band: Band, state: BandState, gauge: Gauge) -> tuple[_Floats, _Floats
         if band.referred and not len(fixed):
             continue
         used = fixed if len(fixed) else members
-        for k in range(width if len(fixed) else nodes):
-            row = np.zeros((images, width))
-            row[used, k] = 1 / len(used)
-            rows.append(row.ravel())
-            held.append(float(band.nodes[k]) if k < nodes else 0.0)
-    return np.array(rows).reshape(-1, images * width), np.array(held)
+        for k in range(nodes):
+            row = np.zeros(state.vector.size)
+            row[used * width + k] = 1 / len(used)
+            rows.append(row)
+            held.append(float(band.nodes[k]))
+    return np.array(rows).reshape(-1, state.vector.size), np.array(held)
 
 
 def _rising(band: Band, state: BandState, flat: NDArray[np.bool_]) -> tuple[csr_array, _Floats]:
     """Tables that may not fall: their rises as rows, and what these lack."""
-    (images, _), width = state.tables.shape, state.width
+    width = state.width
     image, k = np.nonzero(flat)
     first, n = image * width + k, len(image)
     columns = np.stack([first, first + 1], axis=1).ravel()
-    rows = csr_array((np.tile([-1.0, 1.0], n), columns, np.arange(0, 2 * n + 1, 2)), shape=(n, images * width))
+    rows = csr_array((np.tile([-1.0, 1.0], n), columns, np.arange(0, 2 * n + 1, 2)), shape=(n, state.vector.size))
     return rows, _LEAST_SLOPE * band.step - np.diff(state.tables, axis=1)[image, k]
 
 
 def _without_parts(band: Band, state: BandState, weights: _Weights, solved: Solved, N: csr_array) -> _Floats:
-    """Variances of the unknowns by what they become without a part of the ground (Quenouille 1956, Tukey 1958).
+    """Errors of the unknowns, (n, parts), by what they become without a part of the ground (Tukey 1958).
 
     What lies near each other errs together; so parts are blocks of cells, drawn by lot, where there are enough.
     """
     unit = band.block if band.block.max() + 1 >= _PARTS else band.cell
-    part = np.random.default_rng(0).permutation(int(unit.max()) + 1) % _PARTS
+    units = int(unit.max()) + 1
+    # Of a narrow block the cells may be fewer than parts.
+    count = min(_PARTS, units)
+    part = np.random.default_rng(0).permutation(units) % count
     of, ground = part[unit], np.zeros(len(state.ground), np.int64)
     ground[band.group] = of
-    moved = np.zeros((_PARTS, state.vector.size))
-    for k in range(_PARTS):
+    moved = np.zeros((count, state.vector.size))
+    if count < 2:
+        return moved.T
+    for k in range(count):
         rows = np.flatnonzero(of == k)
         some = replace(weights, of=weights.of[rows], ground=weights.ground * (ground == k))
         one = _normals(band.some(rows), state, some)
@@ -260,10 +287,4 @@ def _without_parts(band: Band, state: BandState, weights: _Weights, solved: Solv
     # What residuals change with the unknowns under robust weights, beside what the weights alone say.
     kept = max(float(np.mean(2 * weights.robust**2 - weights.robust) / np.mean(weights.robust)), 0.2)
     moved /= kept
-    return np.asarray((_PARTS - 1) / _PARTS * ((moved - moved.mean(axis=0)) ** 2).sum(axis=0))
-
-
-def _of_prior(solved: Solved, prior: csr_array) -> _Floats:
-    """Variances of the unknowns by what was known of them beforehand, from errors of it that are drawn by lot."""
-    drawn = np.random.default_rng(0).normal(size=(prior.shape[0], _DRAWS))
-    return np.asarray((solved.step(prior.T @ drawn, 0.0) ** 2).mean(axis=1))
+    return np.asarray(np.sqrt((count - 1) / count) * (moved - moved.mean(axis=0)).T)

@@ -14,8 +14,9 @@ from scipy.sparse.csgraph import connected_components
 from photoplan.radiometry.adjust import AdjustedBand, Gauge, adjust
 from photoplan.radiometry.cells import Cells, neighbours
 from photoplan.radiometry.equations import Band
+from photoplan.radiometry.priors import Basis, Prior, placed
 from photoplan.radiometry.ratio import factors
-from photoplan.radiometry.tone import Tone, powers_of
+from photoplan.radiometry.tone import Tone, powers_of, surface
 
 _Floats = NDArray[np.float64]
 
@@ -27,8 +28,28 @@ _MOST_ROWS = 50_000
 _SHOULDER, _BEYOND = 0.12, 0.0005
 #: Pairs of rows that are compared at once.
 _CHUNK = 50_000
+#: Degree of the polynomial by which a trend is written, and places along both sides of an image from which it is found.
+_FITTED, _ALONG = 6, 33
 #: An image whose grey values differ by less than this part of the range is all of one colour.
 _EVEN = 0.01
+
+
+@dataclass(frozen=True)
+class BlockMode:
+    """A change of brightness over the whole block, parts of the brightness from the block's middle to its edge."""
+
+    name: str
+    value: float
+    """Of the exposures and trends that were found."""
+    sigma: float
+    """Standard deviation of what the balanced images still have of it."""
+    prior: float
+    """Standard deviation before overlaps were compared."""
+
+    @property
+    def held(self) -> bool:
+        """Whether it is the prior that determines it, not the overlaps."""
+        return self.sigma > 0.5 * self.prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +68,8 @@ class Balanced:
     """What each band's adjustment found."""
     contrast: tuple[float, ...]
     """Local contrast of the block after the adjustment, per band, before a common factor made it what it was."""
+    modes: tuple[BlockMode, ...]
+    """What overlaps hardly determine, the largest standard deviation of all bands; none for factors from ratios."""
     shoulder: bool
     """Whether a common shoulder keeps bright and dark grey values inside the range."""
 
@@ -92,6 +115,7 @@ def balanced(
     limits: tuple[float, float],
     *,
     degree: int = 2,
+    cameras: NDArray[np.int64] | None = None,
     fixed: int | None = None,
     factor: bool = False,
     done: Callable[[], None] = lambda: None,
@@ -107,7 +131,10 @@ def balanced(
     limits : (float, float)
         Least and largest grey value of their type.
     degree : int
-        Of the trend over an image; 0: tables alone.
+        Of the trend over an image; 0: tables alone, 1 and more: with the fall-off that all images of a camera have.
+        Trends of degree 2 at least are estimated in any case; otherwise tables would take them for exposures.
+    cameras : ndarray, shape (images,), optional
+        Numbers of the images' cameras; one for all if left out.
     fixed : int, optional
         Number of the image that stays as it is; else the block keeps its mean and its contrast.
     factor : bool
@@ -122,17 +149,34 @@ def balanced(
     place = None if fixed is None else int(np.flatnonzero(images == fixed)[0])
     inner = _thinned(inner)
     nodes, found = np.linspace(*limits, NODES), []
+    modes: tuple[BlockMode, ...] = ()
     if factor:
         ends = np.array(limits)
-        scale = factors(inner, len(images), parts, place)
+        scale = factors(inner, len(images), parts, place, placed(inner, sizes[images], len(images))[1])
         raw = [[Tone(limits, (float(f * ends[0]), float(f * ends[1]))) for f in each] for each in scale]
     else:
-        powers = powers_of(degree)
+        basis = Basis(max(degree, 2))
+        kinds = (
+            np.zeros(len(images), np.int64) if cameras is None else np.unique(cameras[images], return_inverse=True)[1]
+        )
+        turns, middles = placed(inner, sizes[images], len(images))
         for band in range(cells.bands):
-            found.append(adjust(Band.of(inner, band, sizes[images], powers, nodes), Gauge(parts, place)))
+            equations = Band.of(inner, band, sizes[images], basis, nodes)
+            prior = Prior(basis, nodes, _level(equations), kinds.reshape(-1), parts, turns)
+            found.append(adjust(equations, Gauge(parts, place), prior))
             done()
-        raw = [[_tone(nodes, each, k, powers) for each in found] for k in range(len(images))]
+        made = [
+            [_tone(nodes, each, k, degree, (int(size[0]), int(size[1]))) for each in found]
+            for k, size in enumerate(sizes[images])
+        ]
+        raw = [[tone for tone, _ in each] for each in made]
+        modes = _modes(found, middles, sizes[images])
         if place is not None:
+            # It keeps its trend: the others follow its table at the trend's mean.
+            raw = [
+                [_mapped(tone, partial(_linear, 0.0, mean)) for tone, (_, mean) in zip(each, made[place])]
+                for each in raw
+            ]
             raw[place] = [Tone(limits, limits)] * cells.bands
     seen = cells.some(np.isin(cells.image, images))
     kept = _kept(seen, images, sizes, raw)
@@ -155,6 +199,7 @@ def balanced(
         parts=parts,
         bands=tuple(found),
         contrast=contrast,
+        modes=modes,
         shoulder=beyond,
     )
 
@@ -211,12 +256,61 @@ def pairs_of(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.i
     )
 
 
-def _tone(nodes: _Floats, found: AdjustedBand, image: int, powers: Sequence[tuple[int, int]]) -> Tone:
-    """The tone of an image: its table the other way, with equal steps of grey between entries."""
-    table = Tone(tuple(found.state.tables[image].tolist()), tuple(nodes.tolist()))
+def _modes(found: Sequence[AdjustedBand], middles: _Floats, sizes: NDArray[np.int64]) -> tuple[BlockMode, ...]:
+    """Slopes and bends over the block, from the exposures and trends of its images beside the camera's fall-off."""
+    names = ("slope east", "slope north", "bend east", "twist", "bend north")
+    side = np.linspace(-0.5, 0.5, 3)
+    uv = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    every: list[list[BlockMode]] = []
+    for band in found:
+        prior, width, x = band.prior, band.state.width, band.state.vector
+        terms, nodes, images = len(prior.basis.kinds), len(prior.nodes), len(middles)
+        rows = np.zeros((images * len(uv), len(x)))
+        places = np.concatenate([middle + uv @ turn for middle, turn in zip(middles, prior.turns)])
+        for k, size in enumerate(sizes):
+            at = slice(k * len(uv), (k + 1) * len(uv))
+            half = np.hypot(*size) / 2
+            x_, y_ = (uv * half + (size - 1) / 2).T
+            shapes = prior.basis.at(x_, y_, (int(size[0]), int(size[1])))
+            camera = images * width + prior.cameras[k] * terms
+            rows[at, k * width : k * width + nodes] = prior.level
+            rows[at, k * width + nodes : (k + 1) * width] = shapes
+            rows[at, camera : camera + terms] = -shapes
+        X, Y = ((places - places.mean(axis=0)) / np.maximum(np.ptp(places, axis=0) / 2, 1e-9)).T
+        M = np.linalg.pinv(np.stack([np.ones_like(X), X, Y, X**2, X * Y, Y**2], axis=1), rcond=1e-6)[1:] @ rows
+        start = np.tile(np.r_[prior.nodes, np.zeros(terms)], images)
+        value = M[:, : len(start)] @ (x[: len(start)] - start)
+        sigma, before = (np.sqrt(np.square(M @ each).sum(axis=1)) for each in (band.errors, band.prior_errors))
+        every.append([BlockMode(*each) for each in zip(names, value.tolist(), sigma.tolist(), before.tolist())])
+    return tuple(max(same, key=lambda mode: mode.sigma) for same in zip(*every))
+
+
+def _level(band: Band) -> _Floats:
+    """Weights over a table's nodes by which its departure from identity is an exposure, a part of the brightness."""
+    own = band.own
+    k = np.clip(np.searchsorted(band.nodes, own) - 1, 0, len(band.nodes) - 2)
+    part = (own - band.nodes[k]) / band.step
+    weight = np.bincount(k, 1 - part, len(band.nodes)) + np.bincount(k + 1, part, len(band.nodes))
+    return np.asarray(weight / max(float(weight @ np.abs(band.nodes)), 1e-12))
+
+
+def _tone(nodes: _Floats, found: AdjustedBand, image: int, degree: int, size: tuple[int, int]) -> tuple[Tone, float]:
+    """The tone of an image: its table the other way, with equal steps of grey between entries; and its trend's mean."""
+    prior, basis, own = found.prior, found.prior.basis, found.state.trends[image]
+    x, y = (each.ravel() for each in np.meshgrid(*((np.arange(_ALONG) + 0.5) * side / _ALONG - 0.5 for side in size)))
+    surfaces = basis.at(x, y, size)
+    mean = float(np.exp(surfaces @ own).mean())
+    terms: tuple[tuple[int, int, float], ...] = ()
+    if degree:
+        # Terms above the degree are those of the camera alone.
+        shared = found.state.common[prior.cameras[image] * len(basis.kinds) :][: len(basis.kinds)]
+        trend = np.exp(surfaces @ np.where(np.abs(basis.kinds) > degree, shared, own))
+        powers = powers_of(_FITTED)
+        fit = np.linalg.lstsq(surface(x, y, size, powers), trend / trend.mean() - 1, rcond=None)[0]
+        terms = tuple((i, j, float(c)) for (i, j), c in zip(powers, fit))
+    table = Tone(tuple((found.state.tables[image] * mean).tolist()), tuple(nodes.tolist()))
     grey = np.linspace(nodes[0], nodes[-1], ENTRIES)
-    terms = tuple((i, j, float(c)) for (i, j), c in zip(powers, found.state.trends[image]))
-    return Tone(tuple(grey.tolist()), tuple(table.table(grey).tolist()), terms)
+    return Tone(tuple(grey.tolist()), tuple(table.table(grey).tolist()), terms), mean
 
 
 def _entered(tone: Tone) -> Tone:

@@ -1,7 +1,8 @@
 """Equations of one band: the same ground has its grey value in every image, quantile by quantile.
 
 An image shows ground of grey value G as grey = F(G) · v. F is a table, the image's own; v, near 1, changes slowly over
-the image: vignetting, haze, the angles of sun and view. A quantile of an image in a cell is an observation of that;
+the image: fall-off, haze, the angles of sun and view. Its logarithm is a polynomial, so that the product of two such
+causes is one again. A quantile of an image in a cell is an observation of that;
 all images of a cell have the G of their quantiles in common, which is an unknown as well, and is taken out of the
 equations before they are solved. Errors are those of the grey values that images have: if tables were asked to make
 images equal, they would do so by taking their contrast away.
@@ -16,9 +17,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from photoplan.radiometry.cells import Cells
-from photoplan.radiometry.tone import LEAST, surface
+from photoplan.radiometry.priors import Basis
 
 _Floats = NDArray[np.float64]
+
+#: Largest logarithm of a trend while it is being found.
+_MOST = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +32,11 @@ class BandState:
     tables: _Floats
     """(images, nodes): F at the nodes."""
     trends: _Floats
-    """(images, terms): coefficients of v."""
+    """(images, terms): coefficients of the logarithm of v."""
     ground: _Floats
     """(groups,): G of what the images of a cell have in common."""
+    common: _Floats
+    """(k,): hyperparameters of the prior, which no observation contains; see `photoplan.radiometry.priors`."""
 
     @property
     def width(self) -> int:
@@ -39,14 +45,14 @@ class BandState:
 
     @property
     def vector(self) -> _Floats:
-        """Those of all images, (images · width,)."""
-        return np.concatenate([self.tables, self.trends], axis=1).ravel()
+        """Unknowns of all images, then the common ones, (images · width + k,)."""
+        return np.concatenate([np.concatenate([self.tables, self.trends], axis=1).ravel(), self.common])
 
     def with_vector(self, vector: _Floats) -> BandState:
         """The same ground with other images."""
-        each = vector.reshape(len(self.tables), self.width)
-        nodes = self.tables.shape[1]
-        return replace(self, tables=each[:, :nodes], trends=each[:, nodes:])
+        count, nodes = self.tables.size + self.trends.size, self.tables.shape[1]
+        each = vector[:count].reshape(len(self.tables), self.width)
+        return replace(self, tables=each[:, :nodes], trends=each[:, nodes:], common=vector[count:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,23 +72,21 @@ class Band:
     weight: _Floats
     """(n,): quantiles of a cell together count as two observations, a part of a cell less."""
     surfaces: _Floats
-    """(n, terms)."""
+    """(n, terms): the trend's basis, see `photoplan.radiometry.priors.Basis`."""
     nodes: _Floats
     """Grey values G of the tables, at equal steps."""
     reference: _Floats
     """Mean G of each group's cell as a reference has it, (groups,); NaN where there is none."""
 
     @classmethod
-    def of(
-        cls, cells: Cells, band: int, sizes: NDArray[np.int64], powers: tuple[tuple[int, int], ...], nodes: _Floats
-    ) -> Band:
+    def of(cls, cells: Cells, band: int, sizes: NDArray[np.int64], basis: Basis, nodes: _Floats) -> Band:
         """Observations of shared cells; `sizes` (images, 2): width and height."""
         many = cells.levels.shape[2]
         _, first, cell = np.unique(cells.cell, return_index=True, return_inverse=True)
-        surfaces = np.zeros((len(cells), len(powers)))
+        surfaces = np.zeros((len(cells), len(basis.kinds)))
         for size in np.unique(sizes, axis=0):
             rows = (sizes[cells.image] == size).all(axis=1)
-            surfaces[rows] = surface(cells.uv[rows, 0, 0], cells.uv[rows, 0, 1], (int(size[0]), int(size[1])), powers)
+            surfaces[rows] = basis.at(cells.uv[rows, 0, 0], cells.uv[rows, 0, 1], (int(size[0]), int(size[1])))
         return cls(
             image=np.repeat(cells.image, many),
             group=(cell[:, None] * many + np.arange(many)).ravel(),
@@ -122,9 +126,10 @@ class Band:
         """Mean grey value of the images of each group, (groups,)."""
         return np.asarray(np.bincount(self.group, self.grey) / np.bincount(self.group))
 
-    def start(self, images: int) -> BandState:
+    def start(self, images: int, common: int) -> BandState:
         """All images show what they have in the mean."""
-        return BandState(np.tile(self.nodes, (images, 1)), np.zeros((images, self.surfaces.shape[1])), self.own)
+        trends = np.zeros((images, self.surfaces.shape[1]))
+        return BandState(np.tile(self.nodes, (images, 1)), trends, self.own, np.zeros(common))
 
     def predicted(self, state: BandState) -> tuple[_Floats, _Floats]:
         """What the images show (n,), and its derivatives by G (n,)."""
@@ -134,7 +139,7 @@ class Band:
 
     def _at(self, state: BandState) -> tuple[_Floats, NDArray[np.int64], _Floats]:
         """Trends, and where tables are asked: number of the node before, and part of the way to the next."""
-        v = np.maximum(1.0 + (self.surfaces * state.trends[self.image]).sum(axis=1), LEAST)
+        v = np.exp(np.clip((self.surfaces * state.trends[self.image]).sum(axis=1), -_MOST, _MOST))
         at = (state.ground[self.group] - self.nodes[0]) / self.step
         k = np.clip(np.floor(at), 0, len(self.nodes) - 2).astype(np.int64)
         return v, k, at - k
@@ -144,10 +149,10 @@ class Band:
         v, k, part = self._at(state)
         low, high = state.tables[self.image, k], state.tables[self.image, k + 1]
         table = low + part * (high - low)
-        values = np.column_stack([(1 - part) * v, part * v, table[:, None] * self.surfaces])
+        values = np.column_stack([(1 - part) * v, part * v, (table * v)[:, None] * self.surfaces])
         first = self.image * state.width
         terms = len(self.nodes) + np.arange(self.surfaces.shape[1])
         columns = np.column_stack([first + k, first + k + 1, first[:, None] + terms]).astype(np.int32)
         starts = np.arange(0, values.size + 1, values.shape[1], dtype=np.int32)
-        shape = len(self.grey), len(state.tables) * state.width
+        shape = len(self.grey), state.vector.size
         return csr_array((values.ravel(), columns.ravel(), starts), shape=shape)

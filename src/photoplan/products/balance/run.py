@@ -115,6 +115,10 @@ class BalanceReport:
             "rms_after": after,
             "contrast": found.contrast,
             "shoulder": found.shoulder,
+            "block_modes": {
+                mode.name: {"value": mode.value, "sigma": mode.sigma, "prior_sigma": mode.prior, "held": mode.held}
+                for mode in found.modes
+            },
             "sigma": [each.sigma for each in found.bands],
             "weighted_down": [each.down for each in found.bands],
             "files": {self.named(int(k)): path for k, path in zip(found.images, self.files)},
@@ -193,7 +197,14 @@ def _adjusted(
     _refuse_useless(usable, found, number, notes)
     events.begin("adjusting", cells.bands, "bands")
     made = balanced(
-        usable, found.sizes, limits, degree=request.degree, fixed=number, factor=request.factor, done=events.done
+        usable,
+        found.sizes,
+        limits,
+        degree=request.degree,
+        cameras=found.cameras,
+        fixed=number,
+        factor=request.factor,
+        done=events.done,
     )
     _note(made, found, even, notes)
     tones = dict(zip(made.images.tolist(), made.tones))

@@ -46,6 +46,8 @@ class Survey:
     """A line for each image that sees none."""
     grid: MapGrid
     tiles: Tiles
+    cameras: NDArray[np.int64]
+    """Numbers of the images' cameras, (n,): images of one camera have one fall-off."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -96,7 +98,10 @@ def survey(project: Project, names: Sequence[str], resolution: float | None, eve
     for one in looked:
         surface = painted_surface(one.scene.surface)
         taken.append(covered_tiles(one.scene.camera, surface, grid, _CELLS * SIDE, one.look.footprint.bounds))
-    return Survey(tuple(looked), tuple(blind), grid, Tiles.shared(taken))
+    # Images without a camera of the project, scenes of satellites for instance, are each their own.
+    cameras = [getattr(project.any_image(one.name), "camera", None) or f"\n{one.name}" for one in looked]
+    numbers = np.unique(cameras, return_inverse=True)[1].reshape(-1)
+    return Survey(tuple(looked), tuple(blind), grid, Tiles.shared(taken), numbers)
 
 
 def sample(found: Survey, reference: Reference | None, workers: int, executor: str, events: Events, at: Path) -> Cells:
