@@ -72,10 +72,15 @@ def test_of_a_project(photoplan: Here, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     block = write_block(tmp_path)
     said = photoplan("budget", block.project)
-    assert said.code == 3 and "[terrain]" in said.err and "sigma" in said.err
+    # Nothing is stated: the total is that of making the product, and notes say what is missing and what it costs.
+    assert said.code == 0 and "the total holds only what is stated" in said.err
+    assert "terrain: not stated; 0.1 m of height cost" in said.err and "--sigma-terrain" in said.err
+    assert "orientation: not stated of 3 images" in said.err and "--sigma-center" in said.err
+    bare = json.loads(photoplan("budget", block.project, "--json").out)
+    assert set(bare["images"][0]["contributions_m"]) == {"resampling", "anchors"}
     edit(block.project, "[terrain]", "[terrain]\nsigma = 0.6")
     said = photoplan("budget", block.project)
-    assert said.code == 3 and "'one'" in said.err and "sigma_center" in said.err
+    assert said.code == 0 and "orientation: not stated" in said.err and "terrain: not" not in said.err
     picture = tmp_path / "budget.png"
     stated = ("--sigma-center", 0.1, 0.1, 0.1, "--sigma-angles", 0.01, 0.01, 0.01)
     said = photoplan("budget", block.project, *stated, "--picture", picture)

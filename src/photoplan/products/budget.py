@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from photoplan.kernels.weights import KERNELS
 from photoplan.plan.accuracy import SourceErrors, figures_at, in_image, resampling_sigma
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import Ground, ground_of
-from photoplan.project.uncertain import height_errors, source_errors
+from photoplan.project.uncertain import height_errors, known_height_errors, source_errors
 from photoplan.surfaces.height_errors import HeightErrors, StatedHeightErrors
 from photoplan.targets.map import MapTarget
 
@@ -28,6 +29,9 @@ Triple = tuple[float, float, float]
 PLACES = ("middle", "edge", "corner")
 #: What is not an error of the project, but of making the product.
 TERRAIN, RESAMPLING, ANCHORS = "terrain", "resampling", "anchors"
+ORIENTATION, _USUAL = "orientation", "usual"
+#: Errors whose cost is reported where nothing is stated: of heights and centres, metres, and of angles, in their unit.
+_USUAL_HEIGHT, _USUAL_CENTER, _USUAL_ANGLE = 0.1, 0.1, 0.01
 #: A vertical image that is stated by numbers lies here; the system does not matter.
 _CRS, _STATION = "EPSG:32633", (500_000.0, 5_000_000.0)
 #: Sides of the map of an image.
@@ -154,26 +158,80 @@ def _table(image: ImageBudget) -> list[str]:
 def make_budget(request: BudgetRequest) -> Budget:
     """Error budget of every image of a project, or of a vertical image that numbers state.
 
+    What a project does not state counts as free of error. Notes say so, how to state it, and what
+    a usual error costs.
+
     Raises
     ------
     InputError
-        Nothing is known of an error that counts: the message says how to state it.
+        Nothing is known of the errors of an image that is no central photograph.
     GeometryError
         An image does not look down on its ground.
     """
     project = _of_numbers(request) if request.project is None else load_project(request.project)
     project, notes = _stated(project, request)
-    ground = ground_of(project)
-    heights = height_errors(project)
     names, left_out = project.oriented(project.select(request.images))
     notes += [f"left out: {line}" for line in left_out]
-    if heights == StatedHeightErrors(0.0):
+    project, unknown = _completed(project, names)
+    ground = ground_of(project)
+    heights = height_errors(project)
+    if heights == StatedHeightErrors(0.0) and TERRAIN not in unknown:
         notes.append("the terrain counts as free of error")
     budgets = tuple(_of_image(project, name, ground, heights, request) for name in names)
     posed = [image for image in map(project.any_image, names) if isinstance(image, Image)]
     if any(image.correlation is None for image in posed):
         notes.append("position and angles count as independent: no correlation is stated")
-    return Budget(budgets, tuple(notes))
+    found = Budget(budgets, tuple(notes))
+    if not unknown:
+        return found
+    usual = _of_image(unknown[_USUAL], found.typical.image, ground, StatedHeightErrors(_USUAL_HEIGHT), request)
+    return replace(found, notes=(*_of_unknown(unknown, usual, project), *notes))
+
+
+def _completed(project: Project, names: Sequence[str]) -> tuple[Project, dict[str, Any]]:
+    """The project with zeros for what it does not state; which that is, and the project with usual errors instead."""
+    unknown: dict[str, Any] = {}
+    usual = project
+    if known_height_errors(project) is None:
+        unknown[TERRAIN] = True
+        project = project.model_copy(update={"terrain": project.ground.model_copy(update={"sigma": 0.0})})
+    lacking = {
+        image.name
+        for image in map(project.any_image, names)
+        if isinstance(image, Image) and (image.sigma_center is None or image.sigma_angles is None)
+    }
+    if lacking:
+        unknown[ORIENTATION] = len(lacking)
+
+        def with_sigmas(of: Project, center: float, angle: float) -> Project:
+            sigmas = {"sigma_center": (center,) * 3, "sigma_angles": (angle,) * 3, "correlation": None}
+            images = [i.model_copy(update=sigmas) if i.name in lacking else i for i in of.images]
+            return of.model_copy(update={"images": tuple(images)})
+
+        usual = with_sigmas(usual, _USUAL_CENTER, _USUAL_ANGLE)
+        project = with_sigmas(project, 0.0, 0.0)
+    return project, {**unknown, _USUAL: usual} if unknown else {}
+
+
+def _of_unknown(unknown: dict[str, Any], usual: ImageBudget, project: Project) -> list[str]:
+    """Notes on what is not stated: that it is not in the total, what a usual error costs, and how to state it."""
+    notes = ["the total holds only what is stated"]
+    middle, _, corner = usual.parts.get(TERRAIN, np.zeros(3))
+    if TERRAIN in unknown:
+        notes.append(
+            f"terrain: not stated; {_USUAL_HEIGHT:g} m of height cost {middle:.3f} m in the middle, {corner:.3f} m in "
+            "the corner. Give `sigma_terrain` METRES, or state sigma in [terrain]"
+        )
+    if ORIENTATION in unknown:
+        parts = [v for name, v in usual.parts.items() if name not in (TERRAIN, RESAMPLING, ANCHORS)]
+        middle, _, corner = np.sqrt(np.square(parts).sum(axis=0))
+        unit = project.orientation.angle_unit
+        notes.append(
+            f"orientation: not stated of {unknown[ORIENTATION]} images; {_USUAL_CENTER:g} m of position and "
+            f"{_USUAL_ANGLE:g} {unit} of angles cost {middle:.3f} m in the middle, {corner:.3f} m in the corner. Give "
+            "`sigma_center` X Y Z and `sigma_angles` A B C; `photoplan adjust` and `resect` write them into the images"
+        )
+    return notes
 
 
 def _of_numbers(request: BudgetRequest) -> Project:
