@@ -51,6 +51,10 @@ class Events(Protocol):
         """So many more parts of the phase are done, which took no time: an earlier run had made them."""
         ...
 
+    def more(self, units: int) -> None:
+        """Add parts to the total of the phase: they were not known when it began."""
+        ...
+
     def talk(self, text: str) -> None:
         """Tell a sentence that a user may want to read while it goes on."""
         ...
@@ -70,6 +74,9 @@ class Silent:
         """Nothing."""
 
     def kept(self, units: int) -> None:
+        """Nothing."""
+
+    def more(self, units: int) -> None:
         """Nothing."""
 
     def talk(self, text: str) -> None:

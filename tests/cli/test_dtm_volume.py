@@ -10,6 +10,9 @@ import pytest
 import rasterio
 import shapely
 from tools.dem_file import write_dem, write_geojson
+from tools.events import Told
+
+from photoplan.products.dtm.volume import VolumeRequest, dtm_volume
 
 
 @pytest.fixture
@@ -50,6 +53,16 @@ def test_whole_overlap_with_holes_and_the_raster_of_differences(models, tmp_path
     row = json.loads(said.out)["volumes"][0]
     assert row["area_without_model"] == pytest.approx(5.5 * 51, rel=0.01)
     assert row["sigma_net"] is None
+
+
+def test_halvings_of_the_cells_add_to_the_total_of_the_counter(tmp_path):
+    """A difference that cells do not resolve is halved many times: `3180/120 windows` was printed."""
+    before = write_dem(tmp_path / "before.tif", lambda x, y: 100.0 + 0 * x, (61, 51))
+    after = write_dem(tmp_path / "after.tif", lambda x, y: 100 + np.sin(9.0 * x) * np.cos(7.0 * y), (61, 51))
+    told = Told()
+    dtm_volume(VolumeRequest(before, after, tolerance=1e-5, height_system="same", sigma_a=0.1, sigma_b=0.1), told)
+    assert told.phases[0] == ("volumes", 0, "windows")
+    assert told.units["volumes"] == told.added["volumes"] > 5
 
 
 def test_wrong_use_is_refused_before_work(models, tmp_path, photoplan):

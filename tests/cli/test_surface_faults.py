@@ -128,6 +128,30 @@ def test_a_start_above_the_images_is_refused_and_one_far_from_the_terrain_told(p
     assert "cannot be right" not in surface(project, "--start", 170, "--reach", 80, "--dry-run").out
 
 
+def test_a_start_is_compared_with_the_terrain_inside_the_bounds(project: Path, tmp_path: Path) -> None:
+    """Outside of them the terrain falls to 40 m: a start of 45 m is in its range, yet 40 to 60 m below what is here."""
+    y, x = np.mgrid[300:-301:-5, -300:301:5].astype(float)
+    dem = np.where(np.hypot(x, y) > 60, 40.0, 100 + x / 4)
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", driver="GTiff", width=dem.shape[1], height=dem.shape[0], count=1, dtype="float32",
+        crs=CRS, transform=rasterio.Affine(5.0, 0, X0 - 302.5, 0, -5.0, Y0 + 302.5),
+    ) as out:  # fmt: skip
+        out.write(dem.astype(np.float32), 1)
+    project.write_text(project.read_text().replace("height = 100.0", f'file = "{tmp_path / "dem.tif"}"'))
+    said = surface(project, "--start", 45, "--dry-run")
+    assert said.code == 0 and "(--start) lies 55.1 m below the project's terrain: farther than the reach" in said.out
+    assert "cannot be right" not in surface(project, "--start", 90, "--dry-run").out
+    # A file that is right in one half alone.
+    dem += np.where(x > 0, 50.0, 0.0)
+    with rasterio.open(tmp_path / "dem.tif") as file:
+        profile = file.profile
+    with rasterio.open(tmp_path / "half.tif", "w", **profile) as out:
+        out.write(dem.astype(np.float32), 1)
+    said = surface(project, "--start", tmp_path / "half.tif", "--dry-run", "--json")
+    assert 0.4 < json.loads(said.out)["start_gap_share"] < 0.6
+    assert "% of the places inside the bounds" in surface(project, "--start", tmp_path / "half.tif", "--dry-run").out
+
+
 def test_images_without_overlap_are_told(project: Path) -> None:
     said = surface(project, "--bounds", X0 + 4000, Y0, X0 + 4010, Y0 + 10)
     assert said.code == 3 and "no two images see anything there; together they see" in said.err

@@ -54,6 +54,21 @@ def test_parts_of_tiles_under_way_count_and_are_told() -> None:
         assert events.line(clock.now) == "tiles: 2/2 tiles for 0:01:00"
 
 
+def test_a_counter_never_passes_its_total_and_ends_at_it() -> None:
+    """Parts that were not known at the beginning add to the total; a total that was too small follows the counter."""
+    clock = Clock()
+    with Telling(False, terminal=False, clock=clock) as events:
+        events.begin("volumes", 0, "windows")
+        for known in (4, 16):
+            events.more(known)
+            events.done(known)
+        clock.now += 60
+        assert events.line(clock.now) == "volumes: 20/20 windows for 0:01:00"
+        events.begin("tiles", 2)
+        events.done(3)
+        assert events.line(clock.now).startswith("tiles: 3/3 tiles")
+
+
 def test_what_an_earlier_run_has_done_tells_nothing_of_the_pace() -> None:
     clock = Clock()
     with Telling(False, terminal=False, clock=clock) as events:

@@ -337,11 +337,11 @@ def test_the_median_of_tiles_is_counted_in_classes() -> None:
     assert median(counted(np.full((2, 2), np.nan))) is None
 
 
-def planned(base: int = 0, search: object = None, name: str = "surface", apart_text: str = "") -> Any:
+def planned(base: int = 0, search: object = None, name: str = "surface", gap_text: str = "") -> Any:
     """Of a plan what its findings look at."""
     scheme = SimpleNamespace(base=base, search=search, reach=20.0)
     settings, parts = SimpleNamespace(name=name), {"beside": 0.0}
-    return SimpleNamespace(scheme=scheme, settings=settings, height_error=0.1, apart_text=apart_text, parts=parts)
+    return SimpleNamespace(scheme=scheme, settings=settings, height_error=0.1, gap_text=gap_text, parts=parts)
 
 
 def test_pixels_of_reduced_images_are_those_that_count() -> None:
@@ -385,7 +385,7 @@ def test_heights_that_know_hardly_more_than_the_reach_are_told() -> None:
     told = ["".join(findings(planned(), {"a": 1.0}, 80.0, s, misfit, 0.01, 0.0)) for s, misfit in cases]
     assert ["25% of the reach: images agree on no height" in lines for lines in told] == [True, True, False]
     assert ["follows its surroundings" in lines for lines in told] == [False, False, True]
-    assert findings(planned(apart_text="it lies apart"), {"a": 1.0}, 80.0, 0.1, 0.0, 0.01, 0.0) == ("it lies apart",)
+    assert findings(planned(gap_text="it lies apart"), {"a": 1.0}, 80.0, 0.1, 0.0, 0.01, 0.0) == ("it lies apart",)
 
 
 def test_labels_of_a_report_keep_apart(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ from pathlib import Path
 project, (x, y, z) = load_project("project.toml"), map(float, sys.argv[1:])
 plan = plan_surface(project, SurfaceSettings(3.0, bounds=(x - 9, y - 9, x + 9, y + 9), start=str(z + 1), reach=8.0))
 with rasterio.open(make_surface(plan, "map").path) as file:
-    print(numpy.nanmean(file.read(1)), plan.apart)
+    print(numpy.nanmean(file.read(1)), plan.gap.median)
 wall = SurfaceSettings(
     3.0, target=f"wall:{x},{y},{z},180,90", bounds=(-9, -9, 9, 9), reach=8.0, points=(Path("wall.ply"),)
 )
@@ -42,7 +42,7 @@ print(Path("at.csv").read_text().splitlines()[1].split(",")[4], found.height_sys
 project = load_project("ellipsoidal.toml")
 plan = plan_surface(project, SurfaceSettings(3.0, bounds=(x - 9, y - 9, x + 9, y + 9), start="start.tif", reach=8.0))
 start = _start(plan.address, "start.tif", plan.begun, project.crs)
-print(start(numpy.array([[[x, y]]]))[0, 0], plan.apart)
+print(start(numpy.array([[[x, y]]]))[0, 0], plan.gap.median)
 """
 
 

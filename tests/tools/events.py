@@ -13,6 +13,8 @@ class Told:
         self.phases: list[tuple[str, int, str]] = []
         self.units: Counter[str] = Counter()
         """Units done, by phase."""
+        self.added: Counter[str] = Counter()
+        """Units added to the total of a phase after it began."""
         self.begun: list[tuple[float, str]] = []
         """What parts under way added up to, and what was done there, whenever that was told."""
         self.pixels = 0
@@ -30,6 +32,9 @@ class Told:
 
     def kept(self, units: int) -> None:
         self.units[self.phases[-1][0]] += units
+
+    def more(self, units: int) -> None:
+        self.added[self.phases[-1][0]] += units
 
     def talk(self, text: str) -> None:
         self.talked.append(text)

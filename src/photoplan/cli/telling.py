@@ -65,9 +65,15 @@ class Telling:
         self._kept += units
         self.done(units)
 
+    def more(self, units: int) -> None:
+        """Add parts to the total of the phase."""
+        self._units += units
+
     def done(self, units: int = 1, pixels: int = 0, begun: float = 0.0, what: str = "") -> None:
         """Count what is done; tell it if that is due."""
         self._finished += units
+        if self._units:  # a total that was too small is no total: the counter never passes it
+            self._units = max(self._units, self._finished)
         self._pixels += pixels
         self._begun, self._what = begun, what
         now = self._clock()

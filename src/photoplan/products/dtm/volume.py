@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -126,28 +126,28 @@ def dtm_volume(request: VolumeRequest, events: Events = SILENT) -> VolumeReport:
     log = None
     if request.difference is not None:
         log = ResultLog.beside(request.difference, f"{options.key} {settings}", locked=False)
-    events.begin("volumes", _windows(items, cell) + len(items) * (errors is not None), "windows")
+    events.begin("volumes", 0, "windows")
     rows = []
     # One window at once: a prepared polygon makes its index when it is first asked, whoever else asks it meanwhile.
     with log or nullcontext(), steps("volumes", 1, events, log) as run:
+
+        def counted(function: Callable[[Any], Any], windows: Iterable[Any]) -> Iterator[Any]:
+            # How often cells are halved is not known beforehand: each round adds its windows to the total.
+            every = list(windows)
+            events.more(len(every))
+            return run(function, every)
+
         for item in items:
-            volume, sigma = volume_between(a.surface, b.surface, item.geometry, settings, run), None
+            volume, sigma = volume_between(a.surface, b.surface, item.geometry, settings, counted), None
             if errors is not None:
                 of_errors = partial(volume_sigma, a.surface, b.surface, errors, cell=cell, bias=request.bias)
-                (sigma,) = run(of_errors, [item.geometry])
+                (sigma,) = counted(of_errors, [item.geometry])
             rows.append(VolumeRow(item.name, volume, sigma))
     notes += [note for row in rows for note in _notes(row)]
     if log is not None and request.difference is not None:
         _write_difference(request.difference, (a, b), items, cell, options)
         log.remove()
     return VolumeReport(tuple(rows), system, tuple(notes), request.difference)
-
-
-def _windows(items: tuple[Feature, ...], cell: float) -> int:
-    """Windows of the first two rounds of the integration."""
-    sides = np.array([item.geometry.bounds for item in items])
-    counts = [np.ceil((sides[:, 2:] - sides[:, :2]) / (side * TILE)) + 1 for side in (cell, cell / 2)]
-    return int(sum(np.maximum(n - 1, 1).prod(axis=1).sum() for n in counts))
 
 
 def _notes(row: VolumeRow) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,26 +14,24 @@ from photoplan.products.surface.target import SeenTarget
 from photoplan.project.ground import Ground
 from photoplan.project.open_terrain import open_terrain
 
+#: Places along a side of the bounds at which a start is compared with the project's terrain.
+_PLACES = 33
 
-def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarget], ground: Ground) -> float:
-    """By how much a start lies above (below: negative) the terrain that the images were looked up on.
 
-    Parameters
-    ----------
-    start : str
-        See `SurfaceSettings.start`.
-    bounds : tuple
-        Of the surface.
-    crs : str
-        Of the project.
-    looked : sequence of SeenTarget
-    ground : Ground
-        Of the project: what height system the images are in.
+@dataclass(frozen=True)
+class StartGap:
+    """Heights of a start less those of the project's terrain inside the bounds of a surface."""
 
-    Returns
-    -------
-    float
-        Metres between the ranges of their heights; 0 where these meet, and of the project's terrain itself.
+    median: float = 0.0
+    """Of all places where both have a height, metres; 0 if there is none, or the start is the terrain."""
+    share: float = 0.0
+    """Part of these places at which they differ by more than the reach, 0 to 1."""
+
+
+def start_gap(
+    start: str, reach: float, bounds: Bounds, crs: str, looked: Sequence[SeenTarget], ground: Ground
+) -> StartGap:
+    """Compare a start with the project's terrain, place by place inside the bounds.
 
     Raises
     ------
@@ -42,26 +41,30 @@ def start_apart(start: str, bounds: Bounds, crs: str, looked: Sequence[SeenTarge
         Its file cannot be used.
     """
     if start == "terrain":
-        return 0.0
+        return StartGap()
+    x0, y0, x1, y1 = bounds
+    part = (np.arange(_PLACES) + 0.5) / _PLACES
+    XY = np.stack(np.meshgrid(x0 + part * (x1 - x0), y0 + part * (y1 - y0)), axis=-1)
     height, stated = number(start), None
     if height is None:
         opened = open_terrain(Path(start)).in_crs(crs)[0]
-        stated = opened.height_system
-        low, high = (float(h) for h in opened.surface.height_range(np.array(bounds)))
-        if not np.isfinite([low, high]).all():
-            return 0.0  # no heights there: told of the surface, which has none either
+        stated, begun = opened.height_system, np.asarray(opened.surface.heights(XY), float)
     else:
-        low = high = height
-    x0, y0, x1, y1 = bounds
-    inward = ground.into_working(crs, stated)
-    shift = float(inward([(x0 + x1) / 2, (y0 + y1) / 2, 0.0]))
+        begun = np.full(XY.shape[:-1], height)
+    if not np.isfinite(begun).any():
+        return StartGap()  # the run reports that the start has no height there
+    lifted = ground.into_working(crs, stated).where_defined(np.concatenate([XY, begun[..., None]], axis=-1))
+    shift = float(np.nanmedian(lifted - begun))
     ceilings = sorted(((float(one.camera.vantage.point[2]) - shift, one.name) for one in looked), reverse=True)
+    low = float(np.nanmin(begun))
     if sum(ceiling > low for ceiling, _ in ceilings) < 2:
         (first, name), (last, other) = ceilings[0], ceilings[-1]
         raise UsageError(
             f"start {start}: {low:.6g} m is above the images, which look down from {last:.6g} m ({other}) to "
             f"{first:.6g} m ({name})"
         )
-    lowest = min(one.heights[0] for one in looked) - shift
-    highest = max(one.heights[1] for one in looked) - shift
-    return max(0.0, low - highest) - max(0.0, lowest - high)
+    gaps = lifted - np.asarray(ground.bare.heights(XY), float)
+    gaps = gaps[np.isfinite(gaps)]
+    if not gaps.size:
+        return StartGap()
+    return StartGap(float(np.median(gaps)), float((np.abs(gaps) > reach).mean()))

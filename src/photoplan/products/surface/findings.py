@@ -43,7 +43,7 @@ def findings(
         none since it went too far from the start.
     """
     return (
-        *filter(None, [plan.apart_text]),
+        *filter(None, [plan.gap_text]),
         *_of_images(plan, sigma0, contrast),
         *_of_fits(plan, misfit_share, astray),
         *_of_moves(plan, correction, sigma_px),

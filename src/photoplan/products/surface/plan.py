@@ -20,7 +20,7 @@ from photoplan.io.run_record import run_key
 from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.plain import advised, pick
 from photoplan.products.orthophoto.look import extent_text
-from photoplan.products.surface.begin import start_apart
+from photoplan.products.surface.begin import StartGap, start_gap
 from photoplan.products.surface.scheme import finer_levels, pixels_of_places, scheme_of
 from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start
 from photoplan.products.surface.target import SeenTarget, over_frame, over_map
@@ -32,6 +32,8 @@ from photoplan.project.target_frame import target_frame
 _FINEST = 1.0
 #: Part of stated bounds that two images see, below which it is told: there are no heights elsewhere.
 _MOSTLY = 0.5
+#: Part of the places at which a start may lie farther from the terrain than its reach before the plan reports it.
+_BESIDE = 0.02
 HARDLY = 0.01
 """Part of the bounds up to which an image sees so little that its figures tell nothing."""
 
@@ -59,8 +61,8 @@ class SurfacePlan:
     """Median ground sampling distance of the images, metres."""
     height_error: float
     """What one pixel of parallax between the outermost images is in height, metres."""
-    apart: float
-    """By how much a start that is not the project's terrain lies above that (below: negative), metres; 0: they meet."""
+    gap: StartGap
+    """Heights of a start that is not the project's terrain less those of the terrain."""
     seen_share: float
     """Part of the bounds that lies inside those of what two images see, 0 to 1."""
     parts: dict[str, float]
@@ -109,19 +111,22 @@ class SurfacePlan:
             f"  {s.coarsest + 1} level{'s' * (s.coarsest > 0)}, the coarsest with heights of "
             f"{g.resolution * 2**s.coarsest:g} m; start: {self.settings.start}{self._searched}",
             *([f"  two images see {self.seen_share:.2%} of these bounds at most"] if self.seen_share < _MOSTLY else []),
-            *([f"  {self.apart_text}"] if self.apart_text else []),
+            *([f"  {self.gap_text}"] if self.gap_text else []),
             *([] if self.frame is None else [f"  target {self.settings.target}{far}: u, v, h instead of X, Y, Z"]),
         ])  # fmt: skip
 
     @property
-    def apart_text(self) -> str:
-        """What there is to say of a start that lies farther from the project's terrain than its reach; else empty."""
-        if abs(self.apart) <= self.scheme.reach:
+    def gap_text(self) -> str:
+        """Sentence about a start that lies farther from the project's terrain than its reach; empty if it does not."""
+        if self.gap.share <= _BESIDE:
             return ""
-        side = "above" if self.apart > 0 else "below"
+        side = "above" if self.gap.median > 0 else "below"
+        where, median = "", ""
+        if self.gap.share < 1 - _BESIDE:
+            where, median = f" at {self.gap.share:.0%} of the places inside the bounds", " in the median"
         return (
-            f"the start (`start`) lies {abs(self.apart):.4g} m {side} the project's terrain: farther than the reach of "
-            f"{self.scheme.reach:.3g} m (`reach`), so one of them cannot be right"
+            f"the start (`start`) lies {abs(self.gap.median):.3g} m {side} the project's terrain{median}: farther than "
+            f"the reach of {self.scheme.reach:.3g} m (`reach`){where}, so one of them cannot be right there"
         )
 
     @property
@@ -146,9 +151,10 @@ class SurfacePlan:
                 "seen_share",
                 "parts",
                 height_of_a_pixel="height_error",
-                start_apart_m="apart",
             ),
             **pick(self.grid, "bounds", "resolution", "width", "height"),
+            "start_gap_m": self.gap.median,
+            "start_gap_share": self.gap.share,
             "target": self.settings.target,
             "frame": self.frame,
             "levels": self.scheme.coarsest + 1,
@@ -213,9 +219,9 @@ def plan_surface(
     finer = finer_levels(looked, gsd)
     pixels = pixels_of_places(looked, finer, grid, gsd)
     scheme, height_error = scheme_of(settings, looked, grid, frame, gsd, pixels)
-    apart = 0.0
+    gap = StartGap()
     if frame is None:
-        apart = start_apart(settings.start, grid.bounds, project.crs, looked, ground_of(project))
+        gap = start_gap(settings.start, scheme.reach, grid.bounds, project.crs, looked, ground_of(project))
     used, file = tuple(one.name for one in looked), settings.start_file
     return SurfacePlan(
         project=project,
@@ -229,7 +235,7 @@ def plan_surface(
         finer=finer,
         gsd=gsd,
         height_error=height_error,
-        apart=apart,
+        gap=gap,
         seen_share=seen_share,
         parts={one.name: float((seen > 0).mean()) for one, seen in zip(looked, pixels)},
         most=float(pixels.sum(axis=0).max()),
