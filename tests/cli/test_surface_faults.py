@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import rasterio
 from cli import test_place_faults
+from scipy.ndimage import gaussian_filter
 from tools.command import Here, Said, inside, patience, sabotage, start, wait_for
 from tools.effort import at_most
 from tools.facet_scene import write_scene
@@ -82,6 +83,25 @@ def test_images_of_one_grey_value_tell_no_heights(project: Path) -> None:
     assert "hardly any texture" in notes(surface(project, "--json"))
     with rasterio.open(project.parent / "products" / "surface_sigma.tif") as file:
         assert file.read(1).min() > 5
+
+
+@pytest.mark.parametrize("kind", ["smooth", "noise", "moved"])
+def test_fault_33_images_of_unrelated_content_are_refused_unless_forced(project: Path, kind: str) -> None:
+    for number, image in enumerate(sorted((project.parent / "rendered").glob("*.tif"))):
+        rng = np.random.default_rng(number)
+
+        def unrelated(pixels: np.ndarray, rng: np.random.Generator = rng, number: int = number) -> np.ndarray:
+            if kind == "moved":
+                return np.roll(pixels, (9 * number**2, 7 * number), (1, 2))
+            found = gaussian_filter(rng.normal(0, 1, pixels.shape), (0, 1.5, 1.5) if kind == "smooth" else 0)
+            return np.clip(120 + 25 * found / found.std(), 1, 255)
+
+        change(image, unrelated)
+    said = surface(project, "--resolution", 3)
+    assert said.code == 3 and "the images contradict it" in said.err and "--force writes it" in said.err, said.err
+    assert not list((project.parent / "products").glob("surface*"))
+    if kind == "moved":
+        assert surface(project, "--resolution", 3, "--force").code == 0
 
 
 def test_heights_that_texture_does_not_tell_have_a_large_sigma(tmp_path: Path) -> None:

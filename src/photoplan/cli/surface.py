@@ -43,7 +43,9 @@ from photoplan.cli.options import LISTED, NEW_FOLDER, PATH, bounds_option, dry_r
 @click.option("--report", type=PATH, metavar="HTML", help="Accuracy by classes, images and levels, with plots.")
 @click.option("--name", default="surface", metavar="NAME", help="Of the files [surface].")
 @click.option("-o", "--output", type=NEW_FOLDER, help="Folder of the files [PROJECT's folder/products].")
-@click.option("--force", is_flag=True, help="Also of orientations with a FAULT.")
+@click.option(
+    "--force", is_flag=True, help="Continue although orientations have a FAULT, or the images contradict the surface."
+)
 @dry_run_option("Print the plan, and stop.")
 @executing
 def command(project: Path, **options: Any) -> None:

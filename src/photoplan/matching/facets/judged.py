@@ -82,6 +82,15 @@ def fit(block: FacetBlock) -> _Doubles:
         return np.where(sums[..., 0] > 0, np.sqrt(squares / free), np.nan)
 
 
+def pixel_noise(raw: _Floats) -> float:
+    """Standard deviation of the noise of pixels by themselves, from differences that slopes of grey values do not have
+    (Immerkær 1996), robustly; 0 without pixels."""
+    a = np.array([1.0, -2.0, 1.0])
+    found = ndimage.convolve1d(ndimage.convolve1d(raw.astype(float), a, axis=0), a, axis=1)[1:-1, 1:-1]
+    found = np.abs(found[np.isfinite(found)])
+    return float(np.median(found)) / (0.6745 * 6.0) if found.size else 0.0
+
+
 def edge_variances(block: FacetBlock) -> _Doubles:
     """Variances of heights beside edges, shape (rows, columns), m²; 0 elsewhere.
 

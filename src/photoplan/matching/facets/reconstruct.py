@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,14 @@ from photoplan.events import stretch
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.block import FacetBlock
 from photoplan.matching.facets.curvature import Roughness
+from photoplan.matching.facets.evidence import evidence
 from photoplan.matching.facets.judged import (
     edge_variances,
     fit,
     grey_places,
     grey_sigmas,
     misfit_variances,
+    pixel_noise,
     residual_pictures,
 )
 from photoplan.matching.facets.observe import MARGIN, Facets, Relief, Sight, View, facets_of, levels_done, look
@@ -88,7 +90,8 @@ class Found:
     count: NDArray[np.uint8]
     """Images that see the facets around a post."""
     fit: _Floats
-    """Root mean square of the standardised residuals around a post, 1 is expected; NaN where there is no height."""
+    """Root mean square of the standardised residuals around a post, or of the differences between the images that agree
+    best there if that is less; 1 is expected, NaN where there is no height."""
     grey: _Floats
     """Grey values, `ratio` times as fine; NaN where no image sees it."""
     grey_sigmas: _Floats
@@ -100,6 +103,9 @@ class Found:
     """Posts without a height since it went as far from the start as it may."""
     sums: _Doubles
     """Of every view: Σ of squared residuals in its own grey values, and redundancy; shape (n, 2)."""
+    noise: _Doubles
+    """Of every view: the noise of its pixels by themselves, squared, and their mean grey value, both times the pixels,
+    and the pixels; shape (n, 3)."""
     moves: tuple[float, ...]
     """Mean last correction of the heights on each level, the finest first, pixels of parallax; 0: nothing was seen."""
 
@@ -134,7 +140,7 @@ def reconstruct(
     """
     block: FacetBlock | None = None
     found: Searched | None = None
-    reach = scheme.reach
+    reach, stated = scheme.reach, start
     if scheme.search is not None:
         with stretch(0.0, _SEARCHED, "search"):
             found = search(views, grid, window, scheme.search, start, scheme.reach)
@@ -171,8 +177,7 @@ def reconstruct(
         moves[level] = block.moves[-1]
     if block is None or block.facets.pitch != grid.resolution:
         return None
-    made = _found(block, views, window, tuple(moves), residuals)
-    return made if found is None else _doubting(made, found, window, scheme)
+    return _found(block, views, window, scheme, stated, found, tuple(moves), residuals)
 
 
 def _part(scheme: Scheme, window: Window, level: int, *ends: float) -> AbstractContextManager[None]:
@@ -298,20 +303,42 @@ def _finer(block: FacetBlock, facets: Facets, start: Callable[[_Doubles], _Doubl
 
 
 def _found(
-    block: FacetBlock, views: Sequence[View], window: Window, moves: tuple[float, ...], residuals: bool = False
+    block: FacetBlock,
+    views: Sequence[View],
+    window: Window,
+    scheme: Scheme,
+    start: Callable[[_Doubles], _Doubles],
+    searched: Searched | None,
+    moves: tuple[float, ...],
+    residuals: bool = False,
 ) -> Found:
     """What a block holds of its window."""
-    variance, misfit = block.variances(), fit(block)
-    doubt = edge_variances(block) + misfit_variances(block, misfit)
+    variance, misfit, counted = block.variances(), fit(block), block.counted
     ratio = block.facets.ratio
     inner = slice(MARGIN, MARGIN + window.height), slice(MARGIN, MARGIN + window.width)
+    begun = np.asarray(start(block.facets.posts), float)
+    low, high = (np.where(np.isfinite(begun), begun, block.heights) + side * scheme.reach for side in (-1, 1))
+    agreed = evidence(block, scheme.base, low, high, inner, misfit)
+    if agreed is None:
+        doubt = edge_variances(block) + misfit_variances(block, misfit)
+        if searched is not None:
+            assert scheme.search is not None
+            away = scheme.search.planes.away(block.heights, searched.heights)
+            doubt += searched.variance + np.where(searched.sure, away, 0.0) ** 2
+    else:
+        doubt = agreed.variance + (0.0 if searched is None else (1.0 - agreed.probability) * searched.variance)
+        misfit = agreed.fit
+        counted = np.minimum(counted, agreed.count)
     # What one image alone sees has no height, and grey values no place.
-    seen = block.counted[inner] > 1
+    seen = counted[inner] > 1
     astray = block.astray[inner] & seen
-    count = np.where(astray, np.uint8(1), block.counted[inner])
+    count = np.where(astray, np.uint8(1), counted[inner])
     place = [next(n for n, view in enumerate(views) if view is own) for own in block.views]
-    sums = np.zeros((len(views), 2))
+    sums, noise = np.zeros((len(views), 2)), np.zeros((len(views), 3))
     sums[place] = block.sums
+    for n, sight in zip(place, block.sights):
+        pixels = float(np.isfinite(sight.raw).sum())
+        noise[n] = np.array([pixel_noise(sight.raw) ** 2, float(np.nanmean(sight.raw)), 1.0]) * pixels
     at = grey_places(block, window, MARGIN)
 
     def finer(values: NDArray[Any]) -> NDArray[Any]:
@@ -336,17 +363,9 @@ def _found(
         residuals=pictures,
         astray=int(astray.sum()),
         sums=sums,
+        noise=noise,
         moves=moves,
     )
-
-
-def _doubting(made: Found, found: Searched, window: Window, scheme: Scheme) -> Found:
-    """With what the choice among heights adds to the standard deviations, and facets that went away from a sure one."""
-    assert scheme.search is not None
-    inner = slice(MARGIN, MARGIN + window.height), slice(MARGIN, MARGIN + window.width)
-    away = scheme.search.planes.away(made.heights.astype(float), found.heights[inner])
-    variance = made.sigmas.astype(float) ** 2 + found.variance[inner] + np.where(found.sure[inner], away, 0.0) ** 2
-    return replace(made, sigmas=np.sqrt(variance).astype(np.float32))
 
 
 def _where(known: NDArray[np.bool_], values: NDArray[Any]) -> _Floats:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
 from photoplan.products.surface.plan import HARDLY, SurfacePlan
+from photoplan.products.surface.spread import median
 
 #: An image whose sigma0 is so many times the median of the others is told of; or all, if sigma0 is this part of the
 #: contrast of the surface. Parts of the heights that fit badly, last corrections, and standard deviations, pixels of
@@ -16,6 +18,8 @@ _ALONE, _NOISY, _MISFITS, _MOVING, _VAGUE, _ASTRAY = 1.6, 0.35, 0.02, 0.2, 1.0, 
 _MOST_MISFIT = 0.25
 #: From this part of the reach on it tells that nothing was found there.
 _LOST = 0.1
+#: Residuals in parts of the noise of pixels by themselves, and of the mean grey value, from which on it is no noise.
+_CONTENT, _NO_NOISE = 2.0, 0.08
 #: Standard deviations by which noise alone may still move heights in the last iteration.
 _NOISE_MOVES = 1.0
 
@@ -48,6 +52,38 @@ def findings(
         *_of_fits(plan, misfit_share, astray),
         *_of_moves(plan, correction, sigma_px),
         *_of_noise(plan, sigma_px, misfit_share),
+    )
+
+
+def contradicted(plan: SurfacePlan, totals: Mapping[str, Any]) -> str:
+    """Sentence that says why the images contradict a surface; empty if they do not, or have nothing to say.
+
+    They do if heights are hardly better known than the reach says (images agree at none of them) although there is
+    texture: residuals are larger than what the pixels of each image show to be noise, or than noise of any camera.
+
+    Parameters
+    ----------
+    totals : mapping
+        Figures of all tiles: see `SurfaceJob`.
+    """
+    sigma, (squares, redundancy) = median(totals["sigmas"]), (np.array(totals[k]) for k in ("squares", "redundancy"))
+    noise = np.reshape(totals["noise"], (-1, 3))
+    known = (redundancy > 0) & (noise[:, 2] > 0)
+    if sigma is None or not known.any() or sigma < _LOST * plan.scheme.reach:
+        return ""
+    if sigma < _VAGUE * plan.height_error * 2**plan.scheme.base:
+        return ""
+    sigma0 = np.sqrt(squares[known] / redundancy[known])
+    own, mean = np.sqrt(noise[known, 0] / noise[known, 2]), noise[known, 1] / noise[known, 2]
+    misfits = totals["misfits"] / max(totals["heights"], 1)
+    beyond_own, beyond_any = (float(np.median(sigma0 / np.maximum(other, 1e-9))) for other in (own, mean))
+    if beyond_own < _CONTENT and beyond_any < _NO_NOISE and misfits < _MOST_MISFIT:
+        return ""
+    return (
+        f"the images contradict it: their median standard deviation of a height is {sigma:.3g} m where the reach is "
+        f"{plan.scheme.reach:.3g} m, and residuals of {float(np.median(sigma0)):.3g} grey values are no noise. They "
+        "show different things, orientations are wrong (`photoplan check`, `photoplan tie`, `photoplan adjust`), or "
+        "the start is farther away than its reach (`start`, `reach`)"
     )
 
 

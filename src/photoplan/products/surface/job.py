@@ -93,7 +93,8 @@ class SurfaceJob:
         count = np.zeros((1, *shape), np.uint8)
         grey, grey_sigmas = (np.full((1, *finest), np.nan, np.float32) for _ in range(2))
         residuals = np.full((len(views) if self.residuals else 0, *finest), np.nan, np.float32)
-        sums, moves, parts, astray = np.zeros((len(views), 2)), np.zeros(self.scheme.coarsest + 1), 0, 0
+        sums, noise = np.zeros((len(views), 2)), np.zeros((len(views), 3))
+        moves, parts, astray = np.zeros(self.scheme.coarsest + 1), 0, 0
         every = tuple(window.tiles(self.part))
         for k, part in enumerate(every):
             name = f"part {k + 1} of {len(every)}" if len(every) > 1 else ""
@@ -108,10 +109,12 @@ class SurfaceJob:
             grey[(0, *there)], grey_sigmas[(0, *there)] = found.grey, found.grey_sigmas
             if found.residuals is not None:
                 residuals[(slice(None), *there)] = found.residuals
-            sums, moves, parts, astray = sums + found.sums, moves + found.moves, parts + 1, astray + found.astray
+            sums, noise = sums + found.sums, noise + found.noise
+            moves, parts, astray = moves + found.moves, parts + 1, astray + found.astray
         record = {
             "squares": sums[:, 0].tolist(),
             "redundancy": sums[:, 1].tolist(),
+            "noise": noise.ravel().tolist(),
             "moves": moves.tolist(),
             "parts": parts,
             "sigmas": counted(sigmas),

@@ -71,6 +71,8 @@ class SurfacePlan:
     """Images that see the place in the bounds that most see, each counting by how many pixels it has of usual ones."""
     key: str
     """Hash of all that decides the product."""
+    force: bool = False
+    """Whether it is also written if the images contradict it."""
 
     @property
     def address(self) -> ScenesAddress:
@@ -180,7 +182,7 @@ def plan_surface(
     images : sequence of str, optional
         Names or patterns; None: all.
     force : bool
-        Also of images whose orientation `photoplan check` calls a fault.
+        Also of images whose orientation `photoplan check` calls a fault, and although images contradict the surface.
     events : Events
         Told of each image.
 
@@ -240,6 +242,7 @@ def plan_surface(
         parts={one.name: float((seen > 0).mean()) for one, seen in zip(looked, pixels)},
         most=float(pixels.sum(axis=0).max()),
         key=_key(project, used, settings, scheme=scheme, grid=grid, frame=frame),
+        force=force,
     )
 
 

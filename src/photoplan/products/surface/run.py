@@ -12,7 +12,7 @@ import numpy as np
 
 from photoplan import __version__
 from photoplan.engine.run import Tally, Work
-from photoplan.errors import UsageError
+from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm
 from photoplan.io.naming import scratch, together
@@ -23,7 +23,7 @@ from photoplan.io.surface_file import TARGET
 from photoplan.plain import pick
 from photoplan.plan.tiles import Tiles
 from photoplan.products.run import Run, refuse_inputs
-from photoplan.products.surface.findings import findings
+from photoplan.products.surface.findings import contradicted, findings
 from photoplan.products.surface.job import TILE, SurfaceJob
 from photoplan.products.surface.plan import SurfacePlan
 from photoplan.products.surface.spread import median
@@ -114,7 +114,7 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
     UsageError
         A file exists and `run.overwrite` is False, or would replace an input.
     InputError
-        An input has changed since it was planned.
+        An input has changed since it was planned, or the images contradict the surface and it is not forced.
     TilesFailed
         Tiles failed again and again; nothing is written.
     ResourceError
@@ -192,6 +192,9 @@ def _complete(
     """Give the files their names, and write the record."""
     heights = files["heights"]
     tally.check(heights.path)
+    contradiction = contradicted(plan, tally.totals)
+    if contradiction and not plan.force:
+        raise InputError(f"{heights.path}: {contradiction}. Nothing is written; `force` writes it all the same")
     tags = {
         "PHOTOPLAN_VERSION": __version__,
         "PHOTOPLAN_IMAGE": ", ".join(plan.images),
