@@ -45,8 +45,8 @@ _SLOPING = 0.25
 #: Probability that images agree at no height, parts of all heights that are tried; posts along the surroundings in
 #: whose range the height then is.
 _NONE, _RANGE = 0.3, 17
-#: By how much other heights lie below what is between, to be another choice, and those nearer than a pixel; evidence above which nothing is decided;
-#: times the variance of differences above which a post is against its height.
+#: By how much other heights lie below what is between, to be another choice, and those nearer than a pixel; evidence
+#: above which nothing is decided; times the variance of differences above which a post is against its height.
 _RISES, _RISES_NEAR, _UNDECIDED, _AGAINST = 1.0, 4.0, -3.0, 4.0
 #: Evidence below which a post is beyond doubt; heights up to so many pixels of parallax away are tried at all posts,
 #: others at every third of those beyond doubt.
@@ -150,13 +150,13 @@ def evidence(
         offset = k * step
         allowed = (heights + offset >= low - step) & (heights + offset <= high + step) | (abs(k) <= 2)
         if k == 0:
-            flat = L > _UNDECIDED
+            flat = _open(L)
         for size in sizes:
             # Posts around count as they stand relative to their own heights: a roof is lifted as a whole.
             total = L
             if size > 1:
                 # What a wide square decides is what its posts without texture of their own decide together.
-                alike = flat if size > _AROUND[0] else every
+                alike = flat > 0.5 if size > _AROUND[0] else every
                 total = L + _ADDED * (size**2 - 1) * means_around(np.where(alike, np.minimum(L, 4.0), 0.0), size)
             if k == 0:
                 lowest[size], before[size] = total, total
@@ -164,19 +164,25 @@ def evidence(
                 continue
             if abs(k) == 1:
                 barrier[size] = before[size].copy()
-            # The same valley is no other choice, unless there is none.
-            rises = _RISES if abs(k) * _STEP > _SAME else _RISES_NEAR
-            other = (total < barrier[size] - rises) | (before[size] > _UNDECIDED) & (abs(k) * _STEP > _SAME)
+            # The same valley is no other choice, unless there is none: gradually, as evidence has noise.
+            distant = abs(k) * _STEP > _SAME
+            rises = _RISES if distant else _RISES_NEAR
+            other = np.clip(barrier[size] - rises - total, 0.0, 1.0)
+            if distant:
+                other = np.maximum(other, _open(before[size]))
             barrier[size] = np.maximum(barrier[size], total)
             total = np.where(allowed, total, np.inf)
             least = np.minimum(lowest[size], total)
             kept, p = np.exp(least - lowest[size]), np.exp(least - total)
-            for n, weight in enumerate((1.0, (other | flat) * offset**2, other)):
+            for n, weight in enumerate((1.0, np.maximum(other, flat) * offset**2, other)):
                 sums[size][n] = sums[size][n] * kept + p * weight
             lowest[size] = least
     around = np.maximum(maximum_filter(heights, _RANGE) - heights, heights + maximum_filter(-heights, _RANGE)) ** 2 / 3
     variance, agreed = np.zeros((2, *facets.shape))
-    against = np.isfinite(here[0]) & (here[0] > _AGAINST * variances(here[1]))
+    with np.errstate(invalid="ignore"):
+        # All pixels fit, or those of the images that agree best: what hides a place from one image is no misfit.
+        fit = np.fmin(misfit, np.sqrt(here[0] / variances(here[1])))
+    against = np.nan_to_num(fit) ** 2 > _AGAINST
     for size in sizes:
         none = _NONE * sum(counts) * np.exp(np.minimum(lowest[size], 50.0))
         whole = sums[size][0] + none
@@ -185,14 +191,16 @@ def evidence(
         better = (right > agreed) & ~against | (size == 1)
         variance = np.where(better, (sums[size][1] + none * around) / whole, variance)
         agreed = np.where(better, right, agreed)
-    with np.errstate(invalid="ignore"):
-        # All pixels fit, or those of the images that agree best: what hides a place from one image is no misfit.
-        fit = np.fmin(misfit, np.sqrt(here[0] / variances(here[1])))
     beside = (
         np.maximum(maximum_filter(heights, _BESIDE) - heights, heights + maximum_filter(-heights, _BESIDE)) ** 2 / 3
     )
     variance += (1.0 - (_FITS / np.maximum(np.nan_to_num(fit), _FITS)) ** 2) * beside
     return Evidence(seen.sum(axis=0).astype(np.uint8), variance, agreed, fit)
+
+
+def _open(L: _Doubles) -> _Doubles:
+    """By how much evidence leaves a height undecided, 0 to 1."""
+    return np.clip((L - _UNDECIDED) / 2 + 0.5, 0.0, 1.0)
 
 
 def _projected(
