@@ -13,6 +13,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
+from photoplan.codec import storable
 from photoplan.errors import UsageError
 from photoplan.events import Map
 from photoplan.geometry.grid import MapGrid, Window
@@ -25,6 +26,7 @@ TILE = 512
 MOST_HALVINGS = 5
 
 
+@storable
 @dataclass(frozen=True)
 class Sums:
     """An integral over one polygon with cells of one size, in m³ and m²."""
@@ -239,6 +241,7 @@ class ErrorModel:
         return np.asarray(self.sigma(XY), float) if callable(self.sigma) else np.full(len(XY), float(self.sigma))
 
 
+@storable
 @dataclass(frozen=True)
 class VolumeSigma:
     """Standard deviations of a volume, m³."""
