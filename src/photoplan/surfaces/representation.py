@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
 
 #: Weights by which squares of second differences are averaged along rows and along columns.
 _WINDOW = (0.25, 0.5, 0.25)
@@ -113,8 +112,12 @@ def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def _mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Means over a window; NaN where no value is known there."""
     known = np.isfinite(values)
-    total, count = (
-        correlate1d(correlate1d(part, _WINDOW, 0, mode="constant"), _WINDOW, 1, mode="constant")
-        for part in (np.where(known, values, 0.0), known.astype(float))
-    )
+    total, count = _weighted_sum(np.where(known, values, 0.0)), _weighted_sum(known.astype(float))
     return np.asarray(np.where(count > 0.01, total / np.maximum(count, 0.01), np.nan))
+
+
+def _weighted_sum(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum over a window with `_WINDOW` along rows and columns, zeros around."""
+    padded = np.pad(values, 1)
+    rows = sum(w * padded[k : k + len(values)] for k, w in enumerate(_WINDOW))
+    return np.asarray(sum(w * rows[:, k : k + values.shape[1]] for k, w in enumerate(_WINDOW)))
