@@ -135,6 +135,7 @@ class UnitFigures:
     """Points flagged as gross errors."""
 
 
+@storable
 @dataclass(frozen=True, eq=False)
 class LineElement:
     """A line as the model keeps it: filtered vertices and the intersections with the grid, in order."""
