@@ -189,7 +189,7 @@ def test_dry_run_reads_no_pixel_and_names_what_is_missing(folder, tmp_path, run)
 
 def test_only_some(folder, run):
     said = run("characterise", folder / "series.toml", "--only", "wedge", "--only", "noise", "--json", "-q")
-    assert said.code == 0 and said.err == ""
+    assert said.code == 0 and said.err.startswith("the sensor is full"), "notes are no progress"
     assert [a["name"] for a in json.loads(said.out)["analyses"]] == ["noise", "wedge"]
     said = run("characterise", folder / "series.toml", "--only", "colour")
     assert said.code == 2 and "known are photon_transfer" in said.err

@@ -216,7 +216,7 @@ class TestExport:
         assert np.allclose(sigmas[:16:2, :16:2], 0.05, atol=1e-6) and 0.05 < np.nanmax(sigmas) < 0.1
         assert np.allclose(sigmas, HybridSurface(ModelReader(model)).sigmas(XY), atol=1e-6, equal_nan=True)
         facts = json.loads(photoplan("info", tmp_path / "o.tif", "--json").out)
-        assert facts["heights"] == "EPSG:5773"
+        assert facts["heights"] == "EGM96 height (EPSG:5773), in metre"
 
     def test_resolution_and_bounds(self, photoplan: Here, model: Path, tmp_path: Path) -> None:
         bounds = ("500010", "5299960", "500030", "5299990")

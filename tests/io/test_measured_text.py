@@ -179,7 +179,7 @@ def test_borders_need_no_heights(write: Write) -> None:
 
 
 def test_a_prj_file_states_crs_and_heights(write: Write) -> None:
-    path = write("1 2 3\n")
+    path = write("21500000 6700000 3\n")
     write("EPSG:3875+3900", "p.prj")
     measured = read_measured([path])
     assert (measured.crs, measured.height_system) == ("EPSG:3875", "EPSG:3900")

@@ -149,7 +149,7 @@ def test_fault_12_files_of_two_mosaics_do_not_meet(mosaic) -> None:  # type: ign
     text = block.project.read_text()
     block.project.write_text(text.replace('name = "one"', 'name = "THREE"'))
     said = photoplan("mosaic", block.project, *OPTIONS, "--name", "other")
-    assert said.code == 3 and "THREE" in said.err and "three" in said.err
+    assert said.code == 0, said.err  # names that differ in capitals alone have stems of their own
 
 
 @pytest.mark.parametrize("kind", some(["nodata", "mask"], 0))

@@ -83,10 +83,6 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
         if page is not None:
             samples = samples_of(built.built, built.measured)
             report, warning = page.write(build_page(built, request.inputs, samples)), samples.covariance.warning
-    if quiet:  # progress is hidden, a doubtful result is not
-        for note in built.measured.notes:
-            if note.startswith("warning: "):
-                click.echo(f"photoplan: {note}", err=True)
     if as_json:
         show_json(built, report=report)
         return

@@ -131,6 +131,8 @@ def describe(path: Path) -> dict[str, Any]:
                 f"{path}: JSON of no kind that is known: neither a run record of photoplan nor orientations, cameras, "
                 f"objects or vectors{looks_like(path)}"
             ) from None
+        if found is None and kind == ".xml":
+            return {"file": str(path), **read_rpc(path).describe()}
         if found is None:
             raise not_a_raster from None
         return found

@@ -56,7 +56,7 @@ _RESAMPLED = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class HeightEvidence:
     """Of the posts of a block, all of shape (rows, columns)."""
 
     count: NDArray[np.uint8]
@@ -90,7 +90,7 @@ def visible(block: FacetBlock) -> NDArray[np.bool_]:
 
 def evidence(
     block: FacetBlock, level: int, low: _Doubles, high: _Doubles, inner: tuple[slice, slice], misfit: _Doubles
-) -> Evidence | None:
+) -> HeightEvidence | None:
     """Compare the images of a block at heights between two surfaces (rows, columns); `level`: of the pyramids, `inner`:
     the posts that are asked for; `misfit`: see `judged.fit`.
 
@@ -195,7 +195,7 @@ def evidence(
         np.maximum(maximum_filter(heights, _BESIDE) - heights, heights + maximum_filter(-heights, _BESIDE)) ** 2 / 3
     )
     variance += (1.0 - (_FITS / np.maximum(np.nan_to_num(fit), _FITS)) ** 2) * beside
-    return Evidence(seen.sum(axis=0).astype(np.uint8), variance, agreed, fit)
+    return HeightEvidence(seen.sum(axis=0).astype(np.uint8), variance, agreed, fit)
 
 
 def _open(L: _Doubles) -> _Doubles:
