@@ -76,7 +76,7 @@ def plan(path: Path) -> Path:
         ("UPDATE tiles SET sources = NULL WHERE fid = 2", "row 2: sources is 'None'; it must be a text"),
         ("UPDATE tiles SET tile = NULL", "row 1: tile .* it must be an integer"),
         ("UPDATE tiles SET residual_px = NULL", "row 1: residual_px .* it must be a number"),
-        ("DROP TABLE tiles", "layer tiles"),
+        ("DROP TABLE tiles", "not a plan of photoplan"),
         ("ALTER TABLE tiles RENAME COLUMN cells TO x", "no column cells|cannot be read"),
         ("UPDATE photoplan_plan SET content = '[1]'", "header"),
         ("UPDATE photoplan_plan SET content = x'00'", "header"),

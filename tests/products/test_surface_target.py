@@ -179,7 +179,7 @@ def test_targets_that_are_none(scene: Scene) -> None:
         (["--target", f"vault:{X0},{Y0},{GROUND},0,30", *around(0, 0)], 3, "a vault is seen from inside its radius"),
         (["--target", "image:none"], 3, "image 'none' is not in the project"),
         (["--target", "wall:1e300,2,3,4", *around(0, 0)], 2, "lies on no map"),
-        (["--target", f"wall:{Y0},{X0},140,4", *around(0, 0)], 2, "X and Y in the right order"),
+        (["--target", f"wall:{Y0},{X0},140,4", *around(0, 0)], 2, "are X and Y exchanged"),
         (["--target", "image:i2,-5"], 2, "give a distance from 0.001"),
         (["--target", "image:i2,x"], 2, "give a distance from 0.001"),
         (["--target", "image:i2,1e300"], 2, "give a distance from 0.001"),
