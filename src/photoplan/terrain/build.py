@@ -157,6 +157,7 @@ def build_terrain(plan: BuildPlan, run: Map = map, events: Events = SILENT) -> B
     meshes = np.zeros((layout.rows, layout.columns), np.int64)
     for (column, row), unit in units.items():
         meshes[row, column] = unit.meshes
+    events.begin("chords of lines", unit="lines")
     lines = with_chords(found, [on_grid(line, layout, meshes) for line in lines], run)
     units = _with_faces(plan, units, lines, run, events)
     sigmas = _surrounded(plan, domain, units)
