@@ -9,6 +9,7 @@ neither whose part it is nor who listens.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -87,6 +88,48 @@ class Silent:
 
 
 SILENT = Silent()
+
+
+class Compilations:
+    """Count the kernels that this process compiles and the seconds while it compiles any.
+
+    Numba compiles one function at a time in a process. Functions that a kernel calls are compiled inside of its own
+    compilation and count with it.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.kernels = 0
+        """Kernels whose compilation has begun."""
+        self.watchers: list[Callable[[], None]] = []
+        """Called at each change, in the thread that compiles."""
+        self._clock, self._depth = clock, 0
+        self._spent: tuple[float, float | None] = 0.0, None  # finished seconds; when the current compilation began
+
+    @property
+    def running(self) -> bool:
+        """Whether a kernel is being compiled."""
+        return self._spent[1] is not None
+
+    @property
+    def seconds(self) -> float:
+        """Seconds while any kernel was being compiled, until now."""
+        finished, began = self._spent
+        return finished if began is None else finished + self._clock() - began
+
+    def change(self, begins: bool) -> None:
+        """Take into account that the compilation of a function begins or ends."""
+        self._depth += 1 if begins else -1
+        if begins and self._depth == 1:
+            self.kernels += 1
+            self._spent = self._spent[0], self._clock()
+        elif not self._depth:
+            self._spent = self.seconds, None
+        for watcher in tuple(self.watchers):
+            watcher()
+
+
+COMPILATIONS = Compilations()
+"""The compilations of this process; `photoplan.kernels` reports them."""
 
 _LISTENER: ContextVar[Callable[[float, str], None] | None] = ContextVar("listener", default=None)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
 from photoplan.cli.telling import OFTEN, SELDOM, Telling
+from photoplan.events import Compilations
 
 
 class Clock:
@@ -99,12 +102,74 @@ def test_on_a_terminal_a_line_that_moves_and_gives_way(capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("terminal", [False, True])
+def test_compilation_is_a_phase_of_its_own_and_no_part_of_rates_and_times_left(
+    capsys: pytest.CaptureFixture[str], terminal: bool
+) -> None:
+    """Two kernels for 40 s, the second with a part inside of it, then ten tiles in 10 s of a hundred."""
+    clock = Clock()
+    compilations = Compilations(clock)
+    with Telling(False, terminal=terminal, clock=clock, compilations=compilations) as events:
+        events.begin("tiles", 100)
+        compilations.change(True)
+        clock.now += 10
+        assert events.line(clock.now) == "compiling kernels: 1 so far, for 0:00:10"
+        compilations.change(False)
+        compilations.change(True)
+        clock.now += 10
+        compilations.change(True)
+        clock.now += 20
+        assert events.line(clock.now) == "compiling kernels: 2 so far, for 0:00:40"
+        compilations.change(False)
+        compilations.change(False)
+        clock.now += 10
+        events.done(10, 10_000_000)
+        assert events.line(clock.now).endswith("10/100 tiles 1 Mpx/s 0:01:30 left")
+        events.begin("completing")
+        clock.now += 5
+        assert events.line(clock.now) == "completing: for 0:00:05"
+    assert "compiling kernels: 2 so far, for 0:00:10" in capsys.readouterr().err
+
+
+def test_another_thread_s_compilation_is_shown_by_the_thread_that_waits(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    compilations = Compilations(clock)
+
+    def change(begins: bool) -> None:
+        thread = threading.Thread(target=compilations.change, args=(begins,))
+        thread.start()
+        thread.join()
+
+    with Telling(False, terminal=False, clock=clock, compilations=compilations) as events:
+        events.begin("tiles", 4)
+        change(True)
+        clock.now += 5
+        change(True)
+        assert capsys.readouterr().err == ""
+        events.done(0)
+        assert capsys.readouterr().err == "compiling kernels: 1 so far, for 0:00:05\n"
+        clock.now += 5
+        events.done(0)
+        assert capsys.readouterr().err == ""  # the next line without a terminal is due after 30 s
+        change(False)
+        change(False)
+        clock.now += SELDOM
+        events.done(1)
+    assert capsys.readouterr().err == "tiles: 1/4 tiles 0:01:30 left\n"
+    change(True)  # after the command nobody listens
+    assert compilations.watchers == [] and capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("terminal", [False, True])
 def test_quiet_tells_results_alone(capsys: pytest.CaptureFixture[str], terminal: bool) -> None:
     clock = Clock()
-    with Telling(True, print, terminal=terminal, clock=clock) as events:
+    compilations = Compilations(clock)
+    with Telling(True, print, terminal=terminal, clock=clock, compilations=compilations) as events:
         events.begin("tiles", 4)
         clock.now += 10 * SELDOM
         events.done()
+        compilations.change(True)
+        clock.now += 10 * SELDOM
+        compilations.change(False)
         events.talk("hello")
         events.result(7)
     assert capsys.readouterr() == ("7\n", "")

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numba import njit
+from numba.core.errors import TypingError
+from tools.small_block import write_block
 
 from photoplan.errors import PhotoplanWarning
+from photoplan.events import COMPILATIONS
 from photoplan.kernels import jit, numba_parts
 from photoplan.kernels.jit import COMPILED
 from photoplan.kernels.rectify import is_compiled
@@ -147,6 +152,60 @@ def test_what_was_kept_by_another_version_or_is_damaged_is_compiled_again(tmp_pa
         assert kept.load(int) is None
         kept.save(int, "new")
         assert kept.load(int) == "new"
+
+
+@pytest.mark.skipif(not COMPILED, reason="nothing is compiled")
+def test_compilations_are_counted_as_they_happen():
+    """A kernel counts once for each set of types, with the functions that it calls; a later call counts nothing."""
+
+    @jit.inner
+    def part(x):
+        return 2 * x
+
+    @njit
+    def whole(x):
+        return part(x) + 1
+
+    seen = []
+
+    def watch():
+        seen.append((COMPILATIONS.running, COMPILATIONS.kernels - before))
+
+    before, seconds = COMPILATIONS.kernels, COMPILATIONS.seconds
+    COMPILATIONS.watchers.append(watch)
+    try:
+        assert whole(1) == whole(2) - 2 == 3
+        assert seen == [(True, 1), (True, 1), (True, 1), (False, 1)]
+        assert whole(1.0) == 3
+        assert seen[-1] == (False, 2) and COMPILATIONS.seconds > seconds
+        after = COMPILATIONS.seconds
+        with pytest.raises(TypingError):
+            whole("text")
+        assert not COMPILATIONS.running and COMPILATIONS.seconds >= after
+    finally:
+        COMPILATIONS.watchers.remove(watch)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not COMPILED, reason="nothing is compiled")
+def test_a_cold_command_reports_its_compilation(tmp_path):
+    """Whoever makes orthophotos first reads how many kernels are compiled; the rate is that of the tiles."""
+    write_block(tmp_path / "block")
+    words = ["ortho", tmp_path / "block" / "project.toml", "--images", "one", "--resolution", "2", "--workers", "2"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    said = [
+        subprocess.run(
+            [sys.executable, "-m", "photoplan", *map(str, words), "-o", str(tmp_path / out)],
+            env=environment,
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stderr
+        for out in ("cold", "warm")
+    ]
+    assert re.search(r"^compiling kernels: \d+ so far, for 0:00:\d\d$", said[0], re.MULTILINE)
+    assert re.search(r" \([\d.]+ s of them to compile \d\d+ kernels\)", said[0])
+    assert "to compile" not in said[1] and "compiling" not in said[1]
 
 
 def test_is_compiled_knows_all_kinds():

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import click
 
 from photoplan.cli.output import is_doubt, say
+from photoplan.events import COMPILATIONS, Compilations
 
 #: Seconds between two lines where there is no terminal, and between two changes of the line on one.
 SELDOM, OFTEN = 30.0, 0.1
 _BAR = 24
 #: Pixels a second below which they are told one by one, as of heights of a surface.
 _SLOW = 1e4
+#: Seconds of compilation after which a line is due at once where there is no terminal.
+_PATIENCE = 2.0
 #: Units that tell nothing of the pace yet.
 _FEW = 0.01
 
@@ -30,6 +35,9 @@ class Telling:
         Whether stderr is one; None: as it is.
     clock : callable
         Seconds from anywhere.
+    compilations : Compilations
+        Kernels that are compiled meanwhile. While one is, the line shows their number instead of the phase; rates and
+        times left do not include the time that they took.
     """
 
     def __init__(
@@ -38,8 +46,12 @@ class Telling:
         result: Callable[[object], None] = lambda value: None,
         terminal: bool | None = None,
         clock: Callable[[], float] = time.monotonic,
+        compilations: Compilations = COMPILATIONS,
     ) -> None:
         self._quiet, self._print, self._clock = quiet, result, clock
+        self._compilations, self._thread = compilations, threading.get_ident()
+        self._compiled_before = compilations.kernels, compilations.seconds
+        self._compiling_said = False
         self._terminal = sys.stderr.isatty() if terminal is None else terminal
         self._drawn = False
         self.results: list[object] = []
@@ -48,16 +60,18 @@ class Telling:
         self.begin("")
 
     def __enter__(self) -> Telling:
+        self._compilations.watchers.append(self._compiling)
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._compilations.watchers.remove(self._compiling)
         self._clear()
 
     def begin(self, phase: str, units: int = 0, unit: str = "tiles") -> None:
         """A phase begins."""
         self._phase, self._units, self._unit = phase, units, unit
         self._finished = self._pixels = self._kept = 0
-        self._began = self._clock()
+        self._began, self._compiled = self._clock(), self._compilations.seconds
         self.done(0)
 
     def kept(self, units: int) -> None:
@@ -76,8 +90,23 @@ class Telling:
             self._units = max(self._units, self._finished)
         self._pixels += pixels
         self._begun, self._what = begun, what
-        now = self._clock()
-        if self._quiet or not self._phase or now - self._last < (OFTEN if self._terminal else SELDOM):
+        self._show()
+
+    def _compiling(self) -> None:
+        """Show that kernels are compiled, if the thread that would show it is busy with that."""
+        if threading.get_ident() == self._thread:
+            with suppress(OSError):
+                self._show()
+
+    def _show(self) -> None:
+        """Show the line if that is due."""
+        now, compiling = self._clock(), self._compilations.running
+        if self._quiet or not (self._phase or compiling):
+            return
+        due = now - self._last >= (OFTEN if self._terminal else SELDOM)
+        if compiling and not self._compiling_said and self._compilations.seconds - self._compiled_before[1] > _PATIENCE:
+            due = self._compiling_said = True
+        if not due:
             return
         self._last = now
         if self._terminal:
@@ -88,8 +117,12 @@ class Telling:
             say(self.line(now))
 
     def line(self, now: float) -> str:
-        """What there is to say at a time: phase, units done, rate, time left."""
-        took = max(now - self._began, 1e-6)
+        """Return what there is to say at a time: phase, units done, rate, time left; or the kernels being compiled."""
+        if self._compilations.running:
+            kernels, seconds = self._compiled_before
+            count, compiled = self._compilations.kernels - kernels, self._compilations.seconds - seconds
+            return f"compiling kernels: {count} so far, for {_time(compiled)}"
+        took = max(now - self._began - (self._compilations.seconds - self._compiled), 1e-6)
         words, finished = [f"{self._phase}:"], self._finished + self._begun
         if self._units:
             share = min(1.0, finished / self._units)

@@ -21,6 +21,8 @@ import numba
 from numba import types
 from numba.extending import intrinsic
 
+from photoplan.events import COMPILATIONS
+
 try:
     from llvmlite import ir
     from numba.core import cgutils
@@ -30,6 +32,23 @@ except ImportError:
     _FOUND = False
 else:
     _FOUND = True
+
+try:
+    from numba.core import event
+except ImportError:  # a version without it: compilations are not counted
+    pass
+else:
+
+    class _Compiling(event.Listener):
+        """Pass on what numba broadcasts of its compilations."""
+
+        def on_start(self, event: Any) -> None:
+            COMPILATIONS.change(True)
+
+        def on_end(self, event: Any) -> None:
+            COMPILATIONS.change(False)
+
+    event.register("numba:compile", _Compiling())
 
 TRIED = ((0, 60), (0, 68))
 """First and last version of numba that these parts were tried with."""
