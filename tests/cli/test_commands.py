@@ -117,7 +117,7 @@ def test_json_is_one_object_and_talk_is_on_stderr(undisturbed: Undisturbed) -> N
             assert product["valid_share"] == pytest.approx((file.dataset_mask() > 0).mean(), abs=1e-6)
     assert "kernel bicubic · tolerance 0.02 px · nodata auto · hidden show · 1 threads" in said.err
     assert "quick look" in said.err
-    names = {f"{n}_ortho{end}" for n in NAMES for end in (".tif", ".run.json")} | {"overview.png"}
+    names = {f"{n}_ortho{end}" for n in NAMES for end in (".tif", ".run.json")} | {"ortho_overview.png"}
     assert {p.name for p in undisturbed.folder.iterdir()} == names
 
 
@@ -258,7 +258,7 @@ def test_the_demo_runs_on_the_package_alone(photoplan: Here, tmp_path: Path) -> 
     said = photoplan("demo", tmp_path / "demo", "--resolution", "1")
     assert said.code == 0, said.err
     assert len(said.out.splitlines()) == 18
-    assert (tmp_path / "demo" / "products" / "overview.png").stat().st_size > 10_000
+    assert (tmp_path / "demo" / "products" / "ortho_overview.png").stat().st_size > 10_000
     assert "$ photoplan ortho" in said.err
 
 

@@ -292,15 +292,15 @@ class TestFault13And29Outputs:
     def test_fault_13_the_overview_and_the_plan_do_not_replace_inputs(self, photoplan: Here, small: Block) -> None:
         with rasterio.open(small.images[0]) as file:
             pixels = file.read()
-        picture = small.folder / "products" / "overview.png"
+        picture = small.folder / "products" / "ortho_overview.png"
         picture.parent.mkdir()
         with rasterio.open(picture, "w", driver="PNG", width=200, height=150, count=3, dtype="uint8") as file:
             file.write(pixels)
         before = picture.read_bytes()
-        small.project.write_text(small.project.read_text().replace("images/one.tif", "products/overview.png"))
+        small.project.write_text(small.project.read_text().replace("images/one.tif", "products/ortho_overview.png"))
         said = photoplan("ortho", small.project, *OPTIONS, "--overwrite")
         assert said.code == 2
-        assert "overview.png: the output is an input of the project" in said.err
+        assert "ortho_overview.png: the output is an input of the project" in said.err
         assert photoplan("ortho", small.project, *OPTIONS, "--no-quicklook").code == 0
         assert picture.read_bytes() == before
         terrain = small.terrain.read_bytes()

@@ -179,7 +179,7 @@ def test_fault_05_failed_tiles_cost_their_product_only(
     assert [r.failed for r in told.results] == [(), (2, 5), ()]
     assert not (tmp_path / "three_ortho.tif").exists()
     assert not (tmp_path / "three_ortho.run.json").exists()
-    assert (tmp_path / "overview.png").exists()
+    assert (tmp_path / "ortho_overview.png").exists()
     monkeypatch.undo()
     results = execute(plan, tmp_path, QUIET)
     assert results[1].resumed == len(plan["three"].plan.tiles) - 2

@@ -14,7 +14,8 @@ from tools.adjust_project import Make, write_project
 from tools.dem_file import write_dem
 from tools.facet_scene import GROUND, write_scene
 from tools.forked import QUIET, Mishap, Ran, content, forked
-from tools.small_block import X0, Y0, texture, write_block, write_image
+from tools.small_block import CRS, X0, Y0, texture, write_block, write_image
+from tools.town import write_town
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs fork and signals")
 
@@ -161,7 +162,7 @@ def test_fault_13_records_and_overviews_of_other_origin_are_refused(tmp_path: Pa
     folder = inputs(ortho, tmp_path / "in")
     products = folder / "block" / "products"
     products.mkdir()
-    for name in ("one_ortho.run.json", "overview.png"):
+    for name in ("one_ortho.run.json", "ortho_overview.png"):
         other = products / name
         other.write_text('{"a": "paper of mine"}')
         said = run(ortho, folder, tmp_path / "said")
@@ -192,9 +193,35 @@ def test_fault_13_marks_of_hidden_ground_do_not_outlive_their_orthophoto(tmp_pat
     assert marks.read_text() == "my own"
 
 
+def test_each_command_has_a_preview_of_its_own(tmp_path: Path) -> None:
+    """Orthophotos, two mosaics and an object in one folder; a mosaic called `ortho` replaces nobody's preview."""
+    block, out = tmp_path / "block", tmp_path / "out"
+    write_town(write_block(block).project, (X0, Y0), 100.0, CRS)
+    common = ["--resolution", 2, "--workers", 1, "-o", out]
+    alone = [block / "town.toml", block / "town.gpkg", "--objects", "house", "--force"]
+    commands: dict[str, list[object]] = {
+        "ortho_overview.png": ["ortho", block / "project.toml", "--images", "one"],
+        "mosaic_overview.png": ["mosaic", block / "project.toml"],
+        "east_overview.png": ["mosaic", block / "project.toml", "--images", "t*", "--name", "east"],
+        "object_overview.png": ["object", *alone],
+    }
+    made: dict[str, bytes] = {}
+    for name, words in commands.items():
+        said = forked([*words, *common], tmp_path / "said")
+        assert said.code == 0 and f"quick look: {out / name}" in said.err, said.err
+        made[name] = (out / name).read_bytes()
+        assert {path.name: path.read_bytes() for path in out.glob("*.png")} == made
+    assert len(set(made.values())) == len(made)
+    again: list[object] = ["mosaic", block / "project.toml", "--name", "ortho", *common]
+    said = forked(again, tmp_path / "said")
+    assert said.code == 2 and str(out / "ortho_overview.png") in said.err
+    assert forked([*again, "--no-quicklook"], tmp_path / "said").code == 0
+    assert {path.name: path.read_bytes() for path in out.glob("*.png")} == made
+
+
 def test_an_overview_that_is_missing_is_made(tmp_path: Path) -> None:
     folder = inputs(ortho, tmp_path / "in")
-    overview = folder / "block" / "products" / "overview.png"
+    overview = folder / "block" / "products" / "ortho_overview.png"
     assert run(ortho, folder, tmp_path / "said").code == 0
     overview.unlink()
     again = run(ortho, folder, tmp_path / "said")

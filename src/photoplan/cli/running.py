@@ -14,8 +14,10 @@ from photoplan.cli.options import How
 from photoplan.cli.output import can_draw, show_json
 from photoplan.cli.telling import Telling
 from photoplan.errors import TilesFailed
+from photoplan.events import COMPILATIONS
 from photoplan.io.project.model import Project
 from photoplan.products.orthophoto.execution import ProductResult, execute, seams_path
+from photoplan.products.orthophoto.finished import overview_path
 from photoplan.products.orthophoto.plan import OrthoPlan
 
 
@@ -52,7 +54,7 @@ def planned(
 
 def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling) -> None:
     """Make the products and print their paths, or one JSON object."""
-    started = time.perf_counter()
+    started, kernels, compiled = time.perf_counter(), COMPILATIONS.kernels, COMPILATIONS.seconds
     settings = plan.settings
     tiles = sum(len(p.plan.tiles) for p in plan.products)
     events.talk(
@@ -80,9 +82,10 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
         show_json({"products": results, "seconds": seconds, "folder": folder})
     if failed is not None:
         raise failed
-    events.talk(_summary(results, plan, seconds))
+    kernels, compiled = COMPILATIONS.kernels - kernels, COMPILATIONS.seconds - compiled
+    events.talk(_summary(results, plan, seconds, kernels, compiled))
     if how.quicklook:
-        events.talk(f"quick look: {folder / 'overview.png'}")
+        events.talk(f"quick look: {overview_path(plan, folder)}")
 
 
 def _tell_accuracy(results: list[ProductResult], draw: bool, events: Telling) -> None:
@@ -113,12 +116,13 @@ def _draw_sources(results: list[ProductResult], events: Telling) -> None:
         events.talk(f"regions: {regions}{picture}")
 
 
-def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> str:
+def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float, kernels: int, compiled: float) -> str:
     pixels = sum(p.grid.width * p.grid.height for p in plan.products) / 1e6
     worst = max(r.residual for r in results)
     cells = sum(r.cells for r in results)
+    compilation = f" ({compiled:.1f} s of them to compile {kernels} kernel{'s' * (kernels > 1)})" if kernels else ""
     return (
-        f"{plan.what} in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.3g} Mpx/s · "
+        f"{plan.what} in {seconds:.1f} s{compilation} · {pixels:.1f} Mpx, {pixels / (seconds - compiled):.3g} Mpx/s · "
         f"{cells} cells, worst anchor residual {worst:.3g} px{_hidden(results)}"
     )
 

@@ -79,7 +79,7 @@ def read_reduced(product: Path, *, max_side: int) -> tuple[NDArray[Any], tuple[f
     return pixels.astype(float).filled(np.nan), (edges.left, edges.bottom, edges.right, edges.top)
 
 
-def write_overview(products: Sequence[Path], picture: Path, *, max_side: int = 1600) -> Path | None:
+def write_overview(products: Sequence[Path], picture: Path, title: str = "", *, max_side: int = 1600) -> Path | None:
     """Write a PNG of many products placed on the map together; the first ones lie on top.
 
     Transparent where there is nothing. The products must share one reference system;
@@ -91,6 +91,8 @@ def write_overview(products: Sequence[Path], picture: Path, *, max_side: int = 1
         North-up rasters with overviews.
     picture
         The PNG; replaced if it is there.
+    title
+        Stands in the PNG; `refuse_foreign_overview` compares it.
     max_side
         Longest side of the picture, pixels.
     """
@@ -111,11 +113,11 @@ def write_overview(products: Sequence[Path], picture: Path, *, max_side: int = 1
             rgba = _look(sheet.path, dataset, width, height)
         part = canvas[:, row : row + height, col : col + width]
         np.copyto(part, rgba, where=rgba[3] > 0)
-    return write_png(picture, canvas)
+    return write_png(picture, canvas, title)
 
 
-def refuse_foreign_overview(picture: Path) -> None:
-    """Refuse to replace a picture that is none of `write_overview`.
+def refuse_foreign_overview(picture: Path, title: str = "") -> None:
+    """Refuse to replace a picture that `write_overview` did not write, or wrote with another title.
 
     Raises
     ------
@@ -126,11 +128,15 @@ def refuse_foreign_overview(picture: Path) -> None:
         return
     try:
         with open_raster(picture, "PNG") as dataset:
-            own = dataset.tags().get("Software") == _SOFTWARE
+            tags = dataset.tags()
+        own = tags.get("Software") == _SOFTWARE and tags.get("Title", "") == title
     except InputError:
         own = False
     if not own:
-        raise UsageError(f"{picture}: stands where the quick look goes; move it away, or say `overwrite`")
+        raise UsageError(
+            f"{picture}: this name is needed for the preview, and the file is not a preview of this command; "
+            "move it away, or set `overwrite`"
+        )
 
 
 @dataclass(frozen=True)
@@ -198,14 +204,14 @@ def _stretched(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.uin
     return np.clip(scaled, 0, 255).astype(np.uint8)
 
 
-def write_png(picture: Path, rgba: NDArray[np.uint8]) -> Path:
+def write_png(picture: Path, rgba: NDArray[np.uint8], title: str = "") -> Path:
     """Write red, green, blue and alpha, shape (4, height, width): encoded in memory, put in place at once."""
     with not_georeferenced(), gdal_settings(GDAL_PAM_ENABLED=False), rasterio.MemoryFile() as memory:
         profile = {"driver": "PNG", "width": rgba.shape[2], "height": rgba.shape[1], "count": 4, "dtype": "uint8"}
         profile["WRITE_METADATA_AS_TEXT"] = "YES"
         with memory.open(**profile) as dataset:
             dataset.write(rgba)
-            dataset.update_tags(Software=_SOFTWARE)
+            dataset.update_tags(Software=_SOFTWARE, **({"Title": title} if title else {}))
         content = memory.read()
     write_atomically(Path(picture), content)
     return Path(picture)

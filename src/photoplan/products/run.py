@@ -42,7 +42,7 @@ class Run:
     overwrite: bool = False
     """Whether finished products may be replaced."""
     quicklook: bool = True
-    """Whether to write `overview.png`."""
+    """Whether to write a preview of the products, such as `ortho_overview.png`."""
     events: Events = SILENT
     """Told of tiles that are done, and of each product's result, also if some of its tiles failed."""
 

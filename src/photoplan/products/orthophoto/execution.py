@@ -35,6 +35,7 @@ from photoplan.products.orthophoto.finished import (
     all_files,
     finished_products,
     outputs,
+    overview_path,
     seams_path,
     stale_files,
 )
@@ -63,7 +64,7 @@ def execute(
     ----------
     plan : OrthoPlan
     output : path
-        Folder for `NAME_ortho.tif`, its run record, and the overview picture; made if it does not exist.
+        Folder for `NAME_ortho.tif`, its run record, and the preview of all products; made if it does not exist.
     run : Run, optional
         Workers, memory, overwriting, progress.
     then : callable, optional
@@ -92,7 +93,7 @@ def execute(
     folder = Path(output)
     each = tile_bytes(plan.settings.tolerance, plan.settings.tile)
     run.check(each)
-    picture = folder / "overview.png" if run.quicklook else None
+    picture = overview_path(plan, folder) if run.quicklook else None
     rasters = [path for p in plan.products for path in all_files(folder, p, plan.settings)]
     refuse_inputs(input_files(plan.project), [*rasters, *([] if picture is None else [picture])])
     in_sheets = plan.settings.choice is not None and plan.settings.choice.sheets is not None
@@ -107,7 +108,7 @@ def execute(
     done = [] if marker.interrupted else [each for each in (picture, *index) if each is not None]
     kept = finished_products(plan, folder, run.overwrite, None if marker.interrupted else done)
     if picture is not None and not run.overwrite:
-        refuse_foreign_overview(picture)
+        refuse_foreign_overview(picture, plan.command)
     make_folder(folder)
     marker.begin()
     if kept:
@@ -119,7 +120,7 @@ def execute(
         works = (_work(plan, p, folder, run, kept.get(p.plan.name), runner.workers) for p in plan.products)
         results: list[ProductResult] = runner.run(works)
     if picture is not None:
-        write_overview([r.path for r in results if not r.failed], picture)
+        write_overview([r.path for r in results if not r.failed], picture, plan.command)
     for path in index:
         (write_index if in_sheets else write_stack)(plan, path, [r for r in results if not r.failed])
     failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]

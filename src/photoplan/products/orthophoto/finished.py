@@ -9,7 +9,7 @@ from typing import Any
 
 from photoplan.engine.execute import OutputName
 from photoplan.errors import UsageError
-from photoplan.io.names import file_in
+from photoplan.io.names import file_in, safe_stem
 from photoplan.io.naming import is_unfinished, tidy
 from photoplan.io.run_record import record_path, recorded_result, refuse_foreign_record
 from photoplan.plain import pick
@@ -102,6 +102,12 @@ def all_files(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> l
     """Files of a product: its rasters, and regions where sources are asked for."""
     paths = outputs(folder, product, settings)
     return [*paths.values(), *([seams_path(paths["picture"])] if "sources" in paths else [])]
+
+
+def overview_path(plan: OrthoPlan, folder: Path) -> Path:
+    """Return the path of the preview of all products: each command, and each mosaic by its name, has its own."""
+    choice, command = plan.settings.choice, plan.command
+    return folder / f"{safe_stem(choice.name) if choice and command == 'mosaic' else command}_overview.png"
 
 
 def finished_products(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +85,11 @@ class OrthoPlan:
     def of_objects(self) -> bool:
         """Whether its products are those of single objects."""
         return any(product.part is not None for product in self.products)
+
+    @property
+    def command(self) -> Literal["ortho", "mosaic", "object"]:
+        """The command that makes such products."""
+        return "object" if self.of_objects else "ortho" if self.settings.choice is None else "mosaic"
 
     @property
     def what(self) -> str:
