@@ -44,7 +44,8 @@ def command(**options: Any) -> None:
         plans = plan_sequence(request)
         if options["dry_run"]:
             if options["as_json"]:
-                show_json({"frames": len(plans), "first": plans[0], "last": plans[-1]})
+                tiles = sum(len(plan.tiles) for plan in plans)
+                show_json({"frames": len(plans), "tiles": tiles, "first": plans[0], "last": plans[-1]})
             else:
                 show(f"{len(plans)} pictures, the first and the last of them:")
                 for line in [*told(plans[0]), *told(plans[-1])]:

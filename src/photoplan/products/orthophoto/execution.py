@@ -243,7 +243,7 @@ def _complete(
             valid_share=0.0 if facts is None else facts.valid_share,
             residual=tally.totals.get("worst_residual", 0.0),
             cells=tally.totals.get("cells", 0),
-            tiles=product.plan.tiles.total,
+            tiles=len(product.plan.tiles),
             resumed=tally.resumed,
             hidden=_area(tally, "hidden", product) if plan.settings.asks_hidden else None,
             bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product, address),

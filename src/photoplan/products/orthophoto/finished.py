@@ -33,7 +33,7 @@ class ProductResult:
     cells: int
     """Boxes that the anchors of all tiles have."""
     tiles: int
-    """Tiles that the product has, the empty ones included."""
+    """Tiles that are computed: those that its images may see; all others are empty."""
     resumed: int
     """Tiles taken over from an earlier run."""
     hidden: float | None

@@ -51,8 +51,8 @@ class PlanFigures:
 
     @property
     def tiles(self) -> int:
-        """Tiles that hold a part of their image."""
-        return int((self.cells_of_tile > 0).sum())
+        """Tiles that a run computes: those that their images may see."""
+        return len(self.cells_of_tile)
 
     @property
     def cells(self) -> int:
@@ -79,7 +79,7 @@ class PlanFigures:
             "images": product.images,
             **pick(product.grid, "width", "height", "resolution", "bounds"),
             "gsd": product.gsd,
-            "tiles": (self.cells_of_tile[mine] > 0).sum(),
+            "tiles": len(self.cells_of_tile[mine]),
             "cells": self.cells_of_tile[mine].sum(),
             "worst_anchor_residual_px": self.residual_of_tile[mine].max(initial=0.0),
         }
@@ -144,8 +144,7 @@ def write_plan(
         The disk is full.
     """
     check_plan_path(path, plan, overwrite)
-    there = figures.cells_of_tile > 0
-    counts = np.bincount(figures.product[there], minlength=len(plan.products))
+    counts = np.bincount(figures.product, minlength=len(plan.products))
     header = {
         "photoplan": __version__,
         "project": plan.project.model_dump(mode="json", exclude_none=True),
@@ -156,17 +155,17 @@ def write_plan(
         "products": [_product_header(p, count) for p, count in zip(plan.products, counts.tolist())],
     }
     tiles = [p.plan.tiles for p in plan.products]
-    windows = np.concatenate([t.windows for t in tiles])[there]
-    bounds = np.concatenate([t.bounds(p.grid) for t, p in zip(tiles, plan.products)])[there]
+    windows = np.concatenate([t.windows for t in tiles])
+    bounds = np.concatenate([t.bounds(p.grid) for t, p in zip(tiles, plan.products)])
     names = np.array([p.plan.name for p in plan.products], object)
     columns = {
-        "product": names[figures.product[there]],
-        "tile": np.concatenate([t.indices for t in tiles])[there].astype(np.int64),
-        "sources": np.array([" ".join(map(str, tile.sources)) for t in tiles for tile in t], object)[there],
-        "cells": figures.cells_of_tile[there],
-        "residual_px": figures.residual_of_tile[there],
+        "product": names[figures.product],
+        "tile": np.concatenate([t.indices for t in tiles]).astype(np.int64),
+        "sources": np.array([" ".join(map(str, tile.sources)) for t in tiles for tile in t], object),
+        "cells": figures.cells_of_tile,
+        "residual_px": figures.residual_of_tile,
         **{name: windows[:, i] for i, name in enumerate(("col", "row", "width", "height"))},
-        **{f"source_{name}": figures.source[there, i] for i, name in enumerate(("col", "row", "width", "height"))},
+        **{f"source_{name}": figures.source[:, i] for i, name in enumerate(("col", "row", "width", "height"))},
     }
     seen = [(p, row, image, look) for p in plan.products for row, (image, look) in enumerate(zip(p.images, p.looks))]
     footprints = {

@@ -19,8 +19,10 @@ from photoplan.io.project.model import Project
 from photoplan.io.run_record import run_key
 from photoplan.matching.facets.reconstruct import Scheme
 from photoplan.plain import advised, pick
+from photoplan.plan.tiles import Tiles
 from photoplan.products.orthophoto.look import extent_text
 from photoplan.products.surface.begin import StartGap, start_gap
+from photoplan.products.surface.job import TILE
 from photoplan.products.surface.scheme import finer_levels, pixels_of_places, scheme_of
 from photoplan.products.surface.settings import Bounds, SurfaceSettings, check_bands, check_start
 from photoplan.products.surface.target import SeenTarget, over_frame, over_map
@@ -95,6 +97,11 @@ class SurfacePlan:
         g, m = self.grid, self.scheme.ratio
         return replace(g, resolution=g.resolution / m, width=g.width * m, height=g.height * m)
 
+    @property
+    def tiles(self) -> Tiles:
+        """Tiles of the heights."""
+        return Tiles.every(self.grid.window, TILE)
+
     def __str__(self) -> str:
         g, s = self.grid, self.scheme
         reduced = f", images reduced by {2**s.base}" if s.base else ""
@@ -155,6 +162,7 @@ class SurfacePlan:
                 height_of_a_pixel="height_error",
             ),
             **pick(self.grid, "bounds", "resolution", "width", "height"),
+            "tiles": len(self.tiles),
             "start_gap_m": self.gap.median,
             "start_gap_share": self.gap.share,
             "target": self.settings.target,

@@ -21,7 +21,6 @@ from photoplan.io.product import ProductFile, check_output
 from photoplan.io.run_record import input_entry, write_run_record
 from photoplan.io.surface_file import TARGET
 from photoplan.plain import pick
-from photoplan.plan.tiles import Tiles
 from photoplan.products.run import Run, refuse_inputs
 from photoplan.products.surface.findings import contradicted, findings
 from photoplan.products.surface.job import TILE, SurfaceJob
@@ -145,7 +144,7 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
         check_output(path, [], overwrite=run.overwrite)
     for place in (folder, *(path.parent for path in plan.settings.points)):
         make_folder(place)
-    tiles = Tiles.every(plan.grid.window, TILE)
+    tiles = plan.tiles
     run.events.begin("tiles", len(tiles))
     with run.runner(inputs, folder, job.bytes) as runner:
         files = _files(plan, paths, run)

@@ -108,6 +108,11 @@ class ViewPlan:
         return Placement((2 * width if beside else width, height))
 
     @property
+    def tiles(self) -> Tiles:
+        """Tiles of what is written."""
+        return Tiles.every(self.placement.window, TILE)
+
+    @property
     def stereo(self) -> Stereo | None:
         """How a pair is made, its base in metres; None: there is one picture."""
         return None if self.request.stereo is None else self.request.stereo.stated(self.first.nearest)
@@ -130,6 +135,7 @@ class ViewPlan:
         return {
             **self.camera.json_fields(),
             "size": list(self.camera.target.bundle.size),
+            "tiles": len(self.tiles),
             "field_of_view_deg": list(self.field_of_view),
             "farthest_m": self.request.farthest,
             "error_bound_m": self.request.bound,
@@ -314,7 +320,7 @@ def view_work(plan: ViewPlan, run: Run, workers: Workers) -> Work[ViewResult]:
         if is_matrix
         else None,
     )
-    tiles, job = Tiles.every(placement.window, TILE), _job(plan)
+    tiles, job = plan.tiles, _job(plan)
     return Work(
         name=path.stem,
         job=job,
@@ -375,6 +381,7 @@ def _complete(
     result = ViewResult(
         path=file.path,
         size=plan.placement.size,
+        tiles=len(plan.tiles),
         sky=totals["pixels"] - totals["ground"],
         rays=totals["pixels"],
         lost=totals["lost"],

@@ -16,6 +16,7 @@ class ViewResult:
 
     path: Path
     size: tuple[int, int]
+    tiles: int
     sky: int
     """Pixels that show no ground (of a picture with several rays to a pixel: rays)."""
     rays: int
@@ -34,6 +35,6 @@ class ViewResult:
     def json_fields(self) -> dict[str, Any]:
         """Counts of rays."""
         counts = pick(self, "rays", sky_rays="sky", downward_sky_rays="lost")
-        return {**pick(self, "path", "size", nearest_m="nearest", farthest_m="farthest"), **counts,
+        return {**pick(self, "path", "size", "tiles", nearest_m="nearest", farthest_m="farthest"), **counts,
                 **pick(self, "seconds", resumed_tiles="resumed"),
                 **({} if self.drawn is None else pick(self, "svg", "drawn"))}  # fmt: skip

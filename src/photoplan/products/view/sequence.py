@@ -121,7 +121,7 @@ def make_sequence(request: SequenceRequest, plans: list[ViewPlan], run: Run) -> 
             check_output(plan.request.output, inputs, overwrite=run.overwrite)
     if request.video is not None:
         check_output(request.video, inputs, overwrite=run.overwrite)
-    tiles = [-(-plan.placement.size[0] // 512) * -(-plan.placement.size[1] // 512) for plan in plans]
+    tiles = [len(plan.tiles) for plan in plans]
 
     def works(workers: Workers) -> Iterator[Work[Path] | Kept[Path]]:
         for plan, there, count in zip(plans, kept, tiles):
