@@ -98,6 +98,22 @@ def named_block(folder: Path, name: str = "block") -> None:
     project(folder, name)
 
 
+def mosaics(folder: Path) -> None:
+    """The block, and the polygons of a map series."""
+    import shapely
+
+    from photoplan.io.geopackage import VectorLayer, write_geopackage
+
+    named_block(folder)
+    squares = [shapely.box(576690 + 15 * k, 5188140, 576705 + 15 * k, 5188165) for k in range(2)]
+    layer = VectorLayer("sheets", "Polygon", squares, {"name": np.array(["west", "east"], object)})
+    write_geopackage(folder / "sheets.gpkg", [layer], "EPSG:32615")
+
+
+def demo_project(folder: Path) -> None:
+    project(folder, "demo")
+
+
 def in_place(folder: Path) -> None:
     project(folder)
 
@@ -306,11 +322,6 @@ def own_images(folder: Path) -> None:
     as_tiff(folder, "scans", 4)
 
 
-def block_without_orientation(folder: Path) -> None:
-    """The included block as the page on blocks finds it."""
-    block(folder, orientation="approximate.csv")
-
-
 def film_and_block(folder: Path, shared: Path) -> None:
     """A film project and a block without orientation, whose camera is called "drone"."""
     film(folder, shared)
@@ -351,6 +362,10 @@ def flight_and_camera(folder: Path) -> None:
     sharp_images(folder, "flight", "tif")
     camera_series(folder)
     shutil.copy(DOCS / "templates" / "sensor-frame.toml", folder / "sensor.toml")
+    page = (DOCS / "reference" / "simulate.md").read_text("utf-8")
+    model = re.search(r"^```toml\n(seed = 1\n.*?)^```$", page, re.M | re.S)
+    assert model
+    (folder / "model.toml").write_text(model[1])
 
 
 def without_lens(folder: Path) -> None:
@@ -475,9 +490,8 @@ STAGES: dict[str, Callable[..., None]] = {
     "README: Your own terrain": road,
     "README: Sharper images, known cameras": flight_and_camera,
     "tutorial": lambda folder: None,
-    "mosaic": named_block,
+    "mosaic": mosaics,
     "balance": named_block,
-    "block": block_without_orientation,
     "build-report": survey,
     "large": in_place,
     "monoplot": with_points,
@@ -489,7 +503,7 @@ STAGES: dict[str, Callable[..., None]] = {
     "sharpness: Measure an image flight": sharp_images,
     "sharpness: Compare with the laboratory": chart,
     "sharpness: Make images sharper": sharp_images,
-    "surface": in_place,
+    "surface": demo_project,
     "terrain-build: In one command": survey,
     "terrain-build: From a laser scan": cloud,
     "terrain-build: Gross errors": built_terrace,
@@ -503,6 +517,7 @@ STAGES: dict[str, Callable[..., None]] = {
 }
 #: Sections about inputs that cannot be had here, with the tests that run the same commands on such inputs.
 ELSEWHERE = {
+    "block": "tests/slow/test_block_howto.py",
     "camera: Correct light fall-off": "tests/products/test_restore_fall_off.py",
     "orientation: Tables": "tests/cli/test_convert_command.py",
     "satellites: Rational polynomials": "tests/products/test_satellites.py",
@@ -539,6 +554,8 @@ def test_commands_of_a_page(section: Section, tmp_path: Path, monkeypatch: pytes
     stage(tmp_path, *([request.getfixturevalue("shared")] if "shared" in names else []))
     monkeypatch.chdir(tmp_path)
     for words in section.commands:
+        if "edited.gpkg" in words:  # a person edits the regions of a mosaic
+            shutil.copy(tmp_path / "block" / "products" / "mosaic_seams.gpkg", tmp_path / "edited.gpkg")
         given: list[str] = []
         for k, word in enumerate(words):
             # The shell expands what is not quoted; patterns of options are quoted on the pages.

@@ -19,6 +19,7 @@ import shapely
 from tools.command import inside
 from tools.small_block import CRS, NAMES, Block, make_project, texture, write_image, write_terrain
 
+import photoplan
 from photoplan.errors import InputError, UsageError
 from photoplan.io.project.file import load_project
 from photoplan.products.orthophoto.execution import Run, execute
@@ -51,6 +52,21 @@ def test_a_plan_that_was_written_gives_the_same_bytes(planned: tuple[Path, Ortho
     execute(plan, tmp_path / "direct", QUIET)
     execute(again, folder, QUIET)
     assert products(folder) == products(tmp_path / "direct")
+
+
+def test_images_whose_border_leaves_the_terrain_run_from_a_plan(tmp_path: Path) -> None:
+    """Places of the border without terrain are no numbers, which JSON does not have."""
+    demo = Path(photoplan.__file__).parent / "demo_block"
+    image = sorted((demo / "images").glob("*.jpg"))[0]
+    words = ("--camera", demo / "int.yaml", "--orientation", demo / "ext.csv", "--terrain", demo / "dsm.tif")
+    assert inside("init", tmp_path, "--images", image, *words, "--height-system", "same").code == 0
+    project, plan = tmp_path / "project.toml", tmp_path / "plan.gpkg"
+    assert inside("ortho", project, "--resolution", 2, "--plan", plan).code == 0
+    said = inside("run", plan, "-o", tmp_path / "planned")
+    assert said.code == 0, said.err
+    assert inside("ortho", project, "--resolution", 2, "-o", tmp_path / "direct").code == 0
+    name = f"{image.stem}_ortho.tif"
+    assert (tmp_path / "planned" / name).read_bytes() == (tmp_path / "direct" / name).read_bytes()
 
 
 def test_what_was_written_is_what_is_read(planned: tuple[Path, OrthoPlan], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,7 @@ from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project
 from photoplan.io.regions import Regions
-from photoplan.plain import pick
+from photoplan.plain import pick, plain
 from photoplan.plan.footprint import Footprint
 from photoplan.plan.product import compile_tile
 from photoplan.plan.tiles import Tiles
@@ -300,7 +300,7 @@ def _look_header(image: str, look: Look) -> dict[str, Any]:
         "image": image,
         "gsd": look.gsd,
         "blur": look.blur,
-        "outline": seen.outline.tolist(),
+        "outline": plain(seen.outline),
         **pick(seen, "bounds", "on_surface", "height_range"),
     }
 
