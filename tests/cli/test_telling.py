@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 
 import pytest
+from tools.command import counters, unended
 
 from photoplan.cli.telling import OFTEN, SELDOM, Telling
 from photoplan.events import Compilations
@@ -173,3 +174,21 @@ def test_quiet_tells_results_alone(capsys: pytest.CaptureFixture[str], terminal:
         events.talk("hello")
         events.result(7)
     assert capsys.readouterr() == ("7\n", "")
+
+
+def test_counters_that_do_not_end_at_their_total_are_found() -> None:
+    """Every command that a test runs inside of its process, and that ends well, is judged by this."""
+    with counters() as phases, Telling(True, terminal=False) as events:
+        events.begin("resumed", 3)
+        events.done()
+        events.kept(2)
+        events.begin("short", 2)
+        events.done()
+        events.begin("of unknown length")
+        events.done(5)
+        events.begin("growing", 0)
+        events.more(4)
+        events.done(4)
+        events.begin("beyond", 2)
+        events.done(3)
+    assert unended(phases) == [("short", 2, 1), ("beyond", 2, 3)]

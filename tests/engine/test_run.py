@@ -149,6 +149,7 @@ def test_an_excused_error_costs_its_own_product_only(where: str) -> None:
     works = [work("a", [Memory()], complete=lambda t: "a"), bad, work("c", [Memory()], complete=lambda t: "c")]
     results, told = run(*works, excuse=lambda of, error: f"{of.name}: {error}")
     assert results == told.results == ["a", "bad: damaged", "c"]
+    assert told.units["tiles"] == 15  # tiles that will not be computed count too: the counter ends at its total
 
 
 def test_what_was_complete_is_told_before_an_error_ends_the_run() -> None:

@@ -11,16 +11,18 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
 
 from photoplan.cli.main import photoplan, run
+from photoplan.cli.telling import Telling
 
 COMMAND = (sys.executable, "-m", "photoplan")
 OPTIONS = ("--resolution", "1", "--tile", "128")
@@ -94,11 +96,47 @@ def process(*words: object, env: Mapping[str, str] | None = None, before: Sequen
     return Said(done.returncode, done.stdout, done.stderr)
 
 
+@contextmanager
+def counters() -> Iterator[list[tuple[str, int, int]]]:
+    """Inside, keep the phases of commands: name, units that were promised, units that were done."""
+    phases: list[tuple[str, int, int]] = []
+    begin, more, done = Telling.begin, Telling.more, Telling.done
+
+    def add(promised: int, finished: int) -> None:
+        if phases:
+            name, total, counted = phases[-1]
+            phases[-1] = name, total + promised, counted + finished
+
+    def beginning(self: Telling, phase: str, units: int = 0, unit: str = "tiles") -> None:
+        phases.append((phase, units, 0))
+        begin(self, phase, units, unit)
+
+    def adding(self: Telling, units: int) -> None:
+        add(units, 0)
+        more(self, units)
+
+    def finishing(self: Telling, units: int = 1, *rest: Any, **named: Any) -> None:
+        add(0, units)
+        done(self, units, *rest, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, method in (("begin", beginning), ("more", adding), ("done", finishing)):
+            patch.setattr(Telling, name, method)
+        yield phases
+
+
+def unended(phases: Sequence[tuple[str, int, int]]) -> list[tuple[str, int, int]]:
+    """Return the phases with a total at which their counter did not end."""
+    return [phase for phase in phases if phase[1] and phase[1] != phase[2]]
+
+
 def inside(*words: object) -> Said:
     """Run the command to its end in the test's process, which costs no start; also in fixtures of whole modules."""
     with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err, warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        code = run([str(word) for word in words])
+        with counters() as phases:
+            code = run([str(word) for word in words])
+    assert code not in (0, 4) or not unended(phases), phases
     return Said(code, out.getvalue(), err.getvalue())
 
 
@@ -162,8 +200,10 @@ class Here:
         with warnings.catch_warnings():
             # The command hides what NumPy says; an ordinary run leaves nothing to hide, and no more does a refusal.
             warnings.simplefilter("error", RuntimeWarning)
-            code = run([str(word) for word in words])
+            with counters() as phases:
+                code = run([str(word) for word in words])
         said = Said(code, *self.capture.readouterr())
+        assert code not in (0, 4) or not unended(phases), phases
         assert unknown_options([str(word) for word in words], said.err) == [], said.err
         # A refusal may say what was given, and the help what nodata is.
         assert code != 0 or "--help" in words or not unfinished_numbers(said.out + "\n" + said.err), said.out + said.err

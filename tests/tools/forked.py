@@ -196,6 +196,6 @@ def _run(words: list[str], folder: Path, mishap: Mishap) -> None:
     if mishap.most_bytes:
         resource.setrlimit(resource.RLIMIT_FSIZE, (mishap.most_bytes, mishap.most_bytes))
     code = run(words)
-    phases = [(name, units, each.units[name]) for each in kept for name, units, _ in each.phases]
+    phases = [(name, units + each.added[name], each.units[name]) for each in kept for name, units, _ in each.phases]
     os.write(told, (json.dumps({"phases": phases}) + "\n").encode())
     os._exit(code)

@@ -202,6 +202,8 @@ class Runner(Generic[T]):
         """In the order of the products; complete when the context ends."""
         self.workers, self._in_flight, self._events = workers, in_flight or workers.in_flight, events
         self._excuse = excuse
+        self._left = 0
+        """Tiles of the product in work that are not counted yet."""
         self._completing: deque[tuple[Work[T] | Kept[T], Future[T]]] = deque()
         self._pool = ThreadPoolExecutor(1, "photoplan-complete")
 
@@ -240,6 +242,7 @@ class Runner(Generic[T]):
                     self._events.kept(work.tiles)
                     self._settle_done()
                     continue
+                self._left = len(work.tiles)
                 with ExitStack() as stack:
                     try:
                         for sink in work.sinks:
@@ -248,6 +251,7 @@ class Runner(Generic[T]):
                     except PhotoplanError as error:
                         self._settle(0)
                         self._tell(self._excused(work, error))
+                        self._events.done(self._left)
                         continue
                     # Files of one product are assembled at a time; that of the next one is already computed.
                     self._settle(0)
@@ -267,6 +271,7 @@ class Runner(Generic[T]):
         if tally.resumed:
             self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
             self._events.kept(tally.resumed)
+            self._left -= tally.resumed
         if work.count:
             empty = np.ones(work.count, bool)
             for tile in work.tiles:
@@ -290,6 +295,7 @@ class Runner(Generic[T]):
                     tally.failed.append(tile.index)
                     tally.reasons.append(f"tile {tile.index}: {outcome.error}")
                 job.ended(tile)
+                self._left -= 1
                 self._events.done(1, tile.pixels, *job.under_way())
                 self._settle_done()
         return tally

@@ -169,7 +169,7 @@ def make_contours(request: ContourRequest, events: Events = SILENT) -> ContourFa
     run = _Run(facts, _labeller(request, bounds), request.label_all or request.options.index == 0)
     parts, count = contour_parts(terrain, request)
     events.begin("contours", count, "parts")
-    lines = trace_contours(_counted(parts, events), request.options)
+    lines = trace_contours(_counted(parts, count, events), request.options)
     labels = (lambda: facts.labels) if request.labels else None
     facts.files = write_contours(
         request.output, run.rows(lines), labels, terrain.crs, inputs=[request.model], overwrite=request.overwrite
@@ -209,7 +209,9 @@ def contour_parts(terrain: OpenTerrain, request: ContourRequest) -> tuple[Iterat
     return parts, -(-(columns - 1) // SIDE) * -(-(rows - 1) // SIDE)
 
 
-def _counted(parts: Iterable[SurfacePart], events: Events) -> Iterator[SurfacePart]:
+def _counted(parts: Iterable[SurfacePart], count: int, events: Events) -> Iterator[SurfacePart]:
     for part in parts:
         yield part
         events.done(1, (part.heights.shape[0] - 1) * (part.heights.shape[1] - 1))
+        count -= 1
+    events.done(count)  # parts outside the bounds or without terrain

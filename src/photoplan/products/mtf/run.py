@@ -95,13 +95,22 @@ def measure_mtf(request: MtfRequest, events: Events = SILENT) -> MtfReport:
         events.talk(f"note: {ENCODED}")
     results: list[ImageMtf] = []
     events.begin("edges", sum(measuring.steps(image) for image in opened.values()), "tiles")
+    left = 0
+
+    def advance(steps: int, pixels: int = 0) -> None:
+        nonlocal left
+        left -= steps
+        events.done(steps, pixels)
+
     for path, image in opened.items():
+        left = measuring.steps(image)
         try:
-            results.append(measure_image(names[path], path, image, measuring, events.done))
+            results.append(measure_image(names[path], path, image, measuring, advance))
         except (ResourceError, UsageError):
             raise
         except PhotoplanError as error:
             failed[names[path]] = str(error)
+            events.done(left)
     done = bool(results)
     made = MtfReport(
         tuple(results),

@@ -51,6 +51,7 @@ class Looked:
 def look_at(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Looked], list[str]]:
     """Oriented images that see terrain, and a line for each of the others."""
     names, blind = project.oriented(names, approximate=force)
+    events.done(len(blind))
     scenes: dict[str, Scene] = {}
     seen: dict[str, tuple[JudgedView | None, ImagePlausibility]] = {}
     for place in map_order(project, names):

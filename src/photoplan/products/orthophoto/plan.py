@@ -160,6 +160,7 @@ def plan_orthophotos(
     # Each image is looked at twice: where it lies, and which tiles it needs.
     events.begin("planning", 2 * len(names), "steps")
     looked, blind = look_at(project, names, force, events)
+    events.done(len(names) - len(looked))
     chosen = with_resolution(chosen, looked, force)
     judge_bounds(project, chosen, [one.look.footprint for one in looked])
     products = []

@@ -254,6 +254,7 @@ def restore_images(request: RestoreRequest, events: Events = SILENT, more: bool 
                 yield restoration(job, request, events)
             except PhotoplanError as error:
                 failed[job.reader.info.path.name] = str(error)
+                events.done(job.tiles)
 
     def excuse(work: Work[RestoredImage | None], error: PhotoplanError) -> None:
         if isinstance(error, ResourceError | RunLocked):

@@ -84,6 +84,7 @@ def over_frame(
     u, v = (np.linspace(bounds[k], bounds[k + 2], _POINTS) for k in (0, 1))
     uvh = np.stack([*np.meshgrid(u, v), np.full((_POINTS, _POINTS), height)], axis=-1).reshape(-1, 3)
     names, blind = project.oriented(names)
+    events.done(len(blind))
     seen, behind = {}, 0
     for name in (names[place] for place in map_order(project, names)):
         camera = FramedCamera(open_scene(project, name).camera, frame, bounds)
