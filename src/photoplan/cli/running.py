@@ -60,7 +60,7 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     events.talk(
         f"plan: {plan.what}, {tiles} tiles · {settings.resolution:g} m · kernel {settings.kernel} · "
         f"{settings.exactness} · nodata {settings.nodata} · "
-        f"hidden {settings.hidden} · {how.workers} {how.executor}"
+        f"hidden {settings.hidden}{settings.filling} · {how.workers} {how.executor}"
     )
     for line in plan.blind:
         events.talk(f"  note: left out: {line}")
@@ -132,6 +132,10 @@ def _hidden(results: list[ProductResult]) -> str:
     areas = [r.hidden for r in results if r.hidden is not None]
     outside = [r.bare for r in results if r.bare is not None]
     hidden = f" · hidden {_area(areas)} m²" if areas else ""
+    filled = [r.filled for r in results if r.filled is not None]
+    if filled:
+        images, around = (_area([each[name] for each in filled]) for name in ("images", "surroundings"))
+        hidden += f", of it filled {images} m² from images and {around} m² from surroundings"
     gaps = [r.gaps for r in results if r.gaps is not None]
     hidden += f" · gaps {_area(gaps)} m²" if gaps else ""
     return f"{hidden} · in no image {_area(outside)} m²" if outside else hidden

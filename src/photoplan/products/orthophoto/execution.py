@@ -231,7 +231,7 @@ def _complete(
             # A product without regions does not need the libraries of vector data.
             from photoplan.io.regions import source_regions, write_regions  # noqa: PLC0415
 
-            shapes = source_regions(standing(files["sources"].path), product.grid)
+            shapes = source_regions(standing(files["sources"].path), product.grid, len(product.images))
             painted = {product.images[row - 1]: float(shape.area) for row, shape in shapes.items()}
             write_regions(seams_path(file.path), product.images, shapes, product.grid.crs)
         ran = times()
@@ -246,6 +246,9 @@ def _complete(
             tiles=len(product.plan.tiles),
             resumed=tally.resumed,
             hidden=_area(tally, "hidden", product) if plan.settings.asks_hidden else None,
+            filled={name: _area(tally, f"filled_from_{name}", product) for name in ("images", "surroundings")}
+            if plan.settings.fill_hidden
+            else None,
             bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product, address),
             gaps=_area(tally, "gaps", product) if plan.settings.method == "direct" else None,
             painted=painted,

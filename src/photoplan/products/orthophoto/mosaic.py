@@ -89,8 +89,9 @@ def _product(
     """A mosaic, or a sheet of one, of the images that see a part of it; None: none does."""
     assert chosen.choice is not None
     name, grid = name + sheet.end, sheet.grid
-    # Whose seams lie beside a tile decides about weights in it: also beyond the product.
-    side = chosen.tile if chosen.choice.feather else 0
+    # Whose seams lie beside a tile decides about weights in it, and who sees what is there about holes in it: also
+    # beyond the product.
+    side = chosen.tile if chosen.choice.feather or chosen.fill_hidden else 0
     margin = side * grid.resolution
     wide = MapGrid(
         left=grid.left - margin,
