@@ -259,9 +259,9 @@ class How:
         names = ("workers", "executor", "memory", "overwrite", "as_json", "quiet")
         return cls(quicklook=not options.pop("no_quicklook"), **{name: options.pop(name) for name in names})
 
-    def run(self, events: Events) -> Run:
+    def run(self, events: Events, again: bool = False) -> Run:
         """What is asked of a run, told to `events`."""
         from photoplan.plain import pick
         from photoplan.products.run import Run
 
-        return Run(**pick(self, "workers", "executor", "memory", "overwrite", "quicklook"), events=events)
+        return Run(**pick(self, "workers", "executor", "memory", "overwrite", "quicklook"), events=events, again=again)
