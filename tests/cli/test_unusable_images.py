@@ -81,7 +81,7 @@ def test_fault_08_one_unusable_image_of_many(photoplan: Here, small: Block, verb
         assert re.search(r"left out: two: cannot be used", said.err), said.err
     made = {path.name for path in small.folder.rglob("*") if path.is_file()}
     wanted = {
-        "ortho": {"one_ortho.tif", "three_ortho.tif", "one_ortho.run.json", "overview.png"},
+        "ortho": {"one_ortho.tif", "three_ortho.tif", "one_ortho.run.json", "ortho_overview.png"},
         "mosaic": {"mosaic.tif", "mosaic_seams.gpkg"},
         "balance": {"one.toml", "three.toml", "overlaps.csv"},
         "seams": {"seams.gpkg"},
