@@ -76,6 +76,15 @@ class TestBuilt:
         said = photoplan("dtm", "build", level, "-o", tmp_path / "n.gpkg", "--crs", "EPSG:32633", "--no-report")
         assert said.err.count("the surface is level") == 1
 
+    def test_files_without_anything_are_refused_by_name(self, photoplan: Here, tmp_path: Path) -> None:
+        place = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}
+        empty = tmp_path / "empty.geojson"
+        empty.write_text(json.dumps({"type": "FeatureCollection", "features": [], "crs": place}))
+        level = write_text(tmp_path / "p.csv", ground(60) * [1, 1, 0] + [0, 0, -9999])
+        for file, words in ((empty, ()), (level, ("--crs", "EPSG:32633", "--nodata", -9999))):
+            said = photoplan("dtm", "build", file, "-o", tmp_path / "m.gpkg", *words, "--no-report")
+            assert said.code == 3 and f"{file}: " in said.err and "holds no" in said.err, said
+
     def test_what_was_converted_or_left_out_is_printed_once_also_quietly(self, photoplan: Here, tmp_path: Path) -> None:
         ezdxf = pytest.importorskip("ezdxf")
         document = ezdxf.new("R2010", setup=False)

@@ -154,6 +154,7 @@ class _Group:
             theirs = set(map(_place, _noted(path)[0]))
             if place not in waiting and (path.parent in self.folders or waiting & theirs):
                 _note(path).unlink(missing_ok=True)
+                _remove_dead(path.parent)
         for path in self.waiting:
             self._write_note(path, _identity(self.pending[path]))
         for path in self.waiting:
