@@ -86,10 +86,10 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
             raise
         others: list[tuple[float, float, FiducialResult]] = []
         for degrees in (0.0, OTHER_DIRECTIONS[0]):
-            other = layout.with_turned_marks(degrees) if degrees else layout
-            if other is None or any(_correlation(each) >= _SURE for *_, each in others):
+            turned_layout = layout.with_turned_marks(degrees) if degrees else layout
+            if turned_layout is None or any(_correlation(each) >= _SURE for *_, each in others):
                 break
-            sizes = [(degrees, factor, _resized(scan, other, known, factor)) for factor in OTHER_SIZES]
+            sizes = [(degrees, factor, _resized(scan, turned_layout, known, factor)) for factor in OTHER_SIZES]
             others += [(turn, factor, each) for turn, factor, each in sizes if each is not None]
         if not others:
             raise
