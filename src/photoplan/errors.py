@@ -9,7 +9,7 @@
     │   └── GeometryError              rank, visibility or overlap do not allow the computation
     │       └── DatumDefect            nothing determines where a block lies
     ├── TilesFailed           exit 4   finished, but some tiles failed; they are listed
-    │   └── ImagesLeftOut              finished, but some images of a block are not oriented
+    │   └── ImagesLeftOut              finished, but without some of the images
     ├── ResourceError         exit 5   disk or memory is exhausted
     └── RunLocked             exit 2   another run is writing the same product
 
@@ -60,7 +60,7 @@ class TilesFailed(PhotoplanError):
 
 
 class ImagesLeftOut(TilesFailed):
-    """A block was adjusted and written, but the images listed in the message could not be oriented."""
+    """The run finished, but without the images listed in the message: not oriented, or their files cannot be used."""
 
 
 class ResourceError(PhotoplanError):

@@ -7,8 +7,10 @@ A data class becomes an object of its fields, under their names. One whose JSON 
 from __future__ import annotations
 
 import dataclasses
+import html
 import json
 import math
+import re
 from collections.abc import Mapping
 from datetime import date, datetime
 from enum import Enum
@@ -32,6 +34,21 @@ class HasJsonFields(Protocol):
 def pick(value: object, *names: str, **keys: str) -> dict[str, Any]:
     """Attributes of a value by their names, and by other keys: ``pick(run, "tiles", seconds="wall_seconds")``."""
     return {name: getattr(value, name) for name in names} | {key: getattr(value, name) for key, name in keys.items()}
+
+
+#: What XML 1.0 cannot hold, in whatever form.
+_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def xml_text(value: str) -> str:
+    """Escape text for an element of XML; characters that XML cannot hold become U+FFFD."""
+    return html.escape(_NOT_XML.sub("\ufffd", value), quote=False).replace("\r", "&#13;")
+
+
+def xml_quoted(value: str) -> str:
+    """Quote and escape text for an attribute of XML; characters that XML cannot hold become U+FFFD."""
+    escaped = html.escape(_NOT_XML.sub("\ufffd", value))
+    return '"' + re.sub("[\t\n\r]", lambda found: f"&#{ord(found[0])};", escaped) + '"'
 
 
 def advised(least: float, figures: int = 2) -> str:

@@ -263,13 +263,13 @@ def test_the_demo_runs_on_the_package_alone(photoplan: Here, tmp_path: Path) -> 
 
 
 def test_fault_08_one_bad_image_does_not_end_a_check(small: Block) -> None:
-    """The others are checked; the bad one has a fault, and the command fails."""
+    """The others are checked; the bad one is listed with its reason, and the command fails."""
     project = load_project(small.project)
     project.resolve(project.image("two").file).write_bytes(b"II*\0 cut off")
     said = inside("check", small.project, "--json")
     found = {image["image"]: image["fault"] for image in json.loads(said.out)["images"]}
-    assert said.code == 3
-    assert found.pop("two").startswith("cannot be used: ")
+    assert said.code == 4
+    assert json.loads(said.out)["unusable"]["two"].startswith("cannot be used: ")
     assert len(found) > 1
     assert set(found.values()) == {None}
     assert inside("check", small.project, "--images", "two").code == 3

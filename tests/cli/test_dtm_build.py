@@ -73,6 +73,33 @@ class TestBuilt:
         level = write_text(tmp_path / "p.csv", ground(60) * [1, 1, 0])
         said = photoplan("dtm", "build", level, "-o", tmp_path / "m.gpkg", "--crs", "EPSG:32633", "-q", "--no-report")
         assert said.code == 0 and "heights are 0 m: the surface is level" in said.err
+        said = photoplan("dtm", "build", level, "-o", tmp_path / "n.gpkg", "--crs", "EPSG:32633", "--no-report")
+        assert said.err.count("the surface is level") == 1
+
+    def test_files_without_anything_are_refused_by_name(self, photoplan: Here, tmp_path: Path) -> None:
+        place = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}
+        empty = tmp_path / "empty.geojson"
+        empty.write_text(json.dumps({"type": "FeatureCollection", "features": [], "crs": place}))
+        level = write_text(tmp_path / "p.csv", ground(60) * [1, 1, 0] + [0, 0, -9999])
+        for file, words in ((empty, ()), (level, ("--crs", "EPSG:32633", "--nodata", -9999))):
+            said = photoplan("dtm", "build", file, "-o", tmp_path / "m.gpkg", *words, "--no-report")
+            assert said.code == 3 and f"{file}: " in said.err and "holds no" in said.err, said
+
+    def test_what_was_converted_or_left_out_is_printed_once_also_quietly(self, photoplan: Here, tmp_path: Path) -> None:
+        ezdxf = pytest.importorskip("ezdxf")
+        document = ezdxf.new("R2010", setup=False)
+        document.header["$INSUNITS"] = 2  # feet
+        for x, y, z in ground(60) / 0.3048:
+            document.modelspace().add_point((x, y, z))
+        document.modelspace().add_3dface([(EAST / 0.3048 + k % 2, NORTH / 0.3048 + k // 2, 820) for k in (0, 1, 3)])
+        document.saveas(tmp_path / "d.dxf")
+        words = ("--crs", "EPSG:32633", "--height-system", "EPSG:5773", "--no-report")
+        for k, quiet in enumerate(((), ("-q",))):
+            said = photoplan("dtm", "build", tmp_path / "d.dxf", "-o", tmp_path / f"{k}.gpkg", *words, *quiet)
+            assert said.code == 0, said.err
+            notes = [line.strip() for line in said.err.splitlines() if "d.dxf: " in line]
+            assert all(note.startswith("note: ") for note in notes), said.err
+            assert len(set(notes)) == len(notes) >= 2, said.err
 
     def test_json_gives_the_figures(self, photoplan: Here, survey: Path, tmp_path: Path) -> None:
         said = photoplan("dtm", "build", survey, "-o", tmp_path / "m.gpkg", "--json", "-q", "--no-report")

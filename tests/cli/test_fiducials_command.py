@@ -120,6 +120,23 @@ def test_marks_that_are_turned_are_tried_and_named(scans, tmp_path: Path, photop
         assert (mark["x"], mark["y"]) == pytest.approx(truth["a"][mark["name"]], abs=0.1)
 
 
+def test_marks_that_are_turned_and_of_another_size_are_named(scans, tmp_path: Path, photoplan: Here) -> None:  # type: ignore[no-untyped-def]
+    """A description without `rotation`, of marks a quarter too large: neither change alone fits."""
+    folder, truth = scans
+    large = (
+        f'marks = {{ type = "ring_cross", diameter = {1.25 * (2 * RADIUS + LINE)}, width = {1.25 * LINE}, '
+        f"arm = {1.25 * ARM}, cross_width = {2.5 * LINE / 3}, free = {1.25 * FREE}, margin = 0.1 }}"
+    )
+    (tmp_path / "camera.toml").write_text(CAMERA.replace(MARKS, large))
+    words = ("--camera", tmp_path / "camera.toml", "--scan-resolution", "100um", "--json")
+    said = photoplan("fiducials", folder / "a.tif", *words)
+    assert said.code == 0, said.err
+    (image,) = json.loads(said.out)["images"]
+    assert any("turned by 45° and 0.8 times as large: add 45" in note for note in image["notes"]), image["notes"]
+    for mark in image["marks"]:
+        assert (mark["x"], mark["y"]) == pytest.approx(truth["a"][mark["name"]], abs=0.2)
+
+
 def test_lines_name_every_mark_and_what_is_missing(scans, photoplan: Here) -> None:  # type: ignore[no-untyped-def]
     folder, _ = scans
     said = photoplan("fiducials", folder / "b.tif", "--camera", folder / "camera.toml")

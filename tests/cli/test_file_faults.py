@@ -64,14 +64,14 @@ class TestFaults07To09Files:
         with rasterio.open(bomb, "w", tiled=True, blockxsize=4096, blockysize=4096, bigtiff="YES", **profile):
             pass
         with at_most(1):
-            said = photoplan("ortho", small.project, *OPTIONS)
+            said = photoplan("ortho", small.project, *OPTIONS, "--images", "one")
         assert said.code == 3
         assert f"{bomb}: the header promises 400000 × 400000 pixels" in said.err
 
     def test_fault_08_truncated(self, photoplan: Here, small: Block) -> None:
         image = small.images[0]
         image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
-        said = photoplan("ortho", small.project, *OPTIONS)
+        said = photoplan("ortho", small.project, *OPTIONS, "--images", "one")
         assert said.code == 3
         assert str(image) in said.err
         assert "Get a fresh copy" in said.err
@@ -86,7 +86,7 @@ class TestFaults07To09Files:
             offset = int(file.get_tag_item("BLOCK_OFFSET_2_1", "TIFF", bidx=2))
         content[offset : offset + 8] = b"\xff" * 8
         image.write_bytes(content)
-        said = photoplan("ortho", small.project, *OPTIONS, "--workers", 1)
+        said = photoplan("ortho", small.project, *OPTIONS, "--workers", 1, "--images", "one")
         assert said.code == 3
         assert f"{image}: band 2, window col " in said.err
         assert "the pixels cannot be read" in said.err
@@ -118,7 +118,7 @@ class TestFaults07To09Files:
             f'<VRTDataset rasterXSize="200" rasterYSize="150"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
             f"<SourceFilename>{secret}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
         )
-        said = refused(photoplan, small.project)
+        said = refused(photoplan, small.project, image="one")
         assert str(path) in said
         assert "it is not followed" in said
 

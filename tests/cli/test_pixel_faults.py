@@ -97,7 +97,7 @@ class TestFaults22And24Pixels:
     ) -> None:
         bands = 4 if "photometric" in options else 1
         write_image(small.images[0], (texture(bands=bands) // 128).astype(dtype), **options)
-        said = refused(photoplan, small.project)
+        said = refused(photoplan, small.project, image="one")
         assert f"{small.images[0]}: " in said
         assert message in said
 

@@ -200,7 +200,7 @@ def test_fault_07_a_bomb_is_refused_from_its_header(project: Path) -> None:
     with rasterio.open(bomb, "w", tiled=True, blockxsize=4096, blockysize=4096, bigtiff="YES", **profile):
         pass
     with at_most(1):
-        said = surface(project)
+        said = surface(project, "--images", "i1,i2")
     assert said.code == 3 and f"{bomb}: the header promises 400000 × 400000 pixels" in said.err
 
 

@@ -28,10 +28,11 @@ from tools.town import House
 from photoplan.cameras.base import project
 from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.project.file import load_project
-from photoplan.project.rendered import ProjectScene
+from photoplan.project.rendered import DrapedTexture, ProjectScene
 from photoplan.quality.formation.rendered import RenderedScene, SolidTexture
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.objects import ObjectSurface
+from photoplan.surfaces.rays import Hits
 
 GROUND, GRAIN = 100.0, 8.0
 HOUSES = [
@@ -204,3 +205,30 @@ def test_a_camera_needs_rays_only() -> None:
     XYZ = scene.hits(np.stack([col, row], axis=-1).reshape(-1, 2)).XYZ.reshape(30, 40, 3)
     expected = np.stack([(col - 19.5) / 40 * 50, -row * 2.0, 10.0 + 0 * col], axis=-1)
     assert np.allclose(XYZ[:, :39], expected[:, :39], atol=1e-6) and np.isnan(XYZ[:, 39]).all()
+
+
+@pytest.mark.parametrize("how", ["table", "names"])
+def test_a_texture_of_classes_is_taken_by_the_nearest_pixel(tmp_path: Path, how: str) -> None:
+    """Also where rays lie far apart, and over the border of the raster."""
+    numbers = np.random.default_rng(3).integers(0, 4, (2100, 300)).astype(np.uint8)
+    place = {"crs": CRS, "transform": from_origin(X0, Y0, 0.5, 0.5)}
+    table = {0: (250, 10, 10), 1: (10, 240, 20), 2: (30, 20, 230), 3: (200, 200, 40)}
+    file = write_image(tmp_path / "c.tif", numbers[None], **place)
+    if how == "table":
+        with rasterio.open(file, "r+") as opened:
+            opened.write_colormap(1, table)
+    else:
+        names = "<CategoryNames><Category>wood</Category></CategoryNames>"
+        text = f'<PAMDataset><PAMRasterBand band="1">{names}</PAMRasterBand></PAMDataset>'
+        file.with_name("c.tif.aux.xml").write_text(text)
+    X, Y = np.random.default_rng(4).uniform((X0 - 20, Y0 - 1070), (X0 + 170, Y0 + 20), (5000, 2)).T
+    hits = replace(Hits.none(5000), XYZ=np.column_stack([X, Y, np.zeros(5000)]), owner=np.zeros(5000, np.int64))
+    other = SolidTexture(5.0)
+    texture = DrapedTexture.of(file, CRS, other)
+    found = texture(hits)
+    col, row = np.floor((X - X0) / 0.5).astype(int), np.floor((Y0 - Y) / 0.5).astype(int)
+    inside_ = (col >= 0) & (col < 300) & (row >= 0) & (row < 2100)
+    wanted = numbers[row[inside_], col[inside_]]
+    colours = np.array([table[k] for k in range(4)])[wanted].T if how == "table" else wanted[None]
+    np.testing.assert_array_equal(found[:, inside_], colours)
+    np.testing.assert_array_equal(found[:, ~inside_], replace(other, bands=len(found))(hits)[:, ~inside_])

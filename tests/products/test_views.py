@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from tools.command import inside, unfinished_numbers
 from tools.small_block import SIZE, X0, Y0, Block, write_block
 
 from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.plan import product
 from photoplan.products.run import Run
 from photoplan.products.view.camera import CameraRequest, view_camera
-from photoplan.products.view.content import ContentRequest
+from photoplan.products.view.content import ContentRequest, class_colours
 from photoplan.products.view.ground import open_view_ground
 from photoplan.products.view.job import LookRequest, ViewAddress, hazy
 from photoplan.products.view.make import ViewPlan, ViewRequest, make_view, plan_view
@@ -316,3 +318,73 @@ def test_class_rasters_keep_their_classes(small: Block, tmp_path: Path, samples:
     found = {tuple(map(int, colour)) for colour in np.moveaxis(picture[:3], 0, -1).reshape(-1, 3)}
     assert found <= {*table.values(), (1, 2, 3), tuple(look.nodata)}
     assert {*table.values()} <= found
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16"])
+@pytest.mark.parametrize("how", ["word", "names", "table", "vat"])
+@pytest.mark.parametrize("samples", [1, 2])
+def test_class_rasters_without_a_colour_table(small: Block, tmp_path: Path, dtype: str, how: str, samples: int) -> None:
+    """As many colours as classes, far from each other: stated by a word, category names or an attribute table."""
+    numbers = np.array([3, 4, 111, 112] if dtype == "uint8" else [3, 4, 111, 1112], dtype)
+    with rasterio.open(small.terrain) as terrain:
+        profile = {"crs": terrain.crs, "transform": terrain.transform, "width": terrain.width, "height": terrain.height}
+    index = np.random.default_rng(8).integers(0, 4, (1, profile["height"], profile["width"]))
+    file = tmp_path / "c.tif"
+    with rasterio.open(file, "w", driver="GTiff", count=1, dtype=dtype, **profile) as out:
+        out.write(numbers[index])
+    aux = {
+        "names": "<CategoryNames><Category>none</Category><Category>wood</Category></CategoryNames>",
+        "table": '<GDALRasterAttributeTable tableType="thematic"><FieldDefn index="0"><Name>Value</Name><Type>0</Type>'
+        "<Usage>5</Usage></FieldDefn></GDALRasterAttributeTable>",
+    }
+    if how in aux:
+        band = f'<PAMRasterBand band="1">{aux[how]}</PAMRasterBand>'
+        file.with_name("c.tif.aux.xml").write_text(f"<PAMDataset>{band}</PAMDataset>")
+    elif how == "vat":
+        file.with_name("c.tif.vat.dbf").write_bytes(b"")
+    content = ContentRequest.parse(f"{file}@classes" if how == "word" else str(file))
+    look = LookRequest(contents=(content,), samples=samples, sky=(1, 2, 3))
+    _, picture = made(ViewRequest(small.terrain, STAND, tmp_path / "v.tif", look=look))
+    found = {tuple(map(int, colour)) for colour in np.moveaxis(picture[:3], 0, -1).reshape(-1, 3)}
+    colours = np.array(sorted(found - {(1, 2, 3), tuple(look.nodata)}))
+    assert len(colours) == len(numbers)
+    apart = np.abs(colours[:, None] - colours).max(axis=-1)
+    assert apart[~np.eye(4, dtype=bool)].min() > 20
+
+
+def test_grey_values_are_no_classes_unless_it_is_said(small: Block, tmp_path: Path) -> None:
+    """Of whole numbers without names the values are mixed; classes of several bands or fractions are refused."""
+    assert ContentRequest.parse(f"{small.terrain}@0.5@classes") == ContentRequest.parse(f"{small.terrain}@classes@0.5")
+    with pytest.raises(UsageError, match="only the file of a raster has classes"):
+        ContentRequest.parse("tint@classes")
+    look = LookRequest(contents=(ContentRequest.parse(f"{small.terrain}@classes"),))
+    with pytest.raises(UsageError, match="classes are whole numbers in one band"):
+        made(ViewRequest(small.terrain, STAND, tmp_path / "v.tif", look=look))
+    numbers = np.arange(256)
+    colours = class_colours(numbers[None])[:, 0].T
+    assert len({tuple(c) for c in colours.tolist()}) == 256 and colours.min() >= 0 and colours.max() <= 255
+
+
+def test_tolerance_0_is_the_strict_way(small: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every pixel is computed strictly; anchors of a tolerance give the same picture to a grey value or so."""
+    compiled, residuals, pictures = product.compile_anchors, list[float](), {}
+
+    def noted(*words: Any, **more: Any) -> Any:
+        anchors = compiled(*words, **more)
+        residuals.extend([] if anchors is None else [anchors.residual])
+        return anchors
+
+    monkeypatch.setattr(product, "compile_anchors", noted)
+    for tolerance in (0.0, 0.02):
+        residuals.clear()
+        look = LookRequest(contents=(ContentRequest("photos"),), samples=1, tolerance=tolerance)
+        _, picture = made(ViewRequest(small.project, STAND, tmp_path / f"{tolerance}.tif", look=look))
+        pictures[tolerance] = picture.astype(int)
+        assert residuals and (max(residuals) == 0) == (tolerance == 0), residuals
+    off = np.abs(pictures[0.0] - pictures[0.02])
+    assert off.max() <= 3 and off.mean() < 0.1
+    for wrong in (-1.0, 1e-9, 11.0, float("nan")):
+        with pytest.raises(UsageError, match="must be 0"):
+            LookRequest(tolerance=wrong)
+    said = inside("view", small.project, "--from", X0, Y0, "--tolerance", -1, "-o", tmp_path / "v.png")
+    assert said.code == 2 and "must be 0" in said.err

@@ -255,11 +255,12 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new))
 
 
-def refused(photoplan: Here, project: Path, *words: object) -> str:
-    """What `check` and `ortho` say when they refuse a project; neither leaves a product."""
-    said = photoplan("check", project)
+def refused(photoplan: Here, project: Path, *words: object, image: str | None = None) -> str:
+    """Return what `check` and `ortho` print when they refuse a project, or an image alone; neither leaves a product."""
+    alone = () if image is None else ("--images", image)
+    said = photoplan("check", project, *alone)
     assert said.code == 3, said
-    said = photoplan("ortho", project, *OPTIONS, *words)
+    said = photoplan("ortho", project, *OPTIONS, *words, *alone)
     assert said.code == 3, said
     assert said.out == ""
     assert not list(project.parent.glob("products/*.tif"))

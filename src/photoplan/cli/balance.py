@@ -38,6 +38,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     from photoplan.cli.telling import Telling
     from photoplan.io.naming import together
     from photoplan.products.balance.run import BalanceRequest, balance_project
+    from photoplan.project.scene import refuse_unusable
     from photoplan.report.balance import draw_balance
     from photoplan.report.page import open_picture
 
@@ -62,6 +63,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
         _print(found)
     for note in found.notes:
         say(note)
+    refuse_unusable(found.unusable, len(found.survey.names) + len(found.survey.blind))
 
 
 def _print(found: BalanceReport) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from photoplan.cli.options import PATH, POSITIVE, beyond_area_option, ending
-from photoplan.cli.output import can_draw, say, show, show_json
+from photoplan.cli.output import can_draw, is_doubt, say, show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.dtm.build import BuildReport, BuildRequest
@@ -71,7 +72,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
         show(describe_plan(plan, measured, crs, system))
         for finding in findings:
             show(f"  {finding.kind}: {finding.text}")
-        for note in measured.notes:
+        for note in _noted(measured.notes):
             show(f"  {note}")
         return
     page = open_build_report(request.output, wanted, request.overwrite)
@@ -91,8 +92,8 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
         show(report)
     for line in _summary(built):
         events.talk(line)
-    if warning:
-        say(warning)
+    for line in _noted([*built.measured.notes, *([f"warning: {warning}"] if warning else [])]):
+        say(f"  {line}")
 
 
 def _request(options: dict[str, Any]) -> BuildRequest:
@@ -162,9 +163,16 @@ def _summary(built: BuildReport) -> list[str]:
     if built.suspects:
         lines.append(f"suspects, used all the same: {len(built.suspects)}; look at them in the report or the model")
     if built.findings:
-        lines.append(f"findings in the measurements: {len(built.findings)}")
+        lines.append(f"note: findings in the measurements: {len(built.findings)}")
         lines += [f"  {finding.kind}: {finding.text}" for finding in built.findings[:_SHOWN]]
-    return lines + [f"  {note}" for note in built.measured.notes[:_SHOWN]]
+    return lines
+
+
+def _noted(notes: Sequence[str]) -> list[str]:
+    """Return notes once each, in words that `quiet` does not hide; of many the first ones."""
+    found = [note if is_doubt(note) else f"note: {note}" for note in dict.fromkeys(notes)]
+    more = len(found) - _SHOWN
+    return found[:_SHOWN] + ([f"note: {more} more notes are in the model's record"] if more > 0 else [])
 
 
 def _bend(c: dict[str, Any]) -> str:

@@ -177,6 +177,12 @@ product_options = several(
         "--hidden",
         help="What no image sees: show, nodata, or mark (second raster) [ortho: show; mosaic, --true: nodata].",
     ),
+    click.option(
+        "--fill-hidden",
+        type=int,
+        metavar="PX",
+        help="Fill hidden holes up to PX wide and high, marked in NAME_sources.tif [0: they stay empty].",
+    ),
     click.option("--accuracy", is_flag=True, default=None, help="Also a raster of standard deviations, a picture."),
     click.option("--compress", help="deflate, zstd, lzw, jpeg or none [deflate]."),
     click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto]."),
@@ -253,9 +259,9 @@ class How:
         names = ("workers", "executor", "memory", "overwrite", "as_json", "quiet")
         return cls(quicklook=not options.pop("no_quicklook"), **{name: options.pop(name) for name in names})
 
-    def run(self, events: Events) -> Run:
+    def run(self, events: Events, again: bool = False) -> Run:
         """What is asked of a run, told to `events`."""
         from photoplan.plain import pick
         from photoplan.products.run import Run
 
-        return Run(**pick(self, "workers", "executor", "memory", "overwrite", "quicklook"), events=events)
+        return Run(**pick(self, "workers", "executor", "memory", "overwrite", "quicklook"), events=events, again=again)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +18,20 @@ from photoplan.io.project.model import Project
 from photoplan.products.orthophoto.execution import ProductResult, execute, seams_path
 from photoplan.products.orthophoto.finished import overview_path
 from photoplan.products.orthophoto.plan import OrthoPlan
+from photoplan.project.scene import refuse_unusable, without_unusable
 
 
 def telling(how: How) -> Telling:
     """Events of a run: paths of products go to stdout as soon as they are complete."""
 
+    printed = set()
+
     def product(value: object) -> None:
         if isinstance(value, ProductResult) and not value.failed and not how.as_json:
             for path in (value.path, *value.others):
-                click.echo(str(path))
+                if path not in printed:
+                    click.echo(str(path))
+                printed.add(path)
 
     return Telling(how.quiet, product)
 
@@ -35,32 +39,47 @@ def telling(how: How) -> Telling:
 def planned(
     project: Project, plan: Callable[..., OrthoPlan], options: dict[str, Any], how: How, events: Telling
 ) -> Callable[[], None]:
-    """Plan products with the options of `product_options`; what is called next makes them, or shows what would be
-    made."""
+    """Return what plans products with the options of `product_options` and makes them, or shows what would be made.
+
+    Images whose files cannot be used are left out, which it raises at last.
+    """
     folder = options.pop("output") or project.folder / "products"
     plan_file, dry_run, images = (options.pop(name) for name in ("plan_file", "dry_run", "images"))
     squares = options.pop("show_quadtree")
     if squares and not dry_run and plan_file is None:
         raise click.UsageError("--show-quadtree shows a plan: give --plan FILE or --dry-run, too")
     changes = {k: v for k, v in options.items() if v is not None and v != ()}
-    made = plan(project, images or None, events=events, **changes)
-    if dry_run or plan_file is not None:
-        # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
-        from photoplan.cli.show_plan import show_plan
+    begun = False
 
-        return partial(show_plan, made, folder, plan_file, how, events, squares)
-    return partial(execute_and_report, made, folder, how, events)
+    def make(usable: Project) -> None:
+        nonlocal begun
+        made = plan(usable, images or None, events=events, **changes)
+        if dry_run or plan_file is not None:
+            # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
+            from photoplan.cli.show_plan import show_plan
+
+            show_plan(made, folder, plan_file, how, events, squares)
+        else:
+            again, begun = begun, True
+            execute_and_report(made, folder, how, events, again=again)
+
+    def run() -> None:
+        _, left_out = without_unusable(project, images or None, make)
+        refuse_unusable(left_out, len(project.select(images or None)))
+
+    return run
 
 
-def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling) -> None:
+def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling, again: bool = False) -> None:
     """Make the products and print their paths, or one JSON object."""
+    events.results.clear()
     started, kernels, compiled = time.perf_counter(), COMPILATIONS.kernels, COMPILATIONS.seconds
     settings = plan.settings
     tiles = sum(len(p.plan.tiles) for p in plan.products)
     events.talk(
         f"plan: {plan.what}, {tiles} tiles · {settings.resolution:g} m · kernel {settings.kernel} · "
         f"{settings.exactness} · nodata {settings.nodata} · "
-        f"hidden {settings.hidden} · {how.workers} {how.executor}"
+        f"hidden {settings.hidden}{settings.filling} · {how.workers} {how.executor}"
     )
     for line in plan.blind:
         events.talk(f"  note: left out: {line}")
@@ -73,7 +92,7 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
             _draw_sources(results, events)
 
     try:
-        execute(plan, folder, how.run(events), then)
+        execute(plan, folder, how.run(events, again), then)
     except TilesFailed as error:
         failed = error
     seconds = time.perf_counter() - started
@@ -132,6 +151,10 @@ def _hidden(results: list[ProductResult]) -> str:
     areas = [r.hidden for r in results if r.hidden is not None]
     outside = [r.bare for r in results if r.bare is not None]
     hidden = f" · hidden {_area(areas)} m²" if areas else ""
+    filled = [r.filled for r in results if r.filled is not None]
+    if filled:
+        images, around = (_area([each[name] for each in filled]) for name in ("images", "surroundings"))
+        hidden += f", of it filled {images} m² from images and {around} m² from surroundings"
     gaps = [r.gaps for r in results if r.gaps is not None]
     hidden += f" · gaps {_area(gaps)} m²" if gaps else ""
     return f"{hidden} · in no image {_area(outside)} m²" if outside else hidden

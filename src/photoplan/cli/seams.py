@@ -27,6 +27,7 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     from photoplan.cli.telling import Telling
     from photoplan.io.naming import together
     from photoplan.products.seams.run import SeamsRequest, make_seams
+    from photoplan.project.scene import refuse_unusable
     from photoplan.report.maps import draw_regions
 
     request = SeamsRequest(**options)
@@ -54,3 +55,4 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
         show(f"{joined} at {found.survey.grid.resolution:g} m · {along}")
     for note in found.notes:
         say(note)
+    refuse_unusable(found.unusable, len(found.survey.names) + len(found.survey.blind))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from photoplan.cli.options import LISTED, NEW_FOLDER, PATH, bounds_option, dry_run_option, executing, images_option
+
+if TYPE_CHECKING:
+    from photoplan.io.project.model import Project
 
 
 @click.command("surface")
@@ -64,6 +67,7 @@ def command(project: Path, **options: Any) -> None:
     from photoplan.products.surface.plan import plan_surface
     from photoplan.products.surface.run import make_surface
     from photoplan.products.surface.settings import SurfaceSettings
+    from photoplan.project.scene import refuse_unusable, without_unusable
     from photoplan.report.maps import draw_surface
     from photoplan.report.page import open_report
     from photoplan.report.surface import surface_page
@@ -74,8 +78,9 @@ def command(project: Path, **options: Any) -> None:
     report = None if dry_run else open_report(options.pop("report"), [], overwrite=how.overwrite, project=project)
     options.pop("report", None)
     stated = load_project(project)
-    with Telling(how.quiet) as events:
-        plan = plan_surface(stated, SurfaceSettings(**options), images or None, force=force, events=events)
+
+    def make(usable: Project) -> None:
+        plan = plan_surface(usable, SurfaceSettings(**options), images or None, force=force, events=events)
         for line in plan.blind:
             events.talk(f"  note: left out: {line}")
         if dry_run:
@@ -94,6 +99,10 @@ def command(project: Path, **options: Any) -> None:
             for path in filter(None, (result.path, *result.others, told)):
                 show(path)
         _tell(result, plan, picture, events)
+
+    with Telling(how.quiet) as events:
+        _, left_out = without_unusable(stated, images or None, make)
+    refuse_unusable(left_out, len(stated.select(images or None)))
 
 
 def _bands(words: Sequence[str] | None) -> tuple[int, ...]:

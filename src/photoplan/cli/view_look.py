@@ -9,7 +9,7 @@ import click
 from photoplan.cli.options import several
 
 _RGB: dict[str, Any] = {"type": int, "nargs": 3, "default": None, "metavar": "R G B"}
-_LOOK = ("haze", "haze_colour", "sky", "nodata", "water_colour", "samples", "kernel", "shadows")
+_LOOK = ("haze", "haze_colour", "sky", "nodata", "water_colour", "samples", "kernel", "tolerance", "shadows")
 
 #: Contents, light, lines and pairs.
 look_options = several(
@@ -19,7 +19,8 @@ look_options = several(
         multiple=True,
         metavar="WHAT",
         help="shade, tint[:RAMP[:LOW:HIGH]], slope, photos, photo:NAME, or a raster on the map; may be repeated, "
-        "later ones over earlier ones, with @OPACITY [tint, shade@0.8; of a project photos].",
+        "later ones over earlier ones, with @OPACITY, rasters of classes with @classes "
+        "[tint, shade@0.8; of a project photos].",
     ),
     click.option("--sun", type=float, nargs=2, default=None, metavar="AZIMUTH ALTITUDE", help="Degrees [315 45]."),
     click.option("--shadows", is_flag=True, default=None, help="Terrain and objects cast shadows."),
@@ -30,6 +31,12 @@ look_options = several(
     click.option("--water-colour", help="Colour of water that no raster or photo shows [112 150 184].", **_RGB),
     click.option("--samples", type=int, help="Rays along each side of a pixel [2]."),
     click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic]."),
+    click.option(
+        "--tolerance",
+        type=float,
+        metavar="PX",
+        help="Largest error of places in rasters and photos; 0: every pixel strictly [0.02].",
+    ),
     click.option(
         "--lines",
         multiple=True,

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import CentralCamera, project
 from photoplan.engine.base import Source
 from photoplan.engine.execute import Painted
+from photoplan.engine.holes import fill_by_distance
 from photoplan.geometry.grid import Window
 from photoplan.plan.product import CompiledTile, ProductPlan, compile_tile
 from photoplan.plan.tiles import Tile
@@ -55,7 +56,7 @@ class Direct:
         valid = count.reshape(shape) > 0
         gaps = _gaps(product, compiled, source, valid)
         if self.fill and gaps.any():
-            _fill(values, valid, gaps, self.fill)
+            valid = valid | fill_by_distance(values, valid, gaps, self.fill)
         own = at.slices(wide)
         valid, hidden = valid[own], None if compiled.hidden is None else compiled.hidden[own]
         left = int(np.count_nonzero(gaps[own] & ~valid))
@@ -119,24 +120,3 @@ def _gaps(product: ProductPlan, tile: CompiledTile, source: Source, valid: NDArr
     xy = project(source.camera, product.target.to_ground(uvh))
     gaps[row, col] = ((xy >= -0.5) & (xy <= np.array(source.camera.size) - 0.5)).all(axis=-1)
     return gaps
-
-
-def _fill(values: NDArray[Any], valid: NDArray[np.bool_], gaps: NDArray[np.bool_], reach: int) -> None:
-    """Fill gaps from valid pixels within reach; `valid` tells which are."""
-    row, col = np.nonzero(gaps)
-    height, width = valid.shape
-    sums, weights = np.zeros((len(values), len(row))), np.zeros(len(row))
-    for dv in range(-reach, reach + 1):
-        for du in range(-reach, reach + 1):
-            square = du * du + dv * dv
-            if not 0 < square <= reach * reach:
-                continue
-            r, c = row + dv, col + du
-            inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
-            r, c = np.where(inside, r, 0), np.where(inside, c, 0)
-            weight = (inside & valid[r, c]) / square
-            sums += values[:, r, c] * weight
-            weights += weight
-    found = weights > 0
-    values[:, row[found], col[found]] = sums[:, found] / weights[found]
-    valid[row[found], col[found]] = True

@@ -13,6 +13,15 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Part
 from photoplan.engine.bands import detail_bands
 from photoplan.engine.base import Reader, Source
+from photoplan.engine.holes import (
+    FROM_IMAGE,
+    FROM_SURROUNDINGS,
+    Mask,
+    fill_from_surroundings,
+    halo,
+    rise_of_holes,
+    small_holes,
+)
 from photoplan.engine.run import Made, Output
 from photoplan.geometry.grid import Window
 from photoplan.geometry.levels import Pixels
@@ -22,6 +31,8 @@ from photoplan.plan.accuracy import DepthErrors, SourceErrors, radial_counts, ti
 from photoplan.plan.product import CompiledTile, Layer, ProductPlan, compile_next, compile_tile
 from photoplan.plan.tiles import Tile
 from photoplan.surfaces.base import Surface
+from photoplan.surfaces.objects import RaisedSurface
+from photoplan.targets.map import MapTarget
 
 OutputName = Literal["picture", "hidden", "sources", "accuracy"]
 
@@ -40,8 +51,8 @@ class Painted:
     valid: NDArray[np.bool_] | None
     """(height, width); None if no pixel is valid."""
     owner: NDArray[np.uint16] | None
-    """(height, width): row of the table of sources, plus one, that painted each pixel; 0 where invalid. None if there
-    is one source, or no pixel is valid."""
+    """(height, width): row of the table of sources, plus one, that painted each pixel; 0 where invalid. Filled: with
+    codes of `photoplan.engine.holes`. None if there is one source, or no pixel is valid."""
     hidden: NDArray[np.bool_] | None
     """(height, width): pixels that no source sees, see `photoplan.plan.owner.Share`; None if nobody has asked."""
     bare: int
@@ -117,6 +128,14 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
     Whether and how it is cut depends on the tile and the sources alone, so that the result does not depend on
     memory, workers or order.
     """
+    painted = _render(product, tile, sources, surface, kernel)
+    if not product.fill_hidden or painted.hidden is None or not painted.hidden.any():
+        return painted
+    return _with_holes_filled(product, tile, sources, surface, kernel, painted)
+
+
+def _render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str) -> Painted:
+    """What images see of a tile."""
     window, cameras = tile.window, {row: sources[row].camera for row in tile.sources}
     compiled = compile_tile(product, tile, cameras, surface)
     every = [*compiled.layers, *(layer for blend in compiled.blends for layer in blend.tile.layers)]
@@ -132,9 +151,68 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
         return _painted(compiled, values, valid)
     side = max(SMALLEST_PART, -(-max(window.width, window.height) // 2))
     cut = [replace(tile, window=part) for part in window.tiles(side)]
-    parts = ((part.window, render(product, part, sources, surface, kernel)) for part in cut)
+    parts = ((part.window, _render(product, part, sources, surface, kernel)) for part in cut)
     whole = joined(window, parts, sources[tile.sources[0]].reader)
     return whole if np.any(whole.valid) else replace(whole, values=None, valid=None, owner=None)
+
+
+def _with_holes_filled(
+    product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str, painted: Painted
+) -> Painted:
+    """A tile whose small hidden holes are filled: from images that see them once they are raised to the level around
+    them, else from what is painted around them.
+
+    All other pixels stay as they are. What a pixel gets does not depend on the tile: holes, and what is around them,
+    are looked at across its borders and those of what the product shows.
+    """
+    assert isinstance(product.target, MapTarget) and painted.hidden is not None
+    at, reach, resolution = tile.window, halo(product.fill_hidden), product.target.grid.resolution
+    whole = replace(product, clip=None, fill_hidden=0)
+    mine = painted if product.clip is None else _render(whole, tile, sources, surface, kernel)
+    assert mine.hidden is not None
+    wide = Window(at.col - reach, at.row - reach, at.width + 2 * reach, at.height + 2 * reach)
+    (right, bottom), parts = at.stop, [(at, mine)]
+    for near, beside in (
+        (mine.hidden[:reach], Window(wide.col, wide.row, wide.width, reach)),
+        (mine.hidden[-reach:], Window(wide.col, bottom, wide.width, reach)),
+        (mine.hidden[:, :reach], Window(wide.col, at.row, reach, at.height)),
+        (mine.hidden[:, -reach:], Window(right, at.row, reach, at.height)),
+    ):
+        if near.any():
+            parts.append((beside, _render(whole, replace(tile, window=beside), sources, surface, kernel)))
+    around = joined(wide, parts, sources[tile.sources[0]].reader)
+    assert around.values is not None and around.valid is not None and around.hidden is not None
+    own = at.slices(wide)
+    holes = small_holes(around.hidden & ~around.valid, product.fill_hidden)
+    wanted = np.zeros(holes.shape, bool)
+    wanted[own] = holes[own] & painted.hidden
+    if not wanted.any():
+        return painted
+    values, owner = around.values, np.zeros(holes.shape, np.uint16)
+    level = np.nan_to_num(surface.relief(product.target, wide) / resolution)
+    rise = rise_of_holes(level, around.valid, holes, product.fill_hidden)
+    shown = wanted & (rise > 0)
+    if shown.any():
+        rows, cols = (np.flatnonzero(shown.any(axis=axis)).tolist() for axis in (1, 0))
+        box = Window(wide.col + cols[0], wide.row + rows[0], cols[-1] - cols[0] + 1, rows[-1] - rows[0] + 1)
+        over, raised = (
+            replace(whole, feather=None, clip=Mask(wide, shown)),
+            RaisedSurface(surface, wide, rise * resolution),
+        )
+        seen = _render(over, replace(tile, window=box), sources, raised, kernel)
+        if seen.values is not None and seen.valid is not None and seen.owner is not None:
+            part = box.slices(wide)
+            values[:, *part] = np.where(seen.valid, seen.values, values[:, *part])
+            owner[part] = np.where(seen.valid, seen.owner + np.uint16(FROM_IMAGE), np.uint16(0))
+    near = fill_from_surroundings(values, around.valid, wanted & (owner == 0), product.fill_hidden, level)
+    owner[near] = FROM_SURROUNDINGS
+    filled = owner[own] > 0
+    if not filled.any():
+        return painted
+    before = np.zeros(filled.shape, np.uint16) if painted.owner is None else painted.owner
+    valid = filled if painted.valid is None else painted.valid | filled
+    cut = values[:, *own] * valid if painted.values is None else np.where(filled, values[:, *own], painted.values)
+    return replace(painted, values=cut, valid=valid, owner=np.where(filled, owner[own], before))
 
 
 def _blend(
@@ -313,8 +391,8 @@ class RenderJob:
     kernel: str
     outputs: tuple[OutputName, ...] = ("picture",)
     """What a tile gives, in the order of the sinks: its ``picture``; what is ``hidden``, 1, or 0 for what is seen, not
-    valid beyond the images; of the ``sources``, the row in their table, plus one, that painted a pixel; of the
-    ``accuracy``, the bands of `photoplan.plan.accuracy`."""
+    valid beyond the images; of the ``sources``, the row in their table, plus one, that painted a pixel, and codes of
+    filled ones; of the ``accuracy``, the bands of `photoplan.plan.accuracy`."""
     errors: ErrorsAddress | None = None
     """Needed for the output ``accuracy``."""
     paint: Paint | None = None
@@ -332,6 +410,10 @@ class RenderJob:
         record |= {} if painted.gaps is None else {"gaps": painted.gaps}
         if painted.hidden is not None:
             record |= {"hidden": int(np.count_nonzero(painted.hidden)), "bare": painted.bare}
+        if self.product.fill_hidden:
+            codes = np.zeros(0) if painted.owner is None else painted.owner[painted.owner > FROM_IMAGE]
+            around = int(np.count_nonzero(codes == FROM_SURROUNDINGS))
+            record |= {"filled_from_images": codes.size - around, "filled_from_surroundings": around}
         made = {name: find(painted) for name, find in _OUTPUTS.items()}
         if self.errors is not None:
             made["accuracy"] = accuracy = self._accuracy(tile, painted, opened.surface, self.errors.open())
@@ -345,6 +427,9 @@ class RenderJob:
         owner = painted.owner
         if owner is None:
             owner = painted.valid * np.uint16(tile.sources[0] + 1)
+        if self.product.fill_hidden:
+            # How exactly filled pixels lie is not known.
+            owner = np.where(owner > FROM_IMAGE, np.uint16(0), owner)
         found = tile_accuracy(self.product.target, tile.window, surface, errors.depth, errors.sources, owner)
         known = np.isfinite(found[0])
         return (found, known) if known.any() else None

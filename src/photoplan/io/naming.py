@@ -128,6 +128,8 @@ class _Group:
     then: list[Callable[[], object]] = field(default_factory=list)
     held: ExitStack = field(default_factory=ExitStack)
     """Locks of products, and working folders."""
+    locks: set[Path] = field(default_factory=set)
+    """Those that it holds: a second attempt of the same run holds them already."""
     folders: dict[Path, Path] = field(default_factory=dict)
 
     def take(self, part: Path, path: Path) -> None:
@@ -145,10 +147,14 @@ class _Group:
             if _identity(path) != before:
                 raise UsageError(f"{path}: another program made it meanwhile; choose another output or say `overwrite`")
         # Notes of a run that died are done with, also where this run has no such file.
-        earlier = {other for path in self.waiting for other in _noted(path)[0]}
-        for path in earlier - self.waiting.keys():
-            if path.parent in self.folders:
+        waiting = set(map(_place, self.waiting))
+        earlier = {_place(other): other for path in self.waiting for other in _noted(path)[0]}
+        for place, path in earlier.items():
+            # Elsewhere those alone that say themselves that they belong to a file of this run.
+            theirs = set(map(_place, _noted(path)[0]))
+            if place not in waiting and (path.parent in self.folders or waiting & theirs):
                 _note(path).unlink(missing_ok=True)
+                _remove_dead(path.parent)
         for path in self.waiting:
             self._write_note(path, _identity(self.pending[path]))
         for path in self.waiting:
@@ -229,7 +235,11 @@ def locked(lock: Path) -> Iterator[None]:
     """
     group = _GROUP.get()
     with ExitStack() as stack:
-        (stack if group is None else group.held).enter_context(FileLock(lock))
+        if group is None:
+            stack.enter_context(FileLock(lock))
+        elif lock not in group.locks:
+            group.held.enter_context(FileLock(lock))
+            group.locks.add(lock)
         yield
 
 
@@ -301,6 +311,11 @@ def _noted(path: Path) -> tuple[list[Path], _Identity | None]:
         return [path.parent / os.path.normpath(str(file)) for file in noted["files"]], (inode, size, time)
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return [], None
+
+
+def _place(path: Path) -> Path:
+    """Return the place of a file, whatever steps lead to its folder."""
+    return path.parent.resolve() / path.name
 
 
 def _note(path: Path) -> Path:

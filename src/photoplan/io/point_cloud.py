@@ -25,6 +25,8 @@ CLOUD_SUFFIXES = (".las", ".laz", ".ply")
 _POINT = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("sigma", "<f4"), ("grey", "<f4")])
 #: Rows of posts that are read at once; the unit of coordinates in LAS, part of the distance of the posts.
 _ROWS, _UNIT = 256, 1e-3
+#: Where day and year of making are in the header of LAS, two bytes each.
+_LAS_DATE = 90
 
 
 def check_cloud(path: Path) -> None:
@@ -50,8 +52,9 @@ def write_cloud(path: Path, heights: Path, sigmas: Path, grey: Path, crs: str, f
     Parameters
     ----------
     path : Path
-        Its suffix says the format. LAS 1.4 with point format 6: the grey value is the intensity, the standard deviation
-        of the height an extra dimension `sigma`, metres. PLY: binary, little-endian, x, y, z, sigma and grey.
+        Its suffix says the format. LAS 1.4 without a date, with point format 6: the grey value is the intensity,
+        the standard deviation of the height an extra dimension `sigma`, metres. PLY: binary, little-endian, x, y, z,
+        sigma and grey.
     heights, sigmas, grey : Path
         Finished rasters, which may still wait for their names; grey values as fine or several times finer: their means.
     crs : str
@@ -156,4 +159,8 @@ def _write_las(part: Path, path: Path, files: Sequence[Any], crs: str, frame: Fr
             record.return_number[:] = record.number_of_returns[:] = 1
             file.write_points(record)
             count += len(points)
+    # Equal runs give equal files: laspy states the day of making, zeros that none is stated.
+    with part.open("r+b") as written:
+        written.seek(_LAS_DATE)
+        written.write(bytes(4))
     return count

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 import rasterio.io
+import rasterio.shutil
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
@@ -17,7 +19,7 @@ from photoplan.geometry.grid import Window
 from photoplan.geometry.levels import FullSize, Pixels, level_size, means, reduced
 from photoplan.io.block_cache import BlockCache
 from photoplan.io.checks import IMAGE_LIMITS, RasterLimits
-from photoplan.io.gdal import gdal_settings, handle
+from photoplan.io.gdal import gdal_settings, handle, not_georeferenced
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.raster_pixels import both, missing_blocks, read_pixels
 from photoplan.io.tiff_layout import read_tiff_layout
@@ -205,6 +207,32 @@ def pixels_of_dataset(source: Any) -> RasterReader | np.ma.MaskedArray[Any, Any]
         return None
     path = Path(source.name)
     return RasterReader(path) if path.is_file() else source.read(masked=True)
+
+
+def stated_classes(info: RasterInfo) -> tuple[Path, ...] | None:
+    """Return the files beside a raster by which its values are numbers of classes; None if they are not.
+
+    A colour table, category names or a thematic attribute table state so, for one band of whole numbers.
+    """
+    if info.palette:
+        return ()
+    if len(info.colour_bands) != 1 or np.dtype(info.dtype).kind not in "iu":
+        return None
+    table, aux = (info.path.with_name(info.path.name + suffix) for suffix in (".vat.dbf", ".aux.xml"))
+    if table.is_file():
+        return (table,)
+    # GDAL hands out names of categories in no other way than as text.
+    place = f"/vsimem/{uuid4().hex}.vrt"
+    with gdal_settings(), not_georeferenced():
+        rasterio.shutil.copy(handle(info.path, info.driver), place, driver="VRT")
+        try:
+            with rasterio.open(place) as described:
+                text = described.tags(ns="xml:VRT")["xml:VRT"]
+        finally:
+            rasterio.shutil.delete(place, driver="VRT")
+    if "<CategoryNames>" in text or ("<GDALRasterAttributeTable" in text and 'tableType="thematic"' in text):
+        return (aux,) if aux.is_file() else ()
+    return None
 
 
 def _check_image(info: RasterInfo) -> None:

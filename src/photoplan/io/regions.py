@@ -54,13 +54,15 @@ class Regions:
         return np.asarray(rasterio.features.rasterize(near, shape, transform=to_map, dtype="uint16"))
 
 
-def source_regions(path: Path, grid: MapGrid) -> dict[int, Any]:
+def source_regions(path: Path, grid: MapGrid, images: int) -> dict[int, Any]:
     """Outline of what each image paints, along the edges of pixels: multipolygons by row plus one.
 
     Parameters
     ----------
     path : Path
         A raster of sources.
+    images : int
+        How many there are; larger numbers mark filled pixels, which are left out.
     """
     found: dict[int, list[Any]] = {}
     with rasterio.open(path) as file:
@@ -68,6 +70,7 @@ def source_regions(path: Path, grid: MapGrid) -> dict[int, Any]:
             at = rasterio.windows.Window(part.col, part.row, part.width, part.height)
             left, top = grid.left + part.col * grid.resolution, grid.top - part.row * grid.resolution
             labels = file.read(1, window=at).astype(np.int32)
+            labels[labels > images] = 0
             here = MapGrid(
                 left=left, top=top, resolution=grid.resolution, width=part.width, height=part.height, crs=grid.crs
             )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from xml.sax.saxutils import escape
 
 import rasterio
 import rasterio.enums
 
 from photoplan.errors import UsageError
 from photoplan.io.naming import write_atomically
+from photoplan.plain import xml_text
 
 _MARK = "<!-- written by photoplan -->"
 #: Pixels that lie over each other do so to this part of their side.
@@ -51,7 +51,7 @@ def write_virtual(path: Path, rasters: Sequence[Path]) -> None:
             to = f'xOff="{round((x - left) / resolution)}" yOff="{round((top - y) / resolution)}"'
             at = f'xSize="{width}" ySize="{height}"'
             found.append(
-                f'<ComplexSource><SourceFilename relativeToVRT="1">{escape(name)}</SourceFilename><SourceBand>{band}'
+                f'<ComplexSource><SourceFilename relativeToVRT="1">{xml_text(name)}</SourceFilename><SourceBand>{band}'
                 f'</SourceBand><SrcRect xOff="0" yOff="0" {at}/><DstRect {to} {at}/>'
                 # Where sheets of any outline lie over each other, what one does not show is the other's.
                 + ("" if none is None else f"<NODATA>{none!r}</NODATA>")
@@ -69,7 +69,7 @@ def write_virtual(path: Path, rasters: Sequence[Path]) -> None:
     if masked:
         bands.append(f'<MaskBand><VRTRasterBand dataType="Byte">\n{sources("mask,1")}\n</VRTRasterBand></MaskBand>')
     head = (
-        f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{_MARK}\n<SRS>{escape(crs.to_wkt())}</SRS>\n'
+        f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{_MARK}\n<SRS>{xml_text(crs.to_wkt())}</SRS>\n'
         f"<GeoTransform>{left!r}, {resolution!r}, 0, {top!r}, 0, {-resolution!r}</GeoTransform>\n"
     )
     write_atomically(path, (head + "\n".join(bands) + "\n</VRTDataset>\n").encode())
@@ -102,8 +102,8 @@ def write_stacked(path: Path, rasters: Mapping[str, Path]) -> None:
         for k, dtype in enumerate(dtypes, 1):
             title = name if len(dtypes) == 1 else f"{name} {k}"
             bands.append(
-                f'<VRTRasterBand dataType="{_TYPES[dtype]}" band="{len(bands) + 1}"><Description>{escape(title)}'
-                f'</Description>{none}<ComplexSource><SourceFilename relativeToVRT="1">{escape(file_name)}'
+                f'<VRTRasterBand dataType="{_TYPES[dtype]}" band="{len(bands) + 1}"><Description>{xml_text(title)}'
+                f'</Description>{none}<ComplexSource><SourceFilename relativeToVRT="1">{xml_text(file_name)}'
                 f'</SourceFilename><SourceBand>{k}</SourceBand><SrcRect xOff="0" yOff="0" {at}/><DstRect '
                 f'xOff="{round(x)}" yOff="{round(y)}" {at}/>'
                 + ("<UseMaskBand>true</UseMaskBand>" if nodata is None else f"<NODATA>{nodata!r}</NODATA>")
@@ -111,7 +111,7 @@ def write_stacked(path: Path, rasters: Mapping[str, Path]) -> None:
             )
     size = round((right - left) / resolution), round((top - bottom) / resolution)
     head = (
-        f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{_MARK}\n<SRS>{escape(crs.to_wkt())}</SRS>\n'
+        f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{_MARK}\n<SRS>{xml_text(crs.to_wkt())}</SRS>\n'
         f"<GeoTransform>{left!r}, {resolution!r}, 0, {top!r}, 0, {-resolution!r}</GeoTransform>\n"
     )
     write_atomically(path, (head + "\n".join(bands) + "\n</VRTDataset>\n").encode())

@@ -115,6 +115,8 @@ class ProductPlan:
     """How sources pass into each other along seams; None: they do not."""
     clip: Drawn | None = None
     """What of the target the product shows, where rows are not 0; None: all."""
+    fill_hidden: int = 0
+    """Holes that no source sees are filled up to this width and height, pixels; 0: they stay empty."""
 
     def __post_init__(self) -> None:
         if len(self.sources) != 1 and self.owners is None:

@@ -23,7 +23,7 @@ from photoplan.kernels.visibility import BEYOND, HIDDEN, SEEN, find_behind, find
 from photoplan.plan.ground import TileGround
 from photoplan.surfaces.base import Surface, Terrain
 from photoplan.surfaces.lattice import Lattice
-from photoplan.surfaces.objects import ObjectSurface, without_objects
+from photoplan.surfaces.objects import ObjectSurface, RaisedSurface, without_objects
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
@@ -117,7 +117,7 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
     ground : TileGround
         A tile of a map.
     surface : Surface
-        Terrain: what the tile's relief was taken from, and what may be in the way.
+        Terrain: what the tile's relief was taken from, and what may be in the way; what it is raised from, if it is.
 
     Returns
     -------
@@ -144,7 +144,7 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
     if lines is None or not (lines.depth[..., 0] > 0).any():
         return none
     # Over a map every surface is terrain.
-    whole: Any = surface
+    whole: Any = surface.surface if isinstance(surface, RaisedSurface) else surface
     terrain = without_objects(whole)
     over = _OverTerrain(projection, target, terrain, levels)
     found = np.zeros(none.shape, np.uint8)
@@ -153,8 +153,8 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
         toward = lines if part == window else _lines_over(projection, target, part, levels)
         if toward is not None:
             found[at] = over.behind(part, np.ascontiguousarray(ground.relief[at]), toward)
-    if isinstance(surface, ObjectSurface):
-        local, cells, origin = surface.faces.in_cells
+    if isinstance(whole, ObjectSurface):
+        local, cells, origin = whole.faces.in_cells
         x, y = (target.grid.to_map((window.col, window.row)) - origin[:2]).tolist()
         frame = x, y, target.grid.resolution
         find_behind(local, cells, frame, ground.relief, lines.nodes, levels, _SHORT * target.grid.resolution, found)

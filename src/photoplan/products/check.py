@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from photoplan.products.orthophoto.look import heights_in_feet, two_figures
 from photoplan.project.cameras import camera_without_pixels, is_there
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.posed import posed_camera
-from photoplan.project.scene import map_order, open_scene
+from photoplan.project.scene import map_order, open_scene, unusable_images
 from photoplan.surfaces.intersect import intersect
 
 #: Displacements by the choice of earth curvature above this are reported, pixels.
@@ -86,6 +86,8 @@ class ProjectCheck:
     """Sentences that tell what would be better."""
     left_out: tuple[str, ...] = ()
     """Images without orientation, and why."""
+    unusable: Mapping[str, str] = field(default_factory=dict)
+    """Images whose files cannot be used, and why."""
 
     @property
     def implausible(self) -> tuple[str, ...]:
@@ -102,7 +104,7 @@ class ProjectCheck:
     def json_fields(self) -> dict[str, Any]:
         """Height systems by what has them."""
         systems = dict(zip(("terrain", "orientation", "working"), self.heights))
-        own = pick(self, "images", "sensible_resolution", "crs", "alternative", "advice", "left_out")
+        own = pick(self, "images", "sensible_resolution", "crs", "alternative", "advice", "left_out", "unusable")
         return {**own, "height_systems": systems}
 
     def __str__(self) -> str:
@@ -124,9 +126,13 @@ class ProjectCheck:
         closing = [f"sensible resolution {self.sensible_resolution:g} m" if known else "no sensible resolution"]
         if not self.implausible and self.alternative is None:
             closing.append("all plausible")
+        count = len(self.left_out) + len(self.unusable) + len(self.images)
         if self.left_out:
-            closing.append(f"{len(self.left_out)} of {len(self.left_out) + len(self.images)} images are not oriented")
+            closing.append(f"{len(self.left_out)} of {count} images are not oriented")
+        if self.unusable:
+            closing.append(f"{len(self.unusable)} of {count} images cannot be used")
         lines += [f"left out: {line}" for line in self.left_out]
+        lines += [f"left out: {name}: {reason}" for name, reason in self.unusable.items()]
         return "\n".join([*lines, " · ".join(closing), *self.advice])
 
 
@@ -141,7 +147,7 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
     Raises
     ------
     PhotoplanError
-        An input of all images, or every image, cannot be used. One of several images has a fault instead.
+        An input of all images, or every image, cannot be used. Single images are left out.
     """
     names, left_out = project.oriented(project.select(images))
     ground = ground_of(project)
@@ -158,8 +164,11 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
         raise next(iter(failed.values()))
     views, looks, good = zip(*(looked[place] for place in sorted(looked)))
     known = [names[place] for place in sorted(looked)]
+    lost = unusable_images(project, [names[place] for place in failed], "")
     checks = tuple(
-        looked[place][2] if place in looked else _unusable(name, failed[place]) for place, name in enumerate(names)
+        looked[place][2] if place in looked else _refused(name, failed[place])
+        for place, name in enumerate(names)
+        if name not in lost
     )
     gsds = [c.gsd for c in checks if np.isfinite(c.gsd)]
     return ProjectCheck(
@@ -171,11 +180,12 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
         angles=any(view is not None for view, check in zip(views, good) if check.fault),
         advice=_advice(project, good) + _of_objects(project, ground, known),
         left_out=tuple(left_out),
+        unusable=lost,
     )
 
 
-def _unusable(name: str, error: InputError) -> ImageCheck:
-    """The line of an image that cannot be opened or used."""
+def _refused(name: str, error: InputError) -> ImageCheck:
+    """Return the line of an image whose geometry or steps cannot be used."""
     nan = float("nan")
     return ImageCheck(
         image=name,

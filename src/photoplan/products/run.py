@@ -41,6 +41,8 @@ class Run:
     """Bytes the run should stay under; None: no bound but the tiles in flight."""
     overwrite: bool = False
     """Whether finished products may be replaced."""
+    again: bool = False
+    """Whether an earlier attempt of the same command made some products, which are kept without objection."""
     quicklook: bool = True
     """Whether to write a preview of the products, such as `ortho_overview.png`."""
     events: Events = SILENT

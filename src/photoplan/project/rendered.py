@@ -15,7 +15,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.levels import level_size
 from photoplan.io.image_form import placement_of
 from photoplan.io.project.model import Project
-from photoplan.io.raster import RasterReader
+from photoplan.io.raster import RasterReader, stated_classes
 from photoplan.kernels.sample_grid import sample_points
 from photoplan.plan.footprint import FAR
 from photoplan.project.cameras import camera_without_pixels
@@ -34,11 +34,16 @@ _SIDE = 2048
 
 @dataclass(frozen=True, eq=False)
 class DrapedTexture:
-    """Colours of a raster over the map, interpolated bilinearly between pixels about as large as rays are apart."""
+    """Colours of a raster over the map, interpolated bilinearly between pixels about as large as rays are apart.
+
+    Classes are taken by the nearest pixel.
+    """
 
     reader: RasterReader
     other: SolidTexture
     """Where the raster has no value, and on objects."""
+    classes: bool = False
+    """Whether its values are numbers of classes, which are never mixed."""
 
     @classmethod
     def of(cls, path: Path, crs: str, other: SolidTexture) -> DrapedTexture:
@@ -58,7 +63,7 @@ class DrapedTexture:
             )
         if reader.dtype != np.uint8:
             raise InputError(f"{path}: pixels of type {reader.dtype}; the texture of a scene has uint8")
-        return cls(reader, replace(other, bands=reader.bands))
+        return cls(reader, replace(other, bands=reader.bands), stated_classes(reader.info) is not None)
 
     @property
     def bands(self) -> int:
@@ -80,6 +85,8 @@ class DrapedTexture:
         """Values at map points (n, 2), shape (bands, n); NaN where there are none."""
         place = placement_of(self.reader.info)
         xy = (XY - place.coefficients[2::3]) @ np.linalg.inv(place.linear).T
+        if self.classes:
+            return self._nearest(np.floor(xy).astype(np.int64))
         apart = float(np.median(np.hypot(*np.diff(xy, axis=0).T))) if len(xy) > 1 else 1.0
         level = max(0, floor(log2(max(apart, 1.0))), int(np.ceil(np.log2(max(1.0, np.ptp(xy, axis=0).max() / _SIDE)))))
         # Edges of pixels are whole numbers until here.
@@ -94,6 +101,23 @@ class DrapedTexture:
         if valid is not None:
             values[:, ~valid] = np.nan
         return np.stack([sample_points(band, xy - (window.col, window.row)) for band in values]).astype(np.float64)
+
+    def _nearest(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return values of pixels (column, row), shape (bands, n); NaN outside the raster and where it has none."""
+        out = np.full((self.bands, len(cells)), np.nan)
+        # Cells of one square of the raster together.
+        squares = np.unique(cells // _SIDE, axis=0)
+        for column, row in squares.tolist():
+            window = Window(column * _SIDE, row * _SIDE, _SIDE, _SIDE) & Window(0, 0, *self.reader.size)
+            here = np.flatnonzero(((cells >= (window.col, window.row)) & (cells < window.stop)).all(axis=1))
+            if not len(here):
+                continue
+            low, high = cells[here].min(axis=0), cells[here].max(axis=0) + 1
+            pixels, valid = self.reader.read(Window(*low.tolist(), *(high - low).tolist()))
+            at = tuple((cells[here] - low).T[::-1])
+            there = np.ones(len(here), bool) if valid is None else valid[at]
+            out[:, here[there]] = pixels[(slice(None), *(axis[there] for axis in at))]
+        return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from photoplan.cameras.base import Camera
 from photoplan.engine.base import Source
-from photoplan.errors import InputError
+from photoplan.errors import ImagesLeftOut, InputError
+from photoplan.geometry.grid import Window
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.image import ImageEntry
@@ -33,6 +34,9 @@ from photoplan.surfaces.objects import painted_surface
 
 #: Scenes that are kept open, some 20 kB each: more than the images of a row of a mosaic's tiles.
 _KEPT = 2048
+#: Side of the windows in which images are read to find those that are damaged.
+_READ = 2048
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -145,6 +149,62 @@ def open_scene(project: Project, name: str) -> Scene:
         declared or cannot be joined exactly.
     """
     return _open(scene_address(project, name))
+
+
+def without_unusable(
+    project: Project, images: Sequence[str] | None, make: Callable[[Project], T]
+) -> tuple[T, dict[str, str]]:
+    """Return what `make` gives for a project, and the images that it was made without because of their files.
+
+    If `make` fails, the images that cannot be opened are left out, see `Project.leaving_out`. If all can be opened and
+    the error names the file of one, those are left out whose pixels cannot be read. Balance files and filters do not
+    count: they can be corrected.
+
+    Raises
+    ------
+    InputError
+        No image can be used, or another input cannot.
+    """
+    left_out: dict[str, str] = {}
+    while True:
+        try:
+            return make(project.leaving_out(left_out)), left_out
+        except InputError as error:
+            names = project.leaving_out(left_out).oriented(project.select(images), approximate=True)[0]
+            found = unusable_images(project, names, str(error))
+            if not 0 < len(found) < len(names):
+                raise
+            left_out |= found
+
+
+def unusable_images(project: Project, names: Sequence[str], error: str) -> dict[str, str]:
+    """Return why images cannot be used, by name: by their own files, and pixels if `error` names the file of one."""
+    found, readers = {}, {}
+    cameras = {name: camera.model_copy(update={"restore": None}) for name, camera in project.cameras.items()}
+    images = tuple(image.model_copy(update={"balance": None, "restore": None}) for image in project.images)
+    project = project.model_copy(update={"cameras": cameras, "images": images})
+    for name in names:
+        try:
+            readers[name] = open_scene(project, name).reader
+        except InputError as reason:
+            found[name] = f"cannot be used: {reason}"
+    if found or not any(str(reader.path) in error for reader in readers.values()):
+        return found
+    for name, reader in readers.items():
+        width, height = reader.size
+        try:
+            for part in Window(0, 0, width, height).tiles(_READ):
+                reader.image.read(part)
+        except InputError as reason:
+            found[name] = f"cannot be used: {reason}"
+    return found
+
+
+def refuse_unusable(left_out: Mapping[str, str], of: int) -> None:
+    """Raise ImagesLeftOut if something was made without some of a number of images."""
+    if left_out:
+        lines = "\n  ".join(f"{name}: {reason}" for name, reason in left_out.items())
+        raise ImagesLeftOut(f"finished, but {len(left_out)} of {of} images cannot be used and are left out:\n  {lines}")
 
 
 def map_order(project: Project, names: Sequence[str]) -> list[int]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.raycast import SURFACE
-from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.base import Surface, Terrain
 from photoplan.surfaces.faces import Faces
 from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.rays import Hits
@@ -118,6 +118,24 @@ class ObjectSurface:
             ),
             owner=np.where(nearer, self.faces.owner[face] + 1, ground.owner),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class RaisedSurface:
+    """A surface that is shown higher than it stands: it hides what it hides, but is looked at above itself."""
+
+    surface: Surface
+    window: Window
+    """Where it is raised, pixels of a target."""
+    by: NDArray[np.floating]
+    """Metres for each pixel there."""
+
+    def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
+        """Relief of the surface, raised."""
+        relief, common = np.array(self.surface.relief(target, window), np.float32), self.window & window
+        if common.size:
+            relief[common.slices(window)] += self.by[common.slices(self.window)].astype(np.float32)
+        return relief
 
 
 def without_objects(surface: Terrain) -> Terrain:

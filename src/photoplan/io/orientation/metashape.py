@@ -20,7 +20,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element, tostring
-from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,6 +44,7 @@ from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFo
 from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
 from photoplan.io.orientation.text import checked_rotation
 from photoplan.io.plain_files import finite
+from photoplan.plain import xml_quoted, xml_text
 
 MAX_BYTES = 256 << 20
 _COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
@@ -381,11 +381,11 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
         M[:3, :3], M[:3, 3] = rotations[k] @ FLIP, centers[k]
         sensor = sensors[block.camera_name(image)]
         lines += [
-            f'      <camera id="{k}" sensor_id="{sensor}" component_id="0" label={quoteattr(image.name)}>',
+            f'      <camera id="{k}" sensor_id="{sensor}" component_id="0" label={xml_quoted(image.name)}>',
             f"        <transform>{_text(M)}</transform>",
             "      </camera>",
         ]
-    lines += ["    </cameras>", f"    <reference>{escape(wkt)}</reference>", "  </chunk>", "</document>", ""]
+    lines += ["    </cameras>", f"    <reference>{xml_text(wkt)}</reference>", "  </chunk>", "</document>", ""]
     return {path: "\n".join(lines)}
 
 
@@ -415,7 +415,7 @@ def _sensor_lines(name: str, key: str, camera: CameraEntry, path: Path) -> list[
     numbers = {"f": form.f, "cx": form.offset[0], "cy": form.offset[1], "b1": form.b[0], "b2": form.b[1]}
     numbers |= {f"k{i + 1}": v for i, v in enumerate(form.k)} | {"p1": form.p[0], "p2": form.p[1]}
     return [
-        f'      <sensor id="{key}" label={quoteattr(name)} type="{kind}">',
+        f'      <sensor id="{key}" label={xml_quoted(name)} type="{kind}">',
         f"        {size}",
         f'        <calibration type="{kind}" class="adjusted">',
         f"          {size}",

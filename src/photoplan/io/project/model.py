@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from numpy.typing import ArrayLike
-from pydantic import Field, Strict, field_validator, model_validator
+from pydantic import Field, PrivateAttr, Strict, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from photoplan.errors import InputError, UsageError
@@ -222,6 +222,7 @@ class Project(Entry):
     ortho: OrthoDefaults = OrthoDefaults()
     folder: SkipJsonSchema[Path] = Field(default=Path(), exclude=True)
     """Folder of the project file, from which relative paths start; not an entry of the file."""
+    _unusable: dict[str, str] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -324,8 +325,16 @@ class Project(Entry):
             chosen.update(found)
         return [n for n in names if n in chosen]
 
+    def leaving_out(self, reasons: Mapping[str, str]) -> Self:
+        """Return the project with images that `oriented` lists with these reasons, as their files cannot be used."""
+        project = self.model_copy()
+        project._unusable = {**self._unusable, **reasons}
+        return project
+
     def oriented(self, names: Sequence[str], approximate: bool = False) -> tuple[list[str], list[str]]:
         """The oriented ones of some images, and a line for each of the others; `approximate` ones count if asked for.
+
+        Images that `leaving_out` names are listed among the others.
 
         Raises
         ------
@@ -335,6 +344,7 @@ class Project(Entry):
         reasons = {name: self.any_image(name).unoriented for name in names}
         if approximate:
             reasons |= {i.name: None for i in self.posed if i.name in reasons and i.center is not None}
+        reasons |= {name: reason for name, reason in self._unusable.items() if name in reasons}
         left_out = [f"{name}: {reason}" for name, reason in reasons.items() if reason is not None]
         if len(left_out) == len(names) > 0:
             others = f" (nor has any other of {len(names)} images)" if len(names) > 1 else ""

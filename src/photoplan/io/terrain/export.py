@@ -8,7 +8,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from photoplan.io.naming import give_name, scratch
 from photoplan.io.product import check_output
 from photoplan.io.table_lines import csv_line
 from photoplan.io.terrain.export_mesh import MeshPart, mesh_parts
+from photoplan.plain import xml_quoted
 from photoplan.surfaces.units import LineElement, Unit, UnitSource
 
 TIN_SUFFIXES = (".obj", ".ply", ".xml")
@@ -164,7 +164,7 @@ def _coordinate_system(crs: str | None, height_system: str | None) -> str:
         facts |= {"name": parse_crs(crs).name} | ({"epsgCode": code} if code.isdigit() else {"ogcWktCode": crs})
     if height_system is not None:
         facts |= {"verticalDatum": height_label(height_system), "verticalCoordinateSystemName": height_system}
-    return f"<CoordinateSystem{''.join(f' {k}={quoteattr(v)}' for k, v in facts.items())}/>\n" if facts else ""
+    return f"<CoordinateSystem{''.join(f' {k}={xml_quoted(v)}' for k, v in facts.items())}/>\n" if facts else ""
 
 
 def _write_landxml(path: Path, parts: Iterator[MeshPart], name: str, system: str) -> None:
@@ -176,7 +176,7 @@ def _write_landxml(path: Path, parts: Iterator[MeshPart], name: str, system: str
                 'version="1.2">\n<Units><Metric linearUnit="meter" areaUnit="squareMeter" volumeUnit="cubicMeter" '
                 f'temperatureUnit="celsius" pressureUnit="milliBars"/></Units>\n{system}'
                 f'<Application name="photoplan" version="{__version__}"/>\n'
-                f'<Surfaces><Surface name={quoteattr(_word(name))}><Definition surfType="TIN">\n<Pnts>\n'
+                f'<Surfaces><Surface name={xml_quoted(_word(name))}><Definition surfType="TIN">\n<Pnts>\n'
             ).encode()
         )
         count = 0

@@ -78,7 +78,11 @@ def read_measured(paths: Sequence[Path], options: ReadOptions | None = None) -> 
             raise InputError(f"{path}: cannot be read as text ({error})") from None
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-        parts.append(_in_metres(_with_crs(_without_nodata(part, options), options), options, part.crs is not None))
+        stated = part.crs is not None
+        part = _without_nodata(part, options)
+        if not _coordinates(part.points, part.lines) and part.tin is None:
+            raise InputError(f"{path}: holds no points and no lines with heights; leave it out, or choose other layers")
+        parts.append(_in_metres(_with_crs(part, options), options, stated))
     measured = _merged(parts)
     check_matched(measured, options)
     return measured

@@ -67,7 +67,7 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
     """All marks of a scan, without any approximate values.
 
     If they are not found, crosses are tried in other directions. If none is found though the scan's resolution is
-    known, marks of neighbouring sizes are tried.
+    known, marks of neighbouring sizes are tried, and then both together.
 
     Raises
     ------
@@ -84,14 +84,26 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
         # A search for every size among all resolutions would take minutes.
         if known.pixel_mm is None or any(mark.found for mark in error.sought):
             raise
-        others = [(factor, each) for factor in OTHER_SIZES if (each := _resized(scan, layout, known, factor))]
+        others: list[tuple[float, float, FiducialResult]] = []
+        for degrees in (0.0, OTHER_DIRECTIONS[0]):
+            turned_layout = layout.with_turned_marks(degrees) if degrees else layout
+            if turned_layout is None or any(_correlation(each) >= _SURE for *_, each in others):
+                break
+            sizes = [(degrees, factor, _resized(scan, turned_layout, known, factor)) for factor in OTHER_SIZES]
+            others += [(turn, factor, each) for turn, factor, each in sizes if each is not None]
         if not others:
             raise
-        factor, best = max(others, key=lambda other: sum(mark.correlation for mark in other[1].marks))
+        degrees, factor, best = max(others, key=lambda other: sum(mark.correlation for mark in other[2].marks))
         said = (
             f"the marks are not found as described, but {factor:g} times as large; mend their sizes in the camera's "
             "description"
         )
+        if degrees:
+            said = (
+                f"the marks are not found as described, but with their crosses turned by {degrees:g}° and "
+                f"{factor:g} times as large: add {degrees:g} to the entry rotation, and mend their sizes in the "
+                "camera's description"
+            )
         return replace(best, notes=(said, *best.notes))
     # Rings fit without their crosses, too, but worse.
     if (fits := _correlation(found)) < _SURE:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from photoplan.products.balance.reference import Reference, open_reference
 from photoplan.products.balance.sample import Survey, sample, survey
 from photoplan.products.one_colour import one_colour_told
 from photoplan.products.run import BASE_MEMORY, refuse_inputs
-from photoplan.project.scene import input_files
+from photoplan.project.scene import input_files, without_unusable
 from photoplan.radiometry.balance import Balanced, Pairs, balanced, even_images, pairs_of
 from photoplan.radiometry.cells import SIDE, Cells
 
@@ -84,6 +85,8 @@ class BalanceReport:
     pairs: Pairs | None = None
     files: tuple[Path, ...] = ()
     """Balance files, by image as in `balanced`."""
+    unusable: Mapping[str, str] = field(default_factory=dict)
+    """Images that are left out since their files cannot be used, and why; they are among the notes."""
 
     def named(self, number: int) -> str:
         """Name of an image."""
@@ -143,6 +146,21 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     times, project = run_times(), _plain(load_project(request.project))
     names = project.select(request.images or None)
     fixed = _check(request, project, names)
+    report, unusable = without_unusable(
+        project, request.images or None, partial(_balance, request, names, fixed, times, events)
+    )
+    return replace(report, unusable=unusable)
+
+
+def _balance(
+    request: BalanceRequest,
+    names: Sequence[str],
+    fixed: str | None,
+    times: Callable[[], dict[str, Any]],
+    events: Events,
+    project: Project,
+) -> BalanceReport:
+    """Balance a project without images that cannot be used."""
     found = survey(project, names, request.resolution, events)
     notes = [f"left out: {line}" for line in found.blind]
     workers = tiles_in_flight(request.workers, request.memory, BASE_MEMORY + found.kept_bytes, found.tile_bytes)

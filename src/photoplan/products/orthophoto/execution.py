@@ -15,7 +15,7 @@ from photoplan.cameras.base import tremor_told
 from photoplan.engine.execute import OutputName, RenderJob
 from photoplan.engine.executors import Workers
 from photoplan.engine.run import Kept, Tally, Work
-from photoplan.errors import PhotoplanError, TilesFailed
+from photoplan.errors import InputError, PhotoplanError, TilesFailed
 from photoplan.events import Events
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm, bands_of
@@ -105,8 +105,9 @@ def execute(
     for path in index:
         refuse_foreign_virtual(path)
     marker = RunMarker(folder, " ".join(product.key for product in plan.products))
-    done = [] if marker.interrupted else [each for each in (picture, *index) if each is not None]
-    kept = finished_products(plan, folder, run.overwrite, None if marker.interrupted else done)
+    goes_on = marker.interrupted or run.again
+    done = [each for each in (picture, *index) if each is not None]
+    kept = finished_products(plan, folder, run.overwrite, None if goes_on else done)
     if picture is not None and not run.overwrite:
         refuse_foreign_overview(picture, plan.command)
     make_folder(folder)
@@ -118,7 +119,12 @@ def execute(
     run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))
     with run.runner(_pixel_files(plan), folder, each) as runner:
         works = (_work(plan, p, folder, run, kept.get(p.plan.name), runner.workers) for p in plan.products)
-        results: list[ProductResult] = runner.run(works)
+        try:
+            results: list[ProductResult] = runner.run(works)
+        except InputError:
+            # This plan cannot be completed: no later run continues it.
+            marker.end()
+            raise
     if picture is not None:
         write_overview([r.path for r in results if not r.failed], picture, plan.command)
     for path in index:
@@ -231,7 +237,7 @@ def _complete(
             # A product without regions does not need the libraries of vector data.
             from photoplan.io.regions import source_regions, write_regions  # noqa: PLC0415
 
-            shapes = source_regions(standing(files["sources"].path), product.grid)
+            shapes = source_regions(standing(files["sources"].path), product.grid, len(product.images))
             painted = {product.images[row - 1]: float(shape.area) for row, shape in shapes.items()}
             write_regions(seams_path(file.path), product.images, shapes, product.grid.crs)
         ran = times()
@@ -246,6 +252,9 @@ def _complete(
             tiles=len(product.plan.tiles),
             resumed=tally.resumed,
             hidden=_area(tally, "hidden", product) if plan.settings.asks_hidden else None,
+            filled={name: _area(tally, f"filled_from_{name}", product) for name in ("images", "surroundings")}
+            if plan.settings.fill_hidden
+            else None,
             bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product, address),
             gaps=_area(tally, "gaps", product) if plan.settings.method == "direct" else None,
             painted=painted,

@@ -38,6 +38,8 @@ class ProductResult:
     """Tiles taken over from an earlier run."""
     hidden: float | None
     """Ground in the images that none of them sees, m²; None: nobody has asked."""
+    filled: dict[str, float] | None
+    """Of the hidden ground, m² that are filled from `images` and from `surroundings`; None: nobody has asked."""
     bare: float | None
     """Ground of a mosaic that lies in none of its images, m²; None: it is no mosaic."""
     gaps: float | None
@@ -62,6 +64,7 @@ class ProductResult:
                 self,
                 *own,
                 hidden_m2="hidden",
+                **({} if self.filled is None else {"filled_m2": "filled"}),
                 gaps_m2="gaps",
                 painted_m2="painted",
                 accuracy_m="accuracy",
@@ -177,6 +180,7 @@ def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult
             tiles=made["tiles"],
             resumed=made["tiles"],
             hidden=made.get("hidden_m2"),
+            filled=made.get("filled_m2"),
             bare=made.get("outside_m2"),
             gaps=made.get("gaps_m2"),
             painted=made.get("painted_m2"),

@@ -10,6 +10,7 @@ from functools import cache
 from typing import Any
 
 from photoplan import __version__
+from photoplan.engine.holes import halo
 from photoplan.geometry.grid import Window
 from photoplan.io.project.model import Project
 from photoplan.plan.accuracy import in_image
@@ -34,7 +35,9 @@ def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: Si
     facts = address.facts if not settings.accuracy else [address.facts, known_errors(address, plan, settings).facts]
     drawn = None
     if settings.choice is not None and isinstance(plan.owners, BestImage) and plan.owners.drawn is not None:
-        drawn = plan.owners.drawn.digest(settings.choice.feather)
+        assert isinstance(plan.target, MapTarget)
+        around = halo(plan.fill_hidden) * plan.target.grid.resolution if plan.fill_hidden else 0.0
+        drawn = plan.owners.drawn.digest(settings.choice.feather + around)
     return product_key(facts, plan, settings, drawn)
 
 
@@ -67,7 +70,9 @@ def tile_keys(address: ScenesAddress, plan: ProductPlan, settings: OrthoSettings
         if place == len(plan.tiles) or plan.tiles.indices[place] != index:
             return None
         tile = plan.tiles[place]
-        wide = tile.window if plan.feather is None else plan.feather.around(tile.window)
+        at, reach = tile.window, halo(plan.fill_hidden) if plan.fill_hidden else 0
+        filled = Window(at.col - reach, at.row - reach, at.width + 2 * reach, at.height + 2 * reach)
+        wide = filled if plan.feather is None else plan.feather.around(filled)
         images = [(row, scenes[row], best.ranks[row] if best.ranks else 0.0) for row in tile.sources]
         return _digest([shared, index, images, _rows(best.drawn, wide), _rows(plan.clip, tile.window)])[:32]
 
@@ -113,6 +118,7 @@ def _common(plan: ProductPlan, settings: OrthoSettings) -> dict[str, Any]:
         "nodata": settings.nodata,
         "hidden": settings.hidden,
         "method": [settings.method, settings.fill],
+        **({"fill_hidden": settings.fill_hidden} if settings.fill_hidden else {}),
     }
 
 

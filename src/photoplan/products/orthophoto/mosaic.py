@@ -75,7 +75,7 @@ def plan_mosaic(
     else:
         parts = [Sheet("", grid)] if size is None else sheets_of(grid, size)
     events.begin("finding tiles", len(looked) * len(parts), "images")
-    found = [_product(project, chosen, looked, name, part, events) for part in parts]
+    found = [_product(project, chosen, looked, names, name, part, events) for part in parts]
     products = tuple(each for each in found if each is not None)
     seen = {image for each in products for image in each.images}
     blind += [f"{one.name}: sees nothing inside the bounds" for one in looked if one.name not in seen]
@@ -84,13 +84,20 @@ def plan_mosaic(
 
 
 def _product(
-    project: Project, chosen: OrthoSettings, looked: Sequence[Looked], name: str, sheet: Sheet, events: Events
+    project: Project,
+    chosen: OrthoSettings,
+    looked: Sequence[Looked],
+    every: Sequence[str],
+    name: str,
+    sheet: Sheet,
+    events: Events,
 ) -> OrthoProduct | None:
-    """A mosaic, or a sheet of one, of the images that see a part of it; None: none does."""
+    """Return a mosaic, or a sheet, of the images that see a part of it; None if none does. `every` has also others."""
     assert chosen.choice is not None
     name, grid = name + sheet.end, sheet.grid
-    # Whose seams lie beside a tile decides about weights in it: also beyond the product.
-    side = chosen.tile if chosen.choice.feather else 0
+    # Whose seams lie beside a tile decides about weights in it, and who sees what is there about holes in it: also
+    # beyond the product.
+    side = chosen.tile if chosen.choice.feather or chosen.fill_hidden else 0
     margin = side * grid.resolution
     wide = MapGrid(
         left=grid.left - margin,
@@ -118,7 +125,6 @@ def _product(
     check_storable(taking[0].scene, name, grid, chosen)
     taken = tuple(one.name for one in taking)
     looks = tuple(one.look for one in taking)
-    every = tuple(one.name for one in looked)
     regions = drawn_regions(project, chosen, taken, grid, every)
     plan = replace(product_plan(name, taken, grid, shared, chosen, looks, regions), clip=sheet.clip)
     return OrthoProduct(plan, looks, keyed(project, plan, chosen))

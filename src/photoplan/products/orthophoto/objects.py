@@ -209,5 +209,7 @@ def _product(project: Project, chosen: OrthoSettings, one: _Single, looked: Sequ
     seen = [replace(each.look.footprint, height_range=(levels[0], levels[1])) for each, _ in taking]
     looks = tuple(replace(each.look, footprint=footprint) for (each, _), footprint in zip(taking, seen))
     shared, images = Tiles.shared([mine for _, mine in taking]), tuple(each.name for each, _ in taking)
+    if chosen.fill_hidden:
+        shared = shared.with_neighbours()
     plan = product_plan(one.stem, images, one.grid, shared, chosen, looks)
     return OrthoProduct(plan, looks, keyed(project, plan, chosen, one.surface.part), one.surface.part)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from photoplan.engine.direct import Direct
 from photoplan.engine.execute import Painted, joined
 from photoplan.engine.execute import render as render_tile
+from photoplan.engine.holes import MOST_IMAGES
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.bounds import bounds_fault
@@ -110,7 +111,7 @@ class OrthoPlan:
 
     def __str__(self) -> str:
         tiles = sum(len(p.plan.tiles) for p in self.products)
-        lines = [f"{self.what}, {tiles} tiles, kernel {self.settings.kernel}"]
+        lines = [f"{self.what}, {tiles} tiles, kernel {self.settings.kernel}{self.settings.filling}"]
         for p in self.products:
             images = "" if self.settings.choice is None else f"{len(p.images)} images, "
             lines.append(
@@ -231,12 +232,29 @@ def product_plan(
     rule = AnchorRule.of(settings.kernel, settings.tolerance)
     if settings.choice is None:
         owners = None if settings.hidden == "show" else InSight(paints_hidden=settings.hidden == "mark")
-        return ProductPlan(name=name, sources=images, target=MapTarget(grid), rule=rule, tiles=tiles, owners=owners)
+        return ProductPlan(
+            name=name,
+            sources=images,
+            target=MapTarget(grid),
+            rule=rule,
+            tiles=tiles,
+            owners=owners,
+            fill_hidden=settings.fill_hidden,
+        )
     best = _best(images, settings, settings.choice, looks, regions)
     choice = settings.choice
     feather = feather_of(choice.feather, grid.resolution, settings.tile, choice.blend == "multiband")
+    if settings.fill_hidden and len(images) > MOST_IMAGES:
+        raise UsageError(f"`fill_hidden` with {len(images):,} images in one product; at most {MOST_IMAGES:,} can be")
     return ProductPlan(
-        name=name, sources=images, target=MapTarget(grid), rule=rule, tiles=tiles, owners=best, feather=feather
+        name=name,
+        sources=images,
+        target=MapTarget(grid),
+        rule=rule,
+        tiles=tiles,
+        owners=best,
+        feather=feather,
+        fill_hidden=settings.fill_hidden,
     )
 
 

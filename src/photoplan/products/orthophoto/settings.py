@@ -16,7 +16,7 @@ Blending = Literal["mean", "multiband"]
 Compression = Literal["deflate", "zstd", "lzw", "jpeg", "none"]
 
 
-#: Gaps wider than twice this are not filled, pixels.
+#: Gaps wider than twice this, and hidden holes wider than this, are not filled, pixels.
 MOST_FILLED = 32
 
 
@@ -92,6 +92,9 @@ class OrthoSettings:
     carried to the ground."""
     fill: int = 0
     """Gaps that the direct method leaves are filled from pixels no further away than this; 0: they stay empty."""
+    fill_hidden: int = 0
+    """Hidden holes up to this width and height, pixels, are filled: from an image whose line of sight is only just
+    blocked, else from the pixels around them. The raster of `sources` marks them; 0: they stay empty."""
     sources: bool = False
     """Whether a second raster says which image painted each pixel, and a GeoPackage where its regions are."""
     stack: str = ""
@@ -136,6 +139,18 @@ class OrthoSettings:
                 "`method` direct makes orthophotos of single images, paints no hidden ground and knows no `accuracy`: "
                 "leave `hidden` and `accuracy` out, or take the indirect method"
             )
+        if type(self.fill_hidden) is not int or not 0 <= self.fill_hidden <= MOST_FILLED:
+            raise UsageError(
+                f"`fill_hidden` {self.fill_hidden!r}; must be a whole number from 0 to {MOST_FILLED} pixels"
+            )
+        if self.fill_hidden and (self.hidden != "nodata" or self.method == "direct"):
+            raise UsageError(
+                f"`fill_hidden` {self.fill_hidden} fills hidden ground that is left empty; it requires `hidden` nodata "
+                f"(found {self.hidden}) and `method` indirect (found {self.method})"
+            )
+        if self.fill_hidden:
+            # Filled pixels are never without their mark.
+            object.__setattr__(self, "sources", True)
 
         if self.stack and self.choice is not None:
             raise UsageError(f"`stack` {self.stack!r} shows orthophotos as bands; a mosaic is one picture already")
@@ -144,6 +159,11 @@ class OrthoSettings:
     def asks_hidden(self) -> bool:
         """Whether it is looked what images cannot see."""
         return self.hidden != "show" or self.choice is not None
+
+    @property
+    def filling(self) -> str:
+        """Which hidden holes are filled, in words; empty if none are."""
+        return f", hidden holes up to {self.fill_hidden} px filled" if self.fill_hidden else ""
 
     @property
     def nodata_value(self) -> float | Literal["auto", "mask"]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from photoplan.io.naming import scratch, together, when_named
 from photoplan.io.polygons import check_vectors, label_polygons
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Project
 from photoplan.io.regions import read_regions, write_regions
 from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
@@ -31,7 +32,7 @@ from photoplan.products.balance.sample import Survey, survey
 from photoplan.products.one_colour import one_colour_told
 from photoplan.products.orthophoto.shown import shown
 from photoplan.products.run import BASE_MEMORY, question
-from photoplan.project.scene import SceneAddress, input_files
+from photoplan.project.scene import SceneAddress, input_files, without_unusable
 from photoplan.radiometry.seams import AROUND, find_seams, standing_out, without_overlap
 from photoplan.radiometry.shown import ArrayStore, SeamFeatures, SeamLayer, Shown, features_of
 from photoplan.surfaces.objects import painted_surface
@@ -82,6 +83,8 @@ class SeamsReport:
     """Multipolygon of each image that has one."""
     differences: tuple[float | None, float | None] | None = None
     """Mean difference at a pixel of seam: halfway between the images, and as found; grey values. None: no seam."""
+    unusable: Mapping[str, str] = field(default_factory=dict)
+    """Images that are left out since their files cannot be used, and why; they are among the notes."""
 
     def json_fields(self) -> dict[str, Any]:
         """Figures by name."""
@@ -110,12 +113,19 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
         No two images see the same terrain.
     """
     times, project = run_times(), load_project(request.project)
-    names = project.select(request.images or None)
     files = [*input_files(project), *([request.keep] if request.keep else [])]
     check_output(request.path, files, overwrite=request.overwrite)
     check_vectors(request.path)
     executor_factory(request.executor, request.workers)
+    report, unusable = without_unusable(project, request.images or None, partial(_make, request, times, events))
+    return replace(report, unusable=unusable)
+
+
+def _make(request: SeamsRequest, times: Callable[[], dict[str, Any]], events: Events, project: Project) -> SeamsReport:
+    """Find the seams of a project without images that cannot be used."""
+    names = project.select(request.images or None)
     found = survey(project, names, request.resolution, events)
+    files = [*input_files(project.alone(found.names)), *([request.keep] if request.keep else [])]
     notes = tuple(f"left out: {line}" for line in found.blind)
     images = _images(found)
     kept = BASE_MEMORY + _MAP * found.grid.window.size

@@ -21,7 +21,7 @@ from photoplan.geometry.crs import crs_label, crs_step, same_crs
 from photoplan.geometry.grid import Window
 from photoplan.geometry.levels import level_size
 from photoplan.io.image_form import placement_of
-from photoplan.io.raster import RasterReader
+from photoplan.io.raster import RasterReader, stated_classes
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.ground import TileGround
 from photoplan.plan.owner import Share
@@ -43,6 +43,8 @@ SLOPES = Ramp(
 #: Longer sides of the reduced image from which the range of grey values is taken, pixels.
 _LOOKED = 512
 _PERCENT = (2.0, 98.0)
+#: Part of the circle of hues between classes whose numbers follow each other: no two of many come near.
+_GOLDEN = (5**0.5 - 1) / 2
 
 Look = Callable[[Window], Seen]
 
@@ -59,6 +61,8 @@ class ContentRequest:
     value: str = ""
     """Of a raster its file, of a photo its name, of tints the ramp with its lowest and highest height."""
     opacity: float = 1.0
+    classes: bool = False
+    """Whether the values of a raster are numbers of classes, whatever its file states."""
 
     def __post_init__(self) -> None:
         if not 0 < self.opacity <= 1:
@@ -66,31 +70,35 @@ class ContentRequest:
 
     @classmethod
     def parse(cls, text: str) -> ContentRequest:
-        """From ``WHAT`` or ``WHAT@OPACITY``: ``shade``, ``slope``, ``photos``, ``photo:NAME``, ``tint``,
-        ``tint:RAMP``, ``tint:RAMP:LOW:HIGH``, or the file of a raster.
+        """Read ``WHAT`` or ``WHAT@OPACITY``: ``shade``, ``slope``, ``photos``, ``photo:NAME``, ``tint``,
+        ``tint:RAMP``, ``tint:RAMP:LOW:HIGH``, or the file of a raster, with ``@classes`` if its values are classes.
 
         Raises
         ------
         UsageError
             It is none of these.
         """
-        opacity, head, tail = 1.0, *text.rpartition("@")[::2]
-        if head and not Path(text).exists():
+        opacity, classes = 1.0, False
+        while "@" in text and not Path(text).exists():
+            head, _, tail = text.rpartition("@")
             try:
-                opacity, text = float(tail), head
+                classes, opacity = (True, opacity) if tail == "classes" else (classes, float(tail))
             except ValueError:
-                opacity = 1.0
+                break
+            text = head
         kind, _, value = text.partition(":")
-        if kind in ("shade", "slope", "photos") and not value:
-            return cls(kind, "", opacity)
-        if kind == "tint" or (kind == "photo" and value):
-            return cls(kind, value, opacity)
+        known = "" if kind in ("shade", "slope", "photos") and not value else None
+        known = value if kind == "tint" or (kind == "photo" and value) else known
+        if known is not None:
+            if classes:
+                raise UsageError(f"content {text}@classes: only the file of a raster has classes; leave `@classes` out")
+            return cls(kind, known, opacity)
         if not Path(text).is_file():
             raise UsageError(
                 f"content {text!r}: no such file; other contents are shade, slope, tint, tint:RAMP:LOW:HIGH, photos "
-                "and photo:NAME, each with @OPACITY if you like"
+                "and photo:NAME, each with @OPACITY if you like, files also with @classes"
             )
-        return cls("raster", text, opacity)
+        return cls("raster", text, opacity, classes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,15 +114,19 @@ class ViewScene:
     """The part with a pixel more all round, as far as the view goes, and the depth of its pixels."""
     surface: SeenSurface
     kernel: str
+    tolerance: float = 0.02
+    """See `AnchorRule`."""
 
     @classmethod
-    def of(cls, target: ViewTarget, tile: Tile, look: Look, surface: SeenSurface, kernel: str) -> ViewScene:
-        """What a part of a view shows; `look` tells it for a window."""
+    def of(
+        cls, target: ViewTarget, tile: Tile, look: Look, surface: SeenSurface, kernel: str, tolerance: float
+    ) -> ViewScene:
+        """Return what a part of a view shows; `look` finds it for a window."""
         window = tile.window
         around = Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2) & target.window
         seen = look(around)
         depth = seen.uvh[..., 2].astype(np.float32)
-        return cls(target, tile, seen.part(*window.slices(around)), (around, depth), surface, kernel)
+        return cls(target, tile, seen.part(*window.slices(around)), (around, depth), surface, kernel, tolerance)
 
     def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
         """Depth of pixels of the part: the engine need not look again."""
@@ -182,7 +194,7 @@ class Resampled:
     def paint(self, scene: ViewScene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
         """See `ViewLayer`."""
         kernel = "nearest" if self.classes else scene.kernel
-        rule = AnchorRule.of(kernel, 0.02, tilted=True)
+        rule = AnchorRule.of(kernel, scene.tolerance, tilted=True)
         rows, window = tuple(range(len(self.sources))), scene.tile.window
         owners = None
         if self.photos:
@@ -196,6 +208,8 @@ class Resampled:
         painted = render(plan, Tile(0, window, rows), self.sources, scene, kernel)
         if painted.values is None or painted.valid is None:
             return under, np.zeros(under.shape[1:], bool)
+        if self.classes and len(painted.values) == 1:
+            return class_colours(painted.values[0]), painted.valid
         return in_colours(painted.values, self.span), painted.valid
 
 
@@ -252,7 +266,7 @@ def _layer(
     if request.kind == "tint":
         return Tint(_ramp(request.value, heights))
     if request.kind == "raster":
-        return _raster(Path(request.value), ground)
+        return _raster(request, ground)
     project = ground.named
     names = project.select([request.value] if request.kind == "photo" else None)
     names = [name for name in names if project.image(name).center is not None]
@@ -277,8 +291,16 @@ def _ramp(text: str, heights: tuple[float, float]) -> Ramp:
     return built_in_ramp(name, low, high)
 
 
-def _raster(path: Path, ground: ViewGround) -> ViewLayer:
+def _raster(request: ContentRequest, ground: ViewGround) -> ViewLayer:
+    path = Path(request.value)
     reader = RasterReader(path)
+    stating = stated_classes(reader.info)
+    if request.classes and stating is None:
+        if reader.bands != 1 or reader.dtype.kind not in "iu":
+            raise UsageError(
+                f"content {path}@classes: {reader.bands} bands of {reader.dtype}; classes are whole numbers in one band"
+            )
+        stating = ()
     placement = placement_of(reader.info)
     if placement.transform is None:
         raise InputError(f"{path}: lies nowhere (no georeference); a content is a raster on the map, or photo:NAME")
@@ -290,8 +312,10 @@ def _raster(path: Path, ground: ViewGround) -> ViewLayer:
         else crs_step(ground.crs, placement.crs, ground.bounds, placement.middle[0])
     )
     source = Source(MapProjection(placement, carry), reader)
-    # A colour table belongs to numbers of classes: colours in between mean nothing.
-    return Resampled((source,), (reader.path,), grey_span(reader), photos=False, classes=reader.info.palette)
+    # Between numbers of classes nothing has a meaning.
+    span = (0.0, 255.0) if stating is not None else grey_span(reader)
+    files = (reader.path, *(stating or ()))
+    return Resampled((source,), files, span, photos=False, classes=stating is not None)
 
 
 def in_colours(values: NDArray[Any], span: tuple[float, float]) -> Colours:
@@ -300,6 +324,16 @@ def in_colours(values: NDArray[Any], span: tuple[float, float]) -> Colours:
     if span != (0.0, 255.0):
         colours = np.clip((colours - span[0]) * (255 / (span[1] - span[0])), 0, 255)
     return colours.astype(np.float32)
+
+
+def class_colours(numbers: NDArray[Any]) -> Colours:
+    """Return colours (3, height, width) of numbers of classes: hues far apart for numbers that follow each other."""
+    found, place = np.unique(numbers, return_inverse=True)
+    n = found.astype(np.float64)
+    hue, light = 2 * np.pi * np.mod(n * _GOLDEN, 1.0), np.array([0.62, 0.45, 0.78])[np.mod(n, 3).astype(int)]
+    turned = hue[:, None] + np.array([0.0, -2.0, 2.0]) * np.pi / 3
+    table = np.rint(255 * (light[:, None] + 0.22 * np.cos(turned) * np.sqrt(2))).clip(0, 255)
+    return np.moveaxis(table[place.reshape(numbers.shape)], -1, 0).astype(np.float32)
 
 
 def grey_span(reader: Reader) -> tuple[float, float]:

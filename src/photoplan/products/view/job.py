@@ -52,6 +52,8 @@ class LookRequest:
     samples: int = 2
     """Rays along each side of a pixel, of which its colour is the mean."""
     kernel: str = "bicubic"
+    tolerance: float = 0.02
+    """Largest error of places in rasters and photos, pixels of them; 0: every pixel is computed strictly."""
     photo: PhotoRequest | None = None
     """A photograph that the picture is compared with."""
 
@@ -60,6 +62,10 @@ class LookRequest:
             raise UsageError(f"`haze` {self.haze} per kilometre; 0 to 100 are allowed, 0.1 is much")
         if not 1 <= self.samples <= 8:
             raise UsageError(f"`samples` {self.samples}; 1 to 8 rays along each side of a pixel are allowed")
+        if not (self.tolerance == 0 or 1e-6 <= self.tolerance <= 10):
+            raise UsageError(
+                f"`tolerance` {self.tolerance} px; it must be 0 (every pixel strictly) or 1e-6 to 10 (usual is 0.02)"
+            )
         for name in ("haze_colour", "sky", "nodata", "water_colour"):
             if not all(0 <= v <= 255 for v in getattr(self, name)):
                 raise UsageError(f"`{name}` {getattr(self, name)}; red, green and blue from 0 to 255 are needed")
@@ -220,7 +226,14 @@ class ViewJob:
         for part in window.tiles(-(-max(window.width, window.height) // n)):
             fine = Window(part.col * n, part.row * n, part.width * n, part.height * n)
             look = partial(view.surface.look, target) if view.matrix is None else partial(from_matrix, view)
-            scene = ViewScene.of(target, Tile(tile.index, fine), look, view.surface, self.address.look.kernel)
+            scene = ViewScene.of(
+                target,
+                Tile(tile.index, fine),
+                look,
+                view.surface,
+                self.address.look.kernel,
+                self.address.look.tolerance,
+            )
             colours = colours_of(scene, view, self.address.look)
             samples = colours.reshape(3, part.height, n, part.width, n)
             if any(isinstance(layer, Resampled) and layer.classes for layer in view.layers):

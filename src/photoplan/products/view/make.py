@@ -236,7 +236,9 @@ def _fitting(path: Path, camera: ViewCamera) -> Path:
 
 def _look_facts(look: LookRequest) -> dict[str, Any]:
     """What decides colours: of files the content counts, which is among the inputs."""
-    contents = [(each.kind, "" if each.kind == "raster" else each.value, each.opacity) for each in look.contents]
+    contents = [
+        (each.kind, "" if each.kind == "raster" else each.value, each.opacity, each.classes) for each in look.contents
+    ]
     return {**vars(look), "contents": contents, "photo": look.photo and (look.photo.how, look.photo.opacity)}
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 import shapely
@@ -13,6 +12,7 @@ from scipy.ndimage import maximum_filter
 
 from photoplan.geometry.grid import Window
 from photoplan.kernels.strokes import draw_strokes
+from photoplan.plain import xml_quoted, xml_text
 from photoplan.products.view.lines import Drawing, LineStyle
 from photoplan.surfaces.seen_lines import LIFT_OF_POINTS, LinesOfSight, SeenLines
 
@@ -129,7 +129,7 @@ class Overlay:
         ]
         if picture is not None:
             out.append(
-                f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href={quoteattr(picture)} '
+                f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href={xml_quoted(picture)} '
                 'preserveAspectRatio="none"/>'
             )
         for stroke in self.layers:
@@ -149,7 +149,7 @@ class Overlay:
         )
         for label in self.labels:
             y = label.row - 0.5 + label.letters.baseline
-            out.append(f'<text x="{label.column - 0.5:g}" y="{y:.2f}">{escape(label.text)}</text>')
+            out.append(f'<text x="{label.column - 0.5:g}" y="{y:.2f}">{xml_text(label.text)}</text>')
         return "\n".join([*out, "</g>", "</svg>", ""])
 
 
