@@ -126,8 +126,12 @@ def counters() -> Iterator[list[tuple[str, int, int]]]:
 
 
 def unended(phases: Sequence[tuple[str, int, int]]) -> list[tuple[str, int, int]]:
-    """Return the phases with a total at which their counter did not end."""
-    return [phase for phase in phases if phase[1] and phase[1] != phase[2]]
+    """Return the phases with a total at which their counter did not end.
+
+    Planning again, without images that could not be read, begins anew: phases before it do not count.
+    """
+    last = max((at for at, phase in enumerate(phases) if phase[0] == "planning"), default=0)
+    return [phase for phase in phases[last:] if phase[1] and phase[1] != phase[2]]
 
 
 def inside(*words: object) -> Said:

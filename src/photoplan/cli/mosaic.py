@@ -46,7 +46,7 @@ def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str,
     )
     how = running.How.from_options(options)
     with running.telling(how) as events:
-        running.planned(load_project(project), plan_mosaic, {**options, "choice": choice}, how, events)()
+        running.make_products(load_project(project), plan_mosaic, {**options, "choice": choice}, how, events)
 
 
 def _sheets(given: str) -> float | str:

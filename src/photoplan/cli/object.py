@@ -43,4 +43,4 @@ def command(project: Path, polygons: Path, score: tuple[str, ...], prefer: tuple
     choice = Choice(weights=weights(score), prefer=prefer)
     how = running.How.from_options(options)
     with running.telling(how) as events:
-        running.planned(load_project(project), plan, {**options, "choice": choice}, how, events)()
+        running.make_products(load_project(project), plan, {**options, "choice": choice}, how, events)

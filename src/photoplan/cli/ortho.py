@@ -29,4 +29,4 @@ def command(project: Path, **options: Any) -> None:
 
     how = running.How.from_options(options)
     with running.telling(how) as events:
-        running.planned(load_project(project), plan_orthophotos, options, how, events)()
+        running.make_products(load_project(project), plan_orthophotos, options, how, events)

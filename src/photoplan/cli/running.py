@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from photoplan.io.project.model import Project
 from photoplan.products.orthophoto.execution import ProductResult, execute, seams_path
 from photoplan.products.orthophoto.finished import overview_path
 from photoplan.products.orthophoto.plan import OrthoPlan
-from photoplan.project.scene import refuse_unusable, without_unusable
+from photoplan.project.scene import Attempts, refuse_unusable
 
 
 def telling(how: How) -> Telling:
@@ -36,12 +37,12 @@ def telling(how: How) -> Telling:
     return Telling(how.quiet, product)
 
 
-def planned(
+def make_products(
     project: Project, plan: Callable[..., OrthoPlan], options: dict[str, Any], how: How, events: Telling
-) -> Callable[[], None]:
-    """Return what plans products with the options of `product_options` and makes them, or shows what would be made.
+) -> None:
+    """Plan products with the options of `product_options` and make them, or show what would be made.
 
-    Images whose files cannot be used are left out, which it raises at last.
+    Images whose files cannot be used are left out; they are raised at the end.
     """
     folder = options.pop("output") or project.folder / "products"
     plan_file, dry_run, images = (options.pop(name) for name in ("plan_file", "dry_run", "images"))
@@ -49,29 +50,33 @@ def planned(
     if squares and not dry_run and plan_file is None:
         raise click.UsageError("--show-quadtree shows a plan: give --plan FILE or --dry-run, too")
     changes = {k: v for k, v in options.items() if v is not None and v != ()}
-    begun = False
+    attempts, begun = Attempts(project, images or None), False
+    for attempt in attempts:
+        with attempt as usable:
+            made = plan(usable, images or None, events=events, **changes)
+            if dry_run or plan_file is not None:
+                # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
+                from photoplan.cli.show_plan import show_plan
 
-    def make(usable: Project) -> None:
-        nonlocal begun
-        made = plan(usable, images or None, events=events, **changes)
-        if dry_run or plan_file is not None:
-            # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
-            from photoplan.cli.show_plan import show_plan
-
-            show_plan(made, folder, plan_file, how, events, squares)
-        else:
-            again, begun = begun, True
-            execute_and_report(made, folder, how, events, again=again)
-
-    def run() -> None:
-        _, left_out = without_unusable(project, images or None, make)
-        refuse_unusable(left_out, len(project.select(images or None)))
-
-    return run
+                show_plan(made, folder, plan_file, how, events, squares)
+            else:
+                with reporting(made, folder, how, events) as then:
+                    again, begun = begun, True
+                    execute(made, folder, how.run(events, again), then)
+    refuse_unusable(attempts.left_out, len(project.select(images or None)))
 
 
-def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling, again: bool = False) -> None:
+def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling) -> None:
     """Make the products and print their paths, or one JSON object."""
+    with reporting(plan, folder, how, events) as then:
+        execute(plan, folder, how.run(events), then)
+
+
+@contextmanager
+def reporting(
+    plan: OrthoPlan, folder: Path, how: How, events: Telling
+) -> Iterator[Callable[[list[ProductResult]], None]]:
+    """Print the plan, and the products when they are made; yields what draws them before they get their names."""
     events.results.clear()
     started, kernels, compiled = time.perf_counter(), COMPILATIONS.kernels, COMPILATIONS.seconds
     settings = plan.settings
@@ -92,7 +97,7 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling,
             _draw_sources(results, events)
 
     try:
-        execute(plan, folder, how.run(events, again), then)
+        yield then
     except TilesFailed as error:
         failed = error
     seconds = time.perf_counter() - started

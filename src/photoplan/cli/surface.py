@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from photoplan.cli.options import LISTED, NEW_FOLDER, PATH, bounds_option, dry_run_option, executing, images_option
-
-if TYPE_CHECKING:
-    from photoplan.io.project.model import Project
 
 
 @click.command("surface")
@@ -67,7 +64,7 @@ def command(project: Path, **options: Any) -> None:
     from photoplan.products.surface.plan import plan_surface
     from photoplan.products.surface.run import make_surface
     from photoplan.products.surface.settings import SurfaceSettings
-    from photoplan.project.scene import refuse_unusable, without_unusable
+    from photoplan.project.scene import Attempts, refuse_unusable
     from photoplan.report.maps import draw_surface
     from photoplan.report.page import open_report
     from photoplan.report.surface import surface_page
@@ -79,30 +76,30 @@ def command(project: Path, **options: Any) -> None:
     options.pop("report", None)
     stated = load_project(project)
 
-    def make(usable: Project) -> None:
-        plan = plan_surface(usable, SurfaceSettings(**options), images or None, force=force, events=events)
-        for line in plan.blind:
-            events.talk(f"  note: left out: {line}")
-        if dry_run:
-            show_json(plan.json_fields()) if how.as_json else show(plan)
-            return
-        events.talk(str(plan))
-        with together():
-            result = make_surface(plan, folder or stated.folder / "products", how.run(events))
-            told = None if report is None else report.write(surface_page(plan, result))
-            picture = None
-            if can_draw(how.quicklook, events.talk):
-                picture = draw_surface(result.path, result.path.with_suffix(".png"), plan.axes)
-        if how.as_json:
-            show_json(result, report=told)
-        else:
-            for path in filter(None, (result.path, *result.others, told)):
-                show(path)
-        _tell(result, plan, picture, events)
-
+    attempts = Attempts(stated, images or None)
     with Telling(how.quiet) as events:
-        _, left_out = without_unusable(stated, images or None, make)
-    refuse_unusable(left_out, len(stated.select(images or None)))
+        for attempt in attempts:
+            with attempt as usable:
+                plan = plan_surface(usable, SurfaceSettings(**options), images or None, force=force, events=events)
+                for line in plan.blind:
+                    events.talk(f"  note: left out: {line}")
+                if dry_run:
+                    show_json(plan.json_fields()) if how.as_json else show(plan)
+                    continue
+                events.talk(str(plan))
+                with together():
+                    result = make_surface(plan, folder or stated.folder / "products", how.run(events))
+                    told = None if report is None else report.write(surface_page(plan, result))
+                    picture = None
+                    if can_draw(how.quicklook, events.talk):
+                        picture = draw_surface(result.path, result.path.with_suffix(".png"), plan.axes)
+                if how.as_json:
+                    show_json(result, report=told)
+                else:
+                    for path in filter(None, (result.path, *result.others, told)):
+                        show(path)
+                _tell(result, plan, picture, events)
+    refuse_unusable(attempts.left_out, len(stated.select(images or None)))
 
 
 def _bands(words: Sequence[str] | None) -> tuple[int, ...]:

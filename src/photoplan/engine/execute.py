@@ -128,14 +128,6 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
     Whether and how it is cut depends on the tile and the sources alone, so that the result does not depend on
     memory, workers or order.
     """
-    painted = _render(product, tile, sources, surface, kernel)
-    if not product.fill_hidden or painted.hidden is None or not painted.hidden.any():
-        return painted
-    return _with_holes_filled(product, tile, sources, surface, kernel, painted)
-
-
-def _render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str) -> Painted:
-    """What images see of a tile."""
     window, cameras = tile.window, {row: sources[row].camera for row in tile.sources}
     compiled = compile_tile(product, tile, cameras, surface)
     every = [*compiled.layers, *(layer for blend in compiled.blends for layer in blend.tile.layers)]
@@ -151,12 +143,12 @@ def _render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface
         return _painted(compiled, values, valid)
     side = max(SMALLEST_PART, -(-max(window.width, window.height) // 2))
     cut = [replace(tile, window=part) for part in window.tiles(side)]
-    parts = ((part.window, _render(product, part, sources, surface, kernel)) for part in cut)
+    parts = ((part.window, render(product, part, sources, surface, kernel)) for part in cut)
     whole = joined(window, parts, sources[tile.sources[0]].reader)
     return whole if np.any(whole.valid) else replace(whole, values=None, valid=None, owner=None)
 
 
-def _with_holes_filled(
+def with_holes_filled(
     product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str, painted: Painted
 ) -> Painted:
     """A tile whose small hidden holes are filled: from images that see them once they are raised to the level around
@@ -165,10 +157,12 @@ def _with_holes_filled(
     All other pixels stay as they are. What a pixel gets does not depend on the tile: holes, and what is around them,
     are looked at across its borders and those of what the product shows.
     """
-    assert isinstance(product.target, MapTarget) and painted.hidden is not None
+    if not product.fill_hidden or painted.hidden is None or not painted.hidden.any():
+        return painted
+    assert isinstance(product.target, MapTarget)
     at, reach, resolution = tile.window, halo(product.fill_hidden), product.target.grid.resolution
     whole = replace(product, clip=None, fill_hidden=0)
-    mine = painted if product.clip is None else _render(whole, tile, sources, surface, kernel)
+    mine = painted if product.clip is None else render(whole, tile, sources, surface, kernel)
     assert mine.hidden is not None
     wide = Window(at.col - reach, at.row - reach, at.width + 2 * reach, at.height + 2 * reach)
     (right, bottom), parts = at.stop, [(at, mine)]
@@ -179,7 +173,7 @@ def _with_holes_filled(
         (mine.hidden[:, -reach:], Window(right, at.row, reach, at.height)),
     ):
         if near.any():
-            parts.append((beside, _render(whole, replace(tile, window=beside), sources, surface, kernel)))
+            parts.append((beside, render(whole, replace(tile, window=beside), sources, surface, kernel)))
     around = joined(wide, parts, sources[tile.sources[0]].reader)
     assert around.values is not None and around.valid is not None and around.hidden is not None
     own = at.slices(wide)
@@ -199,7 +193,7 @@ def _with_holes_filled(
             replace(whole, feather=None, clip=Mask(wide, shown)),
             RaisedSurface(surface, wide, rise * resolution),
         )
-        seen = _render(over, replace(tile, window=box), sources, raised, kernel)
+        seen = render(over, replace(tile, window=box), sources, raised, kernel)
         if seen.values is not None and seen.valid is not None and seen.owner is not None:
             part = box.slices(wide)
             values[:, *part] = np.where(seen.valid, seen.values, values[:, *part])
@@ -404,6 +398,7 @@ class RenderJob:
         opened = self.address.open()
         if self.paint is None:
             painted = render(self.product, tile, opened.sources, opened.surface, self.kernel)
+            painted = with_holes_filled(self.product, tile, opened.sources, opened.surface, self.kernel, painted)
         else:
             painted = self.paint.render(self.product, tile, opened.sources, opened.surface)
         record: dict[str, Any] = {"worst_residual": painted.residual, "cells": painted.cells}

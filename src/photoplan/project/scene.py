@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -151,30 +151,41 @@ def open_scene(project: Project, name: str) -> Scene:
     return _open(scene_address(project, name))
 
 
-def without_unusable(
-    project: Project, images: Sequence[str] | None, make: Callable[[Project], T]
-) -> tuple[T, dict[str, str]]:
-    """Return what `make` gives for a project, and the images that it was made without because of their files.
+class Attempts:
+    """Attempts to make something of a project's images, each without those whose files the one before could not read.
 
-    If `make` fails, the images that cannot be opened are left out, see `Project.leaving_out`. If all can be opened and
-    the error names the file of one, those are left out whose pixels cannot be read. Balance files and filters do not
-    count: they can be corrected.
+    Each is a context that gives the project. If it ends with an error, the images that cannot be opened are left out,
+    see `Project.leaving_out`; if all can be opened and the error names the file of one, those whose pixels cannot be
+    read. Balance files and filters do not count: they can be corrected.
 
     Raises
     ------
     InputError
         No image can be used, or another input cannot.
     """
-    left_out: dict[str, str] = {}
-    while True:
-        try:
-            return make(project.leaving_out(left_out)), left_out
-        except InputError as error:
-            names = project.leaving_out(left_out).oriented(project.select(images), approximate=True)[0]
-            found = unusable_images(project, names, str(error))
-            if not 0 < len(found) < len(names):
-                raise
-            left_out |= found
+
+    def __init__(self, project: Project, images: Sequence[str] | None) -> None:
+        self.left_out: dict[str, str] = {}
+        self._project, self._images, self._again = project, images, True
+
+    def __iter__(self) -> Iterator[Self]:
+        while self._again:
+            self._again = False
+            yield self
+
+    def __enter__(self) -> Project:
+        return self._project.leaving_out(self.left_out)
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        if not isinstance(error, InputError):
+            return False
+        usable = self._project.leaving_out(self.left_out)
+        names = usable.oriented(self._project.select(self._images), approximate=True)[0]
+        found = unusable_images(usable, names, str(error))
+        self._again = 0 < len(found) < len(names)
+        if self._again:
+            self.left_out |= found
+        return self._again
 
 
 def unusable_images(project: Project, names: Sequence[str], error: str) -> dict[str, str]:

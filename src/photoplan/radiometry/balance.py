@@ -154,6 +154,8 @@ def balanced(
         ends = np.array(limits)
         scale = factors(inner, len(images), parts, place, placed(inner, sizes[images], len(images))[1])
         raw = [[Tone(limits, (float(f * ends[0]), float(f * ends[1]))) for f in each] for each in scale]
+        for _ in range(cells.bands):
+            done()
     else:
         basis = Basis(max(degree, 2))
         kinds = (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ from photoplan.products.balance.reference import Reference, open_reference
 from photoplan.products.balance.sample import Survey, sample, survey
 from photoplan.products.one_colour import one_colour_told
 from photoplan.products.run import BASE_MEMORY, refuse_inputs
-from photoplan.project.scene import input_files, without_unusable
+from photoplan.project.scene import Attempts, input_files
 from photoplan.radiometry.balance import Balanced, Pairs, balanced, even_images, pairs_of
 from photoplan.radiometry.cells import SIDE, Cells
 
@@ -146,10 +145,11 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     times, project = run_times(), _plain(load_project(request.project))
     names = project.select(request.images or None)
     fixed = _check(request, project, names)
-    report, unusable = without_unusable(
-        project, request.images or None, partial(_balance, request, names, fixed, times, events)
-    )
-    return replace(report, unusable=unusable)
+    attempts = Attempts(project, request.images or None)
+    for attempt in attempts:
+        with attempt as usable:
+            report = _balance(request, names, fixed, times, events, usable)
+    return replace(report, unusable=attempts.left_out)
 
 
 def _balance(

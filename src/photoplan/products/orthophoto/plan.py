@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.engine.direct import Direct
-from photoplan.engine.execute import Painted, joined
+from photoplan.engine.execute import Painted, joined, with_holes_filled
 from photoplan.engine.execute import render as render_tile
 from photoplan.engine.holes import MOST_IMAGES
 from photoplan.errors import GeometryError, UsageError
@@ -317,7 +317,8 @@ def render(
     def painted(tile: Tile) -> Painted:
         if paint is not None:
             return paint.render(product.plan, tile, scenes.sources, scenes.surface)
-        return render_tile(product.plan, tile, scenes.sources, scenes.surface, plan.settings.kernel)
+        made = render_tile(product.plan, tile, scenes.sources, scenes.surface, plan.settings.kernel)
+        return with_holes_filled(product.plan, tile, scenes.sources, scenes.surface, plan.settings.kernel, made)
 
     parts = ((tile.window, painted(tile)) for tile in tiles)
     whole = joined(window, parts, scenes[0].reader)

@@ -32,7 +32,7 @@ from photoplan.products.balance.sample import Survey, survey
 from photoplan.products.one_colour import one_colour_told
 from photoplan.products.orthophoto.shown import shown
 from photoplan.products.run import BASE_MEMORY, question
-from photoplan.project.scene import SceneAddress, input_files, without_unusable
+from photoplan.project.scene import Attempts, SceneAddress, input_files
 from photoplan.radiometry.seams import AROUND, find_seams, standing_out, without_overlap
 from photoplan.radiometry.shown import ArrayStore, SeamFeatures, SeamLayer, Shown, features_of
 from photoplan.surfaces.objects import painted_surface
@@ -117,8 +117,11 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     check_output(request.path, files, overwrite=request.overwrite)
     check_vectors(request.path)
     executor_factory(request.executor, request.workers)
-    report, unusable = without_unusable(project, request.images or None, partial(_make, request, times, events))
-    return replace(report, unusable=unusable)
+    attempts = Attempts(project, request.images or None)
+    for attempt in attempts:
+        with attempt as usable:
+            report = _make(request, times, events, usable)
+    return replace(report, unusable=attempts.left_out)
 
 
 def _make(request: SeamsRequest, times: Callable[[], dict[str, Any]], events: Events, project: Project) -> SeamsReport:
