@@ -6,8 +6,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import tomlkit
 
 from photoplan.errors import InputError
+from photoplan.io.project import edit
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 
@@ -74,6 +76,12 @@ def test_only_what_changes_changes(path: Path) -> None:
     assert len(new) == 3 + 3 + 2 * 2  # changed, added to tables that there are, two tables with one entry each
     for comment in ("# The block of 1987.", "# Vienna", "# measured in 2001", "# report of 1986", "# The second strip"):
         assert comment in path.read_text()
+
+
+def test_new_entries_stand_before_the_comments_of_the_next_table() -> None:
+    document = tomlkit.parse("[a]\nx = 1  # one\n\n# Defaults of b\n[b]\n# z = 3\n")
+    edit._set(document.item("a"), {"y": [2.0, 3.0]})
+    assert document.as_string().startswith("[a]\nx = 1  # one\ny = [2.0, 3.0]\n\n# Defaults of b\n[b]\n")
 
 
 def test_tables_of_an_image_stay_in_its_image(path: Path) -> None:

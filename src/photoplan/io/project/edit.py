@@ -134,11 +134,18 @@ def _table(value: Any, what: str) -> Any:
 
 
 def _set(table: Table, entries: Mapping[str, Any]) -> None:
+    """Set entries; new ones stand after the last one, before the comments that introduce the next table."""
+    body = table.value.body
+    last = max((at for at, (key, _) in enumerate(body) if key is not None), default=-1) + 1
+    after: list[Any] = [item for _, item in body[last:]]
+    del body[last:]
     for key, value in entries.items():
         if value is None:
             table.pop(key, None)
         elif key not in table or table[key] != _plain(value):
             table[key] = _item(value)
+    for item in after:
+        table.add(item)
 
 
 def _plain(value: Any) -> Any:
