@@ -100,7 +100,7 @@ def test_pictures_of_a_model_file(tmp_path: Path, photoplan: Any) -> None:
     ("verb", "options", "code", "message"),
     [
         ("shade", ["--altitude", "0"], 2, "altitude"),
-        ("slope", ["--classes", "5,a"], 2, "rising numbers"),
+        ("slope", ["--classes", "5,a"], 2, "numbers with commas"),
         ("slope", ["--classes", "5,4"], 2, "rising"),
         ("slope", ["--aspect", "--percent"], 2, "--aspect"),
         ("tint", ["--ramp", "absent.txt"], 3, "built in are"),

@@ -1,6 +1,5 @@
 """The reference pages name every option and entry that exists, and none that does not; examples parse."""
 
-import importlib
 import json
 import re
 import shlex
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import click
 import pytest
+from tools.command import verbs
 
 from photoplan.cli.dtm import VERBS as DTM_VERBS
 from photoplan.cli.main import VERBS
@@ -33,7 +33,7 @@ def long_options(text):
 
 
 def command_of(verb):
-    return importlib.import_module(f"photoplan.cli.{verb.replace(' ', '_')}").command
+    return verbs()[verb]
 
 
 def options_of(verb):

@@ -156,18 +156,17 @@ REQUESTS = [name for name in pp.__all__ if name.endswith("Request")]
 def test_no_request_takes_nonsense_for_a_file(name: str, value: Any) -> None:
     """In every field that is a file or files: an error of ours at birth, not an exception of Python later."""
     request = getattr(pp, name)
-    fields = [
-        f for f in dataclasses.fields(request) if re.fullmatch(r"(tuple\[)?Path(, \.\.\.\])?( \| None)?", str(f.type))
-    ]
-    if not fields:
-        return
-    for field in fields:
-        given: dict[str, Any] = {f.name: "x" for f in fields if f.default is dataclasses.MISSING}
-        others = [f for f in dataclasses.fields(request) if f not in fields and f.default is f.default_factory]
-        if others:
-            continue
-        with pytest.raises(PhotoplanError, match=field.name):
-            request(**{**given, field.name: value})
+    if hasattr(request, "model_fields"):
+        declared = [(key, each.annotation, each.is_required()) for key, each in request.model_fields.items()]
+    else:
+        declared = [(f.name, f.type, f.default is f.default_factory) for f in dataclasses.fields(request)]
+    of_files = r"(tuple\[)?(pathlib\.)?Path(, \.\.\.\])?( \| None)?"
+    files = [key for key, kind, _ in declared if kind is Path or re.fullmatch(of_files, str(kind))]
+    needed = {key for key, _, required in declared if required}
+    for field in files if needed <= set(files) else ():
+        given: dict[str, Any] = dict.fromkeys(needed, "x")
+        with pytest.raises(PhotoplanError, match=field):
+            request(**{**given, field: value})
 
 
 def test_all_public_functions_keep_their_signature() -> None:

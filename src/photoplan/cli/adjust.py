@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import NEW_FOLDER, PATH, ending, images_option
+from photoplan.cli.options import NEW_FOLDER, PROJECT, ending, images_option
 from photoplan.cli.output import say, show, show_json
 from photoplan.plain import shown_metres
 
@@ -19,7 +19,7 @@ _SHOWN = 20
 
 
 @click.command("adjust")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @click.option(
     "--calibrate", multiple=True, metavar="CAMERA=c:SIGMA,x0,…", help="Unknowns, with what is known [as stated]."
 )

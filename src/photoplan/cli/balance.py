@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import NEW_FOLDER, PATH, ending, images_option
+from photoplan.cli.options import NEW_FOLDER, PATH, PROJECT, ending, images_option
 from photoplan.cli.output import can_draw, say, show, show_json, talking
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ _LISTED = 12
 
 
 @click.command("balance")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @images_option()
 @click.option("--reference-image", metavar="NAME", help="This image stays as it is [mean and contrast of all stay].")
 @click.option("--reference", type=PATH, metavar="FILE", help="A raster on the map whose colours the images get.")

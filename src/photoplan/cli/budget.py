@@ -7,12 +7,12 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, ending, images_option
+from photoplan.cli.options import PATH, PROJECT, ending, images_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("budget")
-@click.argument("project", required=False, type=PATH)
+@click.argument("project", required=False, type=PROJECT)
 @images_option()
 @click.option("--camera-constant", type=float, metavar="MM", help="Camera constant of a vertical image, no project.")
 @click.option("--height", type=float, metavar="M", help="Its flying height above ground.")

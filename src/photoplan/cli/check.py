@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import PATH, ending, images_option
+from photoplan.cli.options import PROJECT, ending, images_option
 from photoplan.cli.output import show, show_json
 
 
 @click.command("check")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @images_option()
 @ending(overwrite=False)
 def command(project: Path, images: tuple[str, ...], as_json: bool, quiet: bool) -> None:

@@ -7,12 +7,12 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, ending, images_option
+from photoplan.cli.options import PATH, PROJECT, ending, images_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("control")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @click.option("--ortho", type=PATH, multiple=True, required=True, metavar="FILE", help="Orthophoto; may be repeated.")
 @click.option("--height-sigma", type=float, required=True, metavar="M", help="Standard deviation of the heights.")
 @click.option("--ortho-sigma", type=float, metavar="M", help="Standard deviation of X and of Y in it [one pixel].")

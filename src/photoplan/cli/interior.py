@@ -6,12 +6,12 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, ending, images_option
+from photoplan.cli.options import PATH, PROJECT, ending, images_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 
 @click.command("interior")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @images_option("all film")
 @click.option(
     "--model",

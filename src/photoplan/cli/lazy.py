@@ -5,18 +5,23 @@ from __future__ import annotations
 import importlib
 import re
 from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import Any
 
 import click
 
 from photoplan.cli.output import spelled
+from photoplan.cli.verb import Verb
 from photoplan.errors import PhotoplanError
+
+#: Commands that hold commands.
+GROUPS = ("dtm", "view")
 
 
 class LazyGroup(click.Group):
     """Lists verbs without importing them."""
 
-    def __init__(self, *arguments: Any, verbs: Mapping[str, str], package: str, **options: Any) -> None:
+    def __init__(self, *arguments: Any, verbs: Mapping[str, str | Verb], package: str, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.verbs = verbs
         self.package = package
@@ -35,8 +40,20 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """The verb and what follows it, with the numbers of options that take several written apart."""
+        if args and args[0] not in self.verbs and not args[0].startswith("-"):
+            ctx.fail(f"no command {args[0]!r}{self._meant(args[0], ctx)}")
         name, command, rest = super().resolve_command(ctx, args)
         return name, command, rest if command is None else apart(command, rest)
+
+    def _meant(self, word: str, ctx: click.Context) -> str:
+        """Return which commands a misspelt word may mean; those of groups, too."""
+        places = {name: name for name in self.verbs}
+        for name in self.verbs if ctx.parent is None else ():
+            group = self.get_command(ctx, name) if name in GROUPS else None
+            places |= {f"{verb} ({name})": f"{name} {verb}" for verb in getattr(group, "verbs", ())}
+        close = get_close_matches(word, [place.split()[0] for place in places], n=3, cutoff=0.6)
+        meant = [f"`{ctx.command_path} {full}`" for place, full in places.items() if place.split()[0] in close]
+        return f"; did you mean {' or '.join(meant[:3])}?" if meant else f"; see `{ctx.command_path} --help`"
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """The verbs, in the order of a job."""
@@ -46,13 +63,18 @@ class LazyGroup(click.Group):
         """The command of a verb, imported now."""
         if cmd_name not in self.verbs:
             return None
+        verb = self.verbs[cmd_name]
+        if isinstance(verb, Verb):
+            return verb.command(cmd_name)
         command: click.Command = importlib.import_module(self.package + cmd_name).command
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """One line for each verb."""
         with formatter.section("Verbs"):
-            formatter.write_dl(list(self.verbs.items()))
+            formatter.write_dl(
+                [(name, verb if isinstance(verb, str) else verb.short) for name, verb in self.verbs.items()]
+            )
 
 
 #: What may stand between numbers of one option: blanks, commas, semicolons.

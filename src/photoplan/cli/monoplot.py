@@ -6,12 +6,12 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, ending
+from photoplan.cli.options import PATH, PROJECT, ending
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("monoplot")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @click.argument("image")
 @click.argument("points", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, metavar="CSV", help="Ground points.")

@@ -7,11 +7,11 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, choosing_options, executing, product_options, weights
+from photoplan.cli.options import PATH, PROJECT, choosing_options, executing, product_options, weights
 
 
 @click.command("mosaic")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @product_options
 @click.option("--name", default="mosaic", show_default=True, help="Of the product's files.")
 @choosing_options

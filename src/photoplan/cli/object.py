@@ -8,11 +8,11 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import LISTED, PATH, choosing_options, executing, product_options, weights
+from photoplan.cli.options import LISTED, PATH, PROJECT, choosing_options, executing, product_options, weights
 
 
 @click.command("object")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @click.argument("polygons", type=PATH)
 @product_options
 @choosing_options

@@ -37,7 +37,17 @@ class _Path(click.Path):
         return super().convert(value, param, ctx)
 
 
+class _ProjectPath(_Path):
+    """A project file; a folder stands for the `project.toml` in it."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        path = super().convert(value, param, ctx)
+        inside = Path(path) / "project.toml"
+        return inside if inside.is_file() else path
+
+
 PATH = _Path()
+PROJECT = _ProjectPath()
 FOLDER = _Path(file_okay=False)
 NEW_FOLDER = _Path(new_folder=True)
 POSITIVE = click.FloatRange(0, min_open=True)
@@ -105,7 +115,8 @@ class _Bytes(click.ParamType):
 BYTES = _Bytes()
 
 
-def _all_cores(context: click.Context, parameter: click.Parameter, given: int | None) -> int:
+def all_cores(context: click.Context, parameter: click.Parameter, given: int | None) -> int:
+    """Return the number of workers; all cores if none is given."""
     from photoplan.engine.executors import available_cpus
 
     return given or available_cpus()
@@ -115,7 +126,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="No progress on stderr; warnings stay.")
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace what exists.")
 workers_option = click.option(
-    "--workers", type=click.IntRange(1), callback=_all_cores, help="Worked on at once [all cores]."
+    "--workers", type=click.IntRange(1), callback=all_cores, help="Worked on at once [all cores]."
 )
 executor_option = click.option(
     "--executor",

@@ -7,11 +7,11 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, executing, product_options
+from photoplan.cli.options import PROJECT, executing, product_options
 
 
 @click.command("ortho")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @product_options
 @click.option("--true/--ground", "true", default=None, help="Show objects where they stand, or the ground [ground].")
 @click.option("--method", help="indirect, or direct: pixels of the image are carried to the ground [indirect].")

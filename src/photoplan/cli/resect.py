@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, POSITIVE, ending, images_option
+from photoplan.cli.options import PATH, POSITIVE, PROJECT, ending, images_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 from photoplan.plain import shown_metres
 
@@ -18,7 +18,7 @@ _DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 
 
 @click.command("resect")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @images_option("all with 3 control points")
 @click.option("--image-points", multiple=True, type=PATH, metavar="FILE", help="Instead of the project's.")
 @click.option("--control", multiple=True, type=PATH, metavar="FILE", help="Instead of the project's.")

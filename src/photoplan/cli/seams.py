@@ -6,12 +6,12 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, ending, images_option
+from photoplan.cli.options import PATH, PROJECT, ending, images_option
 from photoplan.cli.output import can_draw, say, show, show_json, talking
 
 
 @click.command("seams")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @images_option()
 @click.option("--resolution", type=float, metavar="R", help="Seams run along pixels of R metres [256 across an image].")
 @click.option("--keep", type=PATH, metavar="FILE", help="Regions with their images that stay as they are.")

@@ -8,11 +8,20 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import LISTED, NEW_FOLDER, PATH, bounds_option, dry_run_option, executing, images_option
+from photoplan.cli.options import (
+    LISTED,
+    NEW_FOLDER,
+    PATH,
+    PROJECT,
+    bounds_option,
+    dry_run_option,
+    executing,
+    images_option,
+)
 
 
 @click.command("surface")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @click.option("--resolution", type=float, required=True, metavar="R", help="Distance of the heights, metres.")
 @click.option(
     "--target",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, ending, images_option
+from photoplan.cli.options import PATH, PROJECT, ending, images_option
 from photoplan.cli.output import can_draw, say, show, show_json, talking
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @click.command("tie")
-@click.argument("project", type=PATH)
+@click.argument("project", type=PROJECT)
 @images_option()
 @click.option("--pairs", default="auto", show_default=True, metavar="auto|all|FILE", help="Which images are compared.")
 @click.option("--scale", type=float, help="Look for features in images reduced to this, e.g. 0.5 [by their size].")

@@ -29,6 +29,7 @@ from photoplan.io.gdal import gdal_settings, not_georeferenced
 from photoplan.io.names import stated_path, stated_text
 from photoplan.io.naming import together, write_atomically
 from photoplan.plain import HasJsonFields, json_text, pick
+from photoplan.request import Request
 
 try:
     import resource
@@ -102,8 +103,10 @@ def run_key(kind: str, settings: object, inputs: Iterable[Path | Mapping[str, An
 
 def settings_of(request: Any) -> dict[str, Any]:
     """Fields of a request that may decide values: not its files, which are inputs or outputs."""
-    stated = {each.name: getattr(request, each.name) for each in fields(request)}
-    return {name: value for name, value in stated.items() if name not in _IDLE and not _of_files(value)}
+    options = (
+        dict(request) if isinstance(request, Request) else {f.name: getattr(request, f.name) for f in fields(request)}
+    )
+    return {name: value for name, value in options.items() if name not in _IDLE and not _of_files(value)}
 
 
 def _of_files(value: Any) -> bool:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from photoplan.errors import InputError, PhotoplanError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.appearance import looks_like
@@ -45,6 +47,7 @@ from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.model_tables import GrossError
 from photoplan.io.vector_layer import layers_of, read_layer
 from photoplan.plain import pick
+from photoplan.products.dtm.request import InfoRequest
 from photoplan.products.simulate.form import stated_model
 from photoplan.project.filter_files import load_filter
 from photoplan.quality.restoration.borders import Convolution
@@ -491,7 +494,7 @@ def _number(value: float | None) -> str:
 
 
 @dataclass(frozen=True)
-class TerrainFacts:
+class TerrainFacts(Result):
     """What is known of a terrain file."""
 
     facts: dict[str, Any]
@@ -502,6 +505,31 @@ class TerrainFacts:
     """Measurements flagged as gross errors, the largest normalised residual first."""
     suspects: list[dict[str, Any]]
     """Measurements that are used, but look like parts of gross errors."""
+    listed: bool = False
+    """Show the flagged measurements."""
+
+    def json_fields(self) -> dict[str, Any]:
+        """Figures, and the flagged measurements if they are shown."""
+        return self.figures | ({"gross_errors": self.gross, "suspect_points": self.suspects} if self.listed else {})
+
+    def summary(self) -> Sequence[str]:
+        """Return a line for each fact, and for each flagged measurement if they are shown."""
+        width, lines = max(len(key) for key in self.facts), []
+        for key, value in self.facts.items():
+            for i, text in enumerate(value if isinstance(value, list) else [value]):
+                lines.append(f"{key if i == 0 else '':<{width}}  {text}")
+        flagged = [("", g) for g in self.gross] + [("suspect: ", g) for g in self.suspects]
+        return lines + [
+            f"{what}{g['name']}  {g['kind']}  X {g['x']:.3f} Y {g['y']:.3f} Z {g['z']:.3f}  "
+            f"residual {g['residual']:+.3f} m ({g['normalised']:+.1f} σ, redundancy {g['redundancy']:.2f})"
+            for what, g in flagged
+            if self.listed
+        ]
+
+
+def describe_terrain(request: InfoRequest, events: Events = SILENT) -> TerrainFacts:
+    """Describe a terrain model or a raster of heights; see `dtm_info`."""
+    return replace(dtm_info(request.model), listed=request.gross)
 
 
 def dtm_info(path: Path) -> TerrainFacts:
@@ -518,9 +546,9 @@ def dtm_info(path: Path) -> TerrainFacts:
         facts = describe(path)
         return TerrainFacts(facts, facts, [], [])
     reader = ModelReader(path)
-    gross = sorted(reader.gross(), key=lambda g: -abs(g.normalised))
-    lists = ([_flagged(g) for g in some] for some in (gross, reader.suspects()))
-    return TerrainFacts(describe_model(reader), model_figures(reader), *lists)
+    gross = [_flagged(g) for g in sorted(reader.gross(), key=lambda g: -abs(g.normalised))]
+    suspects = [_flagged(g) for g in reader.suspects()]
+    return TerrainFacts(describe_model(reader), model_figures(reader), gross, suspects)
 
 
 def _flagged(g: GrossError) -> dict[str, Any]:

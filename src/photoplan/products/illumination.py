@@ -28,7 +28,8 @@ from photoplan.project.restored import kept_nodata
 from photoplan.radiometry.illumination import LightModel, LitGround, estimate_light
 from photoplan.radiometry.tone import fitted
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.shading import Lighting, even_slopes
+from photoplan.terrain.options import Lighting
+from photoplan.terrain.shading import directions, even_slopes
 
 #: Windows along both axes from which parameters are estimated, and their side, pixels.
 _ALONG, _SIDE = 8, 64
@@ -95,7 +96,7 @@ class _Place:
 
     def ground(self, window: Window) -> LitGround:
         """What the terrain is like in a window of the picture."""
-        surface, sun = self.terrain.surface, self.light.directions[0]
+        surface, sun = self.terrain.surface, directions(self.light)[0]
         slopes = even_slopes(surface, self.grid, window)
         tile = TileGround.of(MapTarget(self.grid), window, slopes.heights)
         shadow = hidden_pixels(SunProjection(triple(sun)), tile, surface)
@@ -152,7 +153,7 @@ def correct_illumination(request: IlluminationRequest, events: Events = SILENT) 
 
 
 def _open(request: IlluminationRequest) -> _Place:
-    light = Lighting(*request.sun)
+    light = Lighting(azimuth=request.sun[0], altitude=request.sun[1])
     reader = RasterReader(request.picture)
     placement = placement_of(reader.info)
     if placement.transform is None or placement.crs is None:

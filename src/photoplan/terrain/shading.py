@@ -20,6 +20,7 @@ from photoplan.kernels.gradient import gradients, illumination
 from photoplan.surfaces.base import Surface, Terrain
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.targets.map import MapTarget
+from photoplan.terrain.options import Lighting
 
 #: Half the distance of two posts at most over which slopes are means, pixels.
 _WIDEST = 64
@@ -29,41 +30,13 @@ FLAT = -1.0
 FAN = (-90.0, -45.0, 0.0, 45.0)
 
 
-@dataclass(frozen=True)
-class Lighting:
-    """Where light comes from, and how much relief is made of the terrain."""
-
-    azimuth: float = 315.0
-    """Direction of the sun, degrees clockwise from north."""
-    altitude: float = 45.0
-    """Its height above the horizon, degrees."""
-    exaggeration: float = 1.0
-    """Factor of all heights."""
-    multidirectional: bool = False
-    """Four suns, at the azimuth, 45 degrees to its right, and 45 and 90 to its left, weighted by the squared cosine of
-    the angle between their azimuth and the slope's, as `gdaldem hillshade -multidirectional` has it."""
-
-    def __post_init__(self) -> None:
-        if not math.isfinite(self.azimuth):
-            raise UsageError(f"azimuth {self.azimuth}; degrees clockwise from north are needed")
-        if not 0 < self.altitude <= 90:
-            raise UsageError(f"altitude {self.altitude} of the sun; more than 0 and up to 90 degrees are needed")
-        if not (math.isfinite(self.exaggeration) and self.exaggeration > 0):
-            raise UsageError(f"exaggeration {self.exaggeration}; a positive factor is needed")
-
-    @property
-    def directions(self) -> NDArray[np.float64]:
-        """Unit vectors towards the suns (east, north, up), shape (n, 3)."""
-        azimuths = np.radians([self.azimuth + turn for turn in (FAN if self.multidirectional else (0.0,))])
-        altitude = math.radians(self.altitude)
-        level = math.cos(altitude)
-        up = np.full(len(azimuths), math.sin(altitude))
-        return np.column_stack([level * np.sin(azimuths), level * np.cos(azimuths), up])
-
-    @property
-    def level(self) -> float:
-        """Light on flat ground, 0 to 1."""
-        return math.sin(math.radians(self.altitude))
+def directions(light: Lighting) -> NDArray[np.float64]:
+    """Return unit vectors towards the suns (east, north, up), shape (n, 3)."""
+    azimuths = np.radians([light.azimuth + turn for turn in (FAN if light.multidirectional else (0.0,))])
+    altitude = math.radians(light.altitude)
+    level = math.cos(altitude)
+    up = np.full(len(azimuths), math.sin(altitude))
+    return np.column_stack([level * np.sin(azimuths), level * np.cos(azimuths), up])
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +110,7 @@ def _mean(values: NDArray[np.floating], length: int, axis: int) -> NDArray[np.fl
 def hillshade(slopes: Slopes, light: Lighting) -> NDArray[np.float32]:
     """Light on a matt surface (Lambert), shape (h, w), 0 to 1; NaN = no surface."""
     result = np.empty(slopes.heights.shape, np.float32)
-    illumination(slopes.gradient, light.exaggeration, light.directions, light.multidirectional, result)
+    illumination(slopes.gradient, light.exaggeration, directions(light), light.multidirectional, result)
     return result
 
 

@@ -23,7 +23,7 @@ from photoplan.io.raster_info import read_info
 
 
 def load_project(path: str | Path) -> Project:
-    """Read and check a project file.
+    """Read and check a project file; a folder stands for the `project.toml` in it.
 
     Inputs that it names are not opened here, except film scans whose size the project does not state; their paths, the
     CRS and the height systems are checked.
@@ -34,6 +34,8 @@ def load_project(path: str | Path) -> Project:
         The file or an entry is wrong; the message names the entry and its line.
     """
     path = Path(path)
+    if (path / "project.toml").is_file():
+        path = path / "project.toml"
     data, text = read_toml(path)
     folder = path.resolve().parent
     return parse_project(_with_sizes(data, folder), folder, str(path), text)

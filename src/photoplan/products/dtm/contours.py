@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import KW_ONLY, dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.io.contour_file import ContourRow, LabelRow, contour_files, write_contours
 from photoplan.io.product import check_output
 from photoplan.plain import pick
+from photoplan.products.dtm.request import ContourRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.terrain.contours.labels import Labeller, decimals_of
 from photoplan.terrain.contours.parts import SurfacePart, grid_parts, unit_parts
-from photoplan.terrain.contours.run import ContourLine, ContourOptions, trace_contours
+from photoplan.terrain.contours.run import ContourLine, trace_contours
+from photoplan.terrain.options import ContourOptions
 
 #: Meshes along the side of a piece of a height grid.
 SIDE = 512
@@ -27,32 +30,6 @@ SIDE = 512
 SKETCH_SIDE, SKETCH_MOST = 1400, 2_000_000
 #: Labels of a line stand this many text heights apart, and a text is so-manieth part of the terrain's extent high.
 LABEL_SPACING, LABEL_PART = 60.0, 200.0
-
-
-@dataclass(frozen=True)
-class ContourRequest:
-    """What is asked."""
-
-    model: Path
-    output: Path
-    """Its ending chooses the format: .gpkg, .shp, .geojson or .dxf."""
-    options: ContourOptions
-    _: KW_ONLY
-    bounds: tuple[float, float, float, float] | None = None
-    """Only the meshes that touch xmin, ymin, xmax, ymax."""
-    labels: bool = False
-    """Find places for labels too."""
-    label_all: bool = False
-    """Label every contour, not index contours alone."""
-    text_height: float | None = None
-    """Height of labels, metres on the ground; None: a two-hundredth of the longer side."""
-    label_spacing: float | None = None
-    """Distance of labels along a line, metres; None: sixty text heights."""
-    crs: str | None = None
-    """CRS of a model that does not state its own."""
-    sketch: bool = False
-    """Keep the lines at the resolution of a small picture, too."""
-    overwrite: bool = False
 
 
 @dataclass(eq=False)
@@ -86,7 +63,7 @@ class ContourSketch:
 
 
 @dataclass(eq=False)
-class ContourFacts:
+class ContourFacts(Result):
     """What was made."""
 
     files: list[Path]
@@ -102,6 +79,7 @@ class ContourFacts:
     labels: list[LabelRow] = field(default_factory=list)
     text_height: float | None = None
     sketch: ContourSketch | None = None
+    options: ContourOptions | None = None
 
     def add(self, line: ContourLine) -> None:
         """Count a line."""
@@ -117,6 +95,20 @@ class ContourFacts:
         """Labels as their number."""
         own = ("files", "lines", "closed", "depressions", "vertices", "length", "lowest", "highest", "text_height")
         return {**pick(self, *own), "labels": len(self.labels)}
+
+    def written(self) -> Sequence[Path]:
+        """Return the contours, and the labels if they have a file of their own."""
+        return self.files
+
+    def messages(self) -> Sequence[str]:
+        """Return counts and the range of heights."""
+        if not self.lines and self.options is not None:
+            return [f"no contour: no level of {self.options.base:g} + n × {self.options.interval:g} m is passed"]
+        labels = "" if self.text_height is None else f", {len(self.labels)} labels {self.text_height:g} m high"
+        return [
+            f"{self.lines} contours from {self.lowest:.10g} to {self.highest:.10g} m, {self.length / 1000:.6g} km, "
+            f"{self.vertices} vertices; {self.closed} closed, {self.depressions} round hollows{labels}"
+        ]
 
 
 @dataclass(eq=False)
@@ -165,9 +157,9 @@ def make_contours(request: ContourRequest, events: Events = SILENT) -> ContourFa
         check_output(file, [request.model], overwrite=request.overwrite)
     terrain = open_terrain(request.model, request.crs)
     bounds = _bounds(request, terrain)
-    facts = ContourFacts([], sketch=ContourSketch(bounds) if request.sketch else None)
+    facts = ContourFacts([], sketch=None if request.preview is None else ContourSketch(bounds), options=request.options)
     run = _Run(facts, _labeller(request, bounds), request.label_all or request.options.index == 0)
-    parts, count = contour_parts(terrain, request)
+    parts, count = contour_parts(terrain, request.options, request.bounds)
     events.begin("contours", count, "parts")
     lines = trace_contours(_counted(parts, count, events), request.options)
     labels = (lambda: facts.labels) if request.labels else None
@@ -195,17 +187,19 @@ def _labeller(request: ContourRequest, bounds: tuple[float, float, float, float]
     return Labeller(size, spacing, decimals_of(request.options.interval, request.options.base))
 
 
-def contour_parts(terrain: OpenTerrain, request: ContourRequest) -> tuple[Iterator[SurfacePart], int]:
-    """Parts of the terrain, and about how many there are."""
+def contour_parts(
+    terrain: OpenTerrain, options: ContourOptions, bounds: tuple[float, float, float, float] | None
+) -> tuple[Iterator[SurfacePart], int]:
+    """Return parts of the terrain, and about how many there are."""
     if terrain.model is not None:
         layout = terrain.model.layout
-        bent = request.options.smooth or request.options.simplify
+        bent = options.smooth or options.simplify
         lines = terrain.model.lines if bent else None
-        return unit_parts(terrain.model, request.bounds, lines), layout.columns * layout.rows
+        return unit_parts(terrain.model, bounds, lines), layout.columns * layout.rows
     surface = terrain.surface
     assert isinstance(surface, RasterSurface)
     columns, rows = surface.grid.size
-    parts = grid_parts(surface.grid, surface.origin, surface.mesh, request.bounds, SIDE)
+    parts = grid_parts(surface.grid, surface.origin, surface.mesh, bounds, SIDE)
     return parts, -(-(columns - 1) // SIDE) * -(-(rows - 1) // SIDE)
 
 

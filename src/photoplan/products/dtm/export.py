@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,14 @@ from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.heights import crs_with_heights
 from photoplan.io.naming import together
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
 from photoplan.products.dtm.raster import GridOptions, write_grid
+from photoplan.products.dtm.request import ExportRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
 
@@ -28,26 +31,7 @@ _TILE = 512
 
 
 @dataclass(frozen=True)
-class ExportRequest:
-    """What is asked."""
-
-    model: Path
-    output: Path
-    """Its suffix says what is written: see `EXPORTS`."""
-    resolution: float | None = None
-    """Of a raster, metres; None: the finest grid width, pixels centred on the posts."""
-    bounds: tuple[float, float, float, float] | None = None
-    """Part of a raster, xmin, ymin, xmax, ymax; None: all."""
-    sigma: Path | None = None
-    """Where to write the raster of standard deviations."""
-    crs: str | None = None
-    """Of a terrain file that does not state its own."""
-    workers: int | None = None
-    overwrite: bool = False
-
-
-@dataclass(frozen=True)
-class ExportReport:
+class ExportReport(Result):
     """What was written."""
 
     paths: tuple[Path, ...]
@@ -57,6 +41,14 @@ class ExportReport:
     def json_fields(self) -> dict[str, Any]:
         """Figures beside the files."""
         return {"files": self.paths, **self.figures}
+
+    def written(self) -> Sequence[Path]:
+        """Return the files."""
+        return self.paths
+
+    def messages(self) -> Sequence[str]:
+        """Return the figures in a line."""
+        return [" · ".join(f"{key.replace('_', ' ')} {value:.6g}" for key, value in self.figures.items())]
 
 
 def dtm_export(request: ExportRequest, events: Events = SILENT) -> ExportReport:

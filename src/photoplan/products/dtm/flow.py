@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from photoplan.engine.steps import steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.naming import together, when_named
 from photoplan.io.polygons import check_vectors, label_polygons, write_features
@@ -23,35 +23,14 @@ from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.plain import advised, pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
+from photoplan.products.dtm.request import FlowRequest
 from photoplan.products.dtm.visible import Place, named_points, own_grid, read_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
-from photoplan.terrain.flow import CELL_BYTES, Flow, FlowMethod, flow_of, snapped
+from photoplan.terrain.flow import CELL_BYTES, Flow, flow_of, snapped
 
 TILE = 512
 BANDS = ("upstream area m²", "flow length m", "longest way here m", "direction", "catchment", "depth of filling m")
 """What the bands of the raster hold; NaN without terrain."""
-
-
-@dataclass(frozen=True)
-class FlowRequest:
-    """What is asked."""
-
-    model: Path
-    output: Path
-    resolution: float | None = None
-    """Side of a cell, metres; None: the model's mesh width."""
-    outlets: Path | None = None
-    """Points whose catchments are wanted; None: catchments are those of the cells where water leaves the model."""
-    snap: float = 0.0
-    """Outlets move to the largest upstream area within this distance, metres."""
-    catchments: Path | None = None
-    """Where to write the catchments as polygons (GeoPackage)."""
-    method: FlowMethod = "d8"
-    memory: int = 2 << 30
-    """Bytes that the grid may take."""
-    workers: int | None = None
-    crs: str | None = None
-    overwrite: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,7 +55,7 @@ class OutletRow:
 
 
 @dataclass(frozen=True)
-class FlowReport:
+class FlowReport(Result):
     """What came out."""
 
     path: Path
@@ -96,6 +75,22 @@ class FlowReport:
         """Areas in m², the volume in m³."""
         more = {"outflow_area": "outflow", "filled_area": "pits", "filled_volume": "pit_volume", "outlets": "rows"}
         return {**pick(self, "path", "catchments", "resolution", "area", **more), "bands": BANDS}
+
+    def summary(self) -> Sequence[str]:
+        """Return areas and pits, and a line for each outlet."""
+        return [
+            f"area {self.area:.8g} m², leaves by its edge {self.outflow:.8g} m²; "
+            f"pits filled on {self.pits:.6g} m² with {self.pit_volume:.6g} m³",
+            *(
+                f"outlet {row.name} at {row.X:.10g} {row.Y:.10g}: {row.area:.8g} m² upstream, "
+                f"longest way {row.longest:.6g} m"
+                for row in self.rows
+            ),
+        ]
+
+    def messages(self) -> Sequence[str]:
+        """Return the bands and the cell size."""
+        return [f"bands: {', '.join(BANDS)}; cells {self.resolution:g} m"]
 
 
 def dtm_flow(request: FlowRequest, events: Events = SILENT) -> FlowReport:
@@ -118,8 +113,6 @@ def dtm_flow(request: FlowRequest, events: Events = SILENT) -> FlowReport:
         raise UsageError(f"{request.output}: raster and catchments are the same file; give them two names")
     if request.catchments is not None:
         check_vectors(request.catchments)
-    if not (math.isfinite(request.snap) and request.snap >= 0):
-        raise UsageError(f"snap {request.snap} m; zero or a positive number of metres is needed")
     terrain = open_terrain(request.model, request.crs)
     points = [] if request.outlets is None else named_points(request.outlets, terrain.crs)
     grid = _grid(request, terrain)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,15 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.table_lines import csv_line
+from photoplan.io.tables import Dialect
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
+from photoplan.products.dtm.request import ProfileRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.profile import profile
 
@@ -57,25 +61,32 @@ class Profile:
 
 
 @dataclass(frozen=True)
-class ProfileRequest:
-    """What is asked."""
+class Profiles(Result):
+    """Profiles over lines, and the tables that were written."""
 
-    model: Path
-    lines: Path
-    """A vector file of lines, or a CSV of points along them."""
-    outputs: tuple[Path, ...]
-    """Tables, `.csv`; none: nothing is written."""
-    form: PointTableFormat = field(default_factory=PointTableFormat)
-    line_column: str | None = None
-    """Column of a CSV that tells lines apart; None: `line`, `line_id` or `profile`, else all points are one line."""
-    tolerance: float = 0.001
-    """Largest distance in height from the surface, metres."""
-    crs: str | None = None
-    """Of a terrain file that does not state its own."""
-    overwrite: bool = False
+    files: tuple[Path, ...]
+    profiles: tuple[Profile, ...]
+
+    def __iter__(self) -> Iterator[Profile]:
+        return iter(self.profiles)
+
+    def __len__(self) -> int:
+        return len(self.profiles)
+
+    def written(self) -> Sequence[Path]:
+        """Return the tables."""
+        return self.files
+
+    def messages(self) -> Sequence[str]:
+        """Return length, points and range of heights of each profile."""
+        return [
+            f"{p.name}: {p.length:.2f} m, {len(p.distance)} points, "
+            + ("no surface" if p.range is None else "{:.3f} to {:.3f} m".format(*p.range))
+            for p in self.profiles
+        ]
 
 
-def dtm_profile(request: ProfileRequest) -> list[Profile]:
+def dtm_profile(request: ProfileRequest, events: Events = SILENT) -> Profiles:
     """Compute the profiles and write them.
 
     Raises
@@ -86,18 +97,17 @@ def dtm_profile(request: ProfileRequest) -> list[Profile]:
         The terrain or the lines cannot be used, or they are in different CRSs.
     """
     inputs = [request.model, request.lines]
-    for path in request.outputs:
+    tables = tuple(path for path in request.outputs if path.suffix.lower() != ".png")
+    for path in tables:
         if path.suffix.lower() not in TABLES:
             raise UsageError(f"{path}: {path.suffix or 'no suffix'}; profiles are written as .csv and .png")
         check_output(path, inputs, overwrite=request.overwrite)
-    if len({path.resolve() for path in request.outputs}) < len(request.outputs):
-        raise UsageError(f"{request.outputs[0]}: is given twice as an output")
     terrain = open_terrain(request.model, request.crs)
     found = profiles_of(terrain, _lines(request, terrain), request.tolerance)
-    for path in request.outputs:
+    for path in tables:
         with replacing(path, inputs, request.overwrite) as part:
             _write_table(part, found)
-    return found
+    return Profiles(tables, tuple(found))
 
 
 def profiles_of(
@@ -132,7 +142,8 @@ def _lines(request: ProfileRequest, terrain: OpenTerrain) -> list[tuple[str, NDA
 
 
 def _lines_of_table(request: ProfileRequest) -> list[tuple[str, NDArray[np.float64]]]:
-    table = PointTable(request.lines, request.form)
+    dialect = Dialect(decimal_comma=request.decimal_comma)
+    table = PointTable(request.lines, PointTableFormat(request.x, request.y, dialect))
     column = _line_column(request, table)
     names: list[str] = []
     points = []

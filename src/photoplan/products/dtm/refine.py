@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy as np
 import shapely
 
 from photoplan.errors import InputError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.heights import common_system
 from photoplan.io.polygons import read_features
@@ -21,6 +24,7 @@ from photoplan.io.terrain.model_read import ModelReader
 from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.plain import pick
+from photoplan.products.dtm.request import RefineRequest
 from photoplan.project.open_terrain import open_terrain
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.raster_units import RasterUnits
@@ -29,27 +33,7 @@ from photoplan.surfaces.units import LineElement, Unit, UnitFigures, unit_range
 
 
 @dataclass(frozen=True)
-class RefineRequest:
-    """What is asked."""
-
-    coarse: Path
-    fine: Path
-    polygons: Path
-    output: Path
-    transition: float
-    """Width of the band inside the polygons in which the two are joined, metres."""
-    width: float | None = None
-    """Largest grid width inside the polygons, metres; None: the fine model's finest. Meshes of the coarse model
-    are divided by the smallest whole number that gives it."""
-    crs: str | None = None
-    """CRS of rasters that do not state their own."""
-    height_system: str | None = None
-    """`same` declares that both models have one height system."""
-    overwrite: bool = False
-
-
-@dataclass(frozen=True)
-class RefineReport:
+class RefineReport(Result):
     """What came out."""
 
     path: Path
@@ -65,8 +49,13 @@ class RefineReport:
         """Counts, and the largest change in metres."""
         return pick(self, "units", "changed", "lines", model="path", largest_change="largest")
 
+    def messages(self) -> Sequence[str]:
+        """Return the number of new units and the largest change."""
+        change = f", largest change of a post {self.largest:.3f} m" if self.largest == self.largest else ""
+        return [f"{self.changed} of {self.units} units are new{change}; {self.lines} lines"]
 
-def dtm_refine(request: RefineRequest) -> RefineReport:
+
+def dtm_refine(request: RefineRequest, events: Events = SILENT) -> RefineReport:
     """Write the coarse model with the fine one inside the polygons.
 
     Raises

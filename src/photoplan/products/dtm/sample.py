@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,39 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
+from photoplan.geometry.crs import crs_label
+from photoplan.geometry.heights import height_label
 from photoplan.io.product import check_output
 from photoplan.io.table_lines import csv_line
+from photoplan.io.tables import Dialect
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
 from photoplan.plain import pick
+from photoplan.products.dtm.request import SampleRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 
 PART = 100_000
 """Points that are in memory at once."""
-COLUMNS = ("height", "sigma")
+_DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "space": " "}
 
 
 @dataclass(frozen=True)
-class SampleRequest:
-    """What is asked."""
-
-    model: Path
-    points: Path
-    output: Path
-    form: PointTableFormat = field(default_factory=PointTableFormat)
-    points_crs: str | None = None
-    """CRS of the points; None: the model's."""
-    crs: str | None = None
-    """Of a terrain file that does not state its own."""
-    digits: int = 4
-    """Decimals of the heights."""
-    names: tuple[str, str] = COLUMNS
-    """Names of the new columns."""
-    overwrite: bool = False
-
-
-@dataclass(frozen=True)
-class SampleReport:
+class SampleReport(Result):
     """What came out."""
 
     path: Path
@@ -61,8 +49,17 @@ class SampleReport:
         own = ("points", "outside", "low", "high", "sigma", "crs", "height_system")
         return pick(self, *own, file="path")
 
+    def messages(self) -> Sequence[str]:
+        """Return counts and the range of heights."""
+        sigma = f", sigma {self.sigma:.3f} m" if self.sigma == self.sigma else ""
+        heights = f" · {self.low:.3f} to {self.high:.3f} m{sigma}" if self.outside < self.points else ""
+        return [
+            f"{self.points} points, {self.outside} without a model{heights} · {crs_label(self.crs)} · "
+            f"heights {height_label(self.height_system)}"
+        ]
 
-def dtm_sample(request: SampleRequest) -> SampleReport:
+
+def dtm_sample(request: SampleRequest, events: Events = SILENT) -> SampleReport:
     """Write the points' table with two more columns, part by part.
 
     Raises
@@ -77,7 +74,9 @@ def dtm_sample(request: SampleRequest) -> SampleReport:
     terrain = open_terrain(request.model, request.crs)
     if request.points_crs is not None:
         terrain, _ = terrain.in_crs(request.points_crs)
-    table = PointTable(request.points, request.form)
+    dialect = Dialect(delimiter=_DELIMITERS.get(request.delimiter or "", request.delimiter),
+                      decimal_comma=request.decimal_comma)  # fmt: skip
+    table = PointTable(request.points, PointTableFormat(request.x, request.y, dialect, request.header))
     taken = [name for name in request.names if name in table.names]
     if taken:
         raise UsageError(f"{request.points}: has a column {taken[0]} already; name the new ones: `names` HEIGHT SIGMA")
@@ -88,7 +87,7 @@ def dtm_sample(request: SampleRequest) -> SampleReport:
         replacing(request.output, inputs, request.overwrite) as part,
         part.open("w", encoding="utf-8", newline="") as file,
     ):
-        if request.form.header:
+        if request.header:
             file.write(csv_line([*table.names, *request.names], delimiter))
         for points in table.parts(PART):
             heights, sigmas = _values(terrain, points.xy)
@@ -127,4 +126,4 @@ def _texts(values: NDArray[np.float64], request: SampleRequest, delimiter: str) 
     # A field of spaces between spaces would vanish.
     if delimiter == " ":
         texts = [text or "nan" for text in texts]
-    return [text.replace(".", ",") for text in texts] if request.form.dialect.decimal_comma else texts
+    return [text.replace(".", ",") for text in texts] if request.decimal_comma else texts

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from photoplan import __version__
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.naming import standing, together
 from photoplan.io.product import check_output
@@ -21,31 +22,14 @@ from photoplan.io.quicklook import write_quicklook
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
+from photoplan.products.dtm.request import PictureRequest, ShadeRequest, SlopeRequest, TintRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain import shading
-from photoplan.terrain.shading import Lighting, surface_slopes
+from photoplan.terrain.options import Lighting
+from photoplan.terrain.shading import surface_slopes
 
 #: From flat to steep, for slope classes.
 SLOPE_COLOURS = ((255, 255, 212), (254, 217, 142), (254, 153, 41), (204, 76, 2), (120, 30, 10))
-
-
-@dataclass(frozen=True)
-class PictureRequest:
-    """What every picture of a terrain needs."""
-
-    model: Path
-    output: Path
-    _: KW_ONLY
-    resolution: float | None = None
-    """Pixel, metres; None: the model's mesh width."""
-    bounds: tuple[float, float, float, float] | None = None
-    """xmin, ymin, xmax, ymax; None: all."""
-    crs: str | None = None
-    """CRS of a model that does not state its own."""
-    preview: Path | None = None
-    """A small PNG to look at."""
-    overwrite: bool = False
-    workers: int | None = None
 
 
 @dataclass(frozen=True)
@@ -64,7 +48,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class ShadingFacts:
+class ShadingFacts(Result):
     """What was made."""
 
     path: Path
@@ -80,6 +64,32 @@ class ShadingFacts:
         """Settings and grid flat."""
         own = pick(self, "path", "preview", "kind", "valid_share", "bytes")
         return {**own, **self.settings, **pick(self.grid, "resolution", "width", "height", "bounds")}
+
+    def messages(self) -> Sequence[str]:
+        """Return size, coverage and settings."""
+        grid, settings = self.grid, ", ".join(f"{k} {v}" for k, v in self.settings.items() if k != "ramp_colours")
+        return [
+            f"{self.kind}: {grid.width} × {grid.height} pixels of {grid.resolution:g} m, {self.valid_share:.1%} with "
+            f"terrain; {settings}"
+        ]
+
+
+def dtm_shade(request: ShadeRequest, events: Events = SILENT) -> ShadingFacts:
+    """Write a hillshade: grey values 1 to 255, 0 where there is no terrain; see `make_picture`."""
+    return make_picture(request, shade_picture(request.light), events)
+
+
+def dtm_slope(request: SlopeRequest, events: Events = SILENT) -> ShadingFacts:
+    """Write slopes, their classes or the aspect; see `make_picture`."""
+    unit = "percent" if request.percent else "degrees"
+    picture = aspect_picture() if request.aspect else slope_picture(unit, request.classes)
+    return make_picture(request, picture, events)
+
+
+def dtm_tint(request: TintRequest, events: Events = SILENT) -> ShadingFacts:
+    """Write colours by height, with a mask where there is no terrain; see `make_picture`."""
+    steps, light = 0 if request.classed else request.classes, request.light if request.shade else None
+    return make_picture(request, tint_picture(request.ramp, request.heights, steps, light, request.strength), events)
 
 
 def make_picture(
@@ -158,17 +168,8 @@ def shade_picture(light: Lighting) -> Callable[[OpenTerrain, MapGrid], Picture]:
         return shading.grey(shading.hillshade(slopes, light))[None]
 
     return lambda terrain, grid: Picture(
-        kind="hillshade", dtype="uint8", bands=1, nodata="auto", settings=_light_settings(light), tile=tile
+        kind="hillshade", dtype="uint8", bands=1, nodata="auto", settings=light.model_dump(), tile=tile
     )
-
-
-def _light_settings(light: Lighting) -> dict[str, Any]:
-    return {
-        "azimuth": light.azimuth,
-        "altitude": light.altitude,
-        "exaggeration": light.exaggeration,
-        "multidirectional": light.multidirectional,
-    }
 
 
 def slope_picture(unit: str = "degrees", classes: tuple[float, ...] = ()) -> Callable[[OpenTerrain, MapGrid], Picture]:
@@ -271,7 +272,7 @@ def tint_picture(
             "ramp_colours": colours.colours.round(2).tolist(),
         }
         if light is not None:
-            settings |= _light_settings(light) | {"strength": strength}
+            settings |= light.model_dump() | {"strength": strength}
         return Picture(kind="tints", dtype="uint8", bands=3, nodata="mask", settings=settings, tile=tile)
 
     return picture

@@ -16,6 +16,7 @@ from photoplan.engine.executors import available_cpus
 from photoplan.engine.steps import Steps, steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.crs import split_compound
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.local import earth_radius
@@ -25,6 +26,7 @@ from photoplan.io.result_log import ResultLog
 from photoplan.io.tables import Columns, read_table
 from photoplan.plain import advised, pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
+from photoplan.products.dtm.request import VisibleRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights, parts
@@ -42,33 +44,6 @@ COLUMNS = Columns(
     needed=("x", "y"),
     row="point",
 )
-
-
-@dataclass(frozen=True)
-class VisibleRequest:
-    """What is asked."""
-
-    model: Path
-    output: Path
-    points: tuple[tuple[float, float], ...] = ()
-    """X, Y of observers."""
-    file: Path | None = None
-    """More of them: a table with columns x, y and optionally name, h (eye above ground), or a vector file."""
-    height_observer: float = 1.7
-    """Eye above ground, metres."""
-    height_target: float = 0.0
-    radius: float = math.inf
-    refraction: float = 0.13
-    curvature: bool = True
-    minimum_height: bool = False
-    """Write the height above ground from which a place is seen, instead of whether it is."""
-    resolution: float | None = None
-    """Pixel of the map, metres; None: the model's mesh width."""
-    memory: int = 2 << 30
-    """Bytes that the grids may take."""
-    workers: int | None = None
-    crs: str | None = None
-    overwrite: bool = False
 
 
 @dataclass(frozen=True)
@@ -94,7 +69,7 @@ class VisibleRow:
 
 
 @dataclass(frozen=True)
-class VisibleReport:
+class VisibleReport(Result):
     """What came out."""
 
     path: Path
@@ -104,10 +79,25 @@ class VisibleReport:
     horizon: float
     """Distance of the horizon of a smooth earth for the first observer, metres."""
     rows: tuple[VisibleRow, ...]
+    earth: str
+    """Radius of the earth and refraction, in words."""
 
     def json_fields(self) -> dict[str, Any]:
         """An infinite horizon (flat earth) becomes null."""
         return pick(self, "path", "bands", "resolution", "earth_radius", "horizon", observers="rows")
+
+    def summary(self) -> Sequence[str]:
+        """Return a line for each observer."""
+        return [
+            f"observer {row.name}: eye at {row.eye:.2f} m, sees {row.visible:.6g} m² of {row.looked_at:.6g} m² "
+            f"({row.visible / row.looked_at if row.looked_at else 0.0:.1%}); {row.missing:.6g} m² without heights"
+            for row in self.rows
+        ]
+
+    def messages(self) -> Sequence[str]:
+        """Return bands, pixel size and the model of the earth."""
+        far = f"; horizon of a smooth earth {self.horizon:.0f} m" if math.isfinite(self.horizon) else ""
+        return [f"bands: {', '.join(self.bands)}; pixel {self.resolution:g} m; {self.earth}{far}"]
 
 
 def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleReport:
@@ -163,6 +153,7 @@ def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleRepo
         earth_radius=radius,
         horizon=far,
         rows=tuple(rows),
+        earth=f"R = {radius / 1000:.0f} km, k = {request.refraction:g}" if request.curvature else "flat earth",
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from photoplan.engine.steps import steps
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import USUAL_TILE, MapGrid, Window, check_resolution, refuse_absurd
 from photoplan.geometry.heights import common_system
@@ -24,38 +25,10 @@ from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
+from photoplan.products.dtm.request import VolumeRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.volume import TILE, ErrorModel, Volume, VolumeSettings, VolumeSigma, volume_between, volume_sigma
-
-
-@dataclass(frozen=True)
-class VolumeRequest:
-    """What is asked."""
-
-    a: Path
-    b: Path
-    """Terrain files; the volume is that of B − A."""
-    polygons: Path | None = None
-    resolution: float | None = None
-    """Side of the cells, metres; None: begin with the finer mesh width and halve it as far as needed."""
-    tolerance: float = 1e-3
-    sigma_a: float | None = None
-    """Standard deviation of the heights, metres; None: the model's own, if it has one."""
-    sigma_b: float | None = None
-    correlation: float | None = None
-    """Correlation length of the height errors, metres; None: each model's mesh width."""
-    bias: float = 0.0
-    """Standard deviation of a height error that is everywhere alike, metres."""
-    height_system: str | None = None
-    """`same` declares that both files have one height system."""
-    crs: str | None = None
-    """Of files that do not state theirs."""
-    difference: Path | None = None
-    """Where to write the raster of B − A."""
-    workers: int | None = None
-    """Of that raster."""
-    overwrite: bool = False
 
 
 @dataclass(frozen=True)
@@ -78,7 +51,7 @@ class VolumeRow:
 
 
 @dataclass(frozen=True)
-class VolumeReport:
+class VolumeReport(Result):
     """What came out."""
 
     rows: tuple[VolumeRow, ...]
@@ -90,6 +63,23 @@ class VolumeReport:
     def json_fields(self) -> dict[str, Any]:
         """The rows as volumes."""
         return pick(self, "height_system", "difference", "notes", volumes="rows")
+
+    def summary(self) -> Sequence[str]:
+        """Return the table of volumes."""
+        w = max(7, *(len(row.name) for row in self.rows))
+        lines = [f"{'polygon':<{w}}  {'cut m³':>14} {'fill m³':>14} {'net m³':>14} {'area m²':>13} {'no model m²':>13}"]
+        for name, v, s in ((row.name, row.volume, row.sigma) for row in self.rows):
+            areas = f"{v.area:>13.1f} {v.missing:>13.1f}"
+            lines.append(f"{name:<{w}}  {v.cut:>14.2f} {v.fill:>14.2f} {v.net:>14.2f} {areas}")
+            changes = f"{v.error_cut:>13.2g}i {v.error_fill:>13.2g}i {v.error_net:>13.2g}i"
+            lines.append(f"{'':<{w}}  {changes}  cells {v.cell:g} m")
+            if s is not None:
+                lines.append(f"{'':<{w}}  {s.cut:>13.2f}σ {s.fill:>13.2f}σ {s.net:>13.2f}σ")
+        return [*lines, "i: change with the last halving of the cells; σ: standard deviation from that of the heights"]
+
+    def messages(self) -> Sequence[str]:
+        """Return the height system and the notes."""
+        return [f"height system: {self.height_system}", *(f"note: {note}" for note in self.notes)]
 
 
 def dtm_volume(request: VolumeRequest, events: Events = SILENT) -> VolumeReport:

@@ -33,7 +33,8 @@ from photoplan.surfaces.base import Surface
 from photoplan.surfaces.seen import Seen, SeenSurface, best_photos
 from photoplan.targets.base import Target
 from photoplan.targets.view import ViewTarget
-from photoplan.terrain.shading import RAMPS, Lighting, Ramp, built_in_ramp, shaded
+from photoplan.terrain.options import Lighting
+from photoplan.terrain.shading import RAMPS, Ramp, built_in_ramp, directions, shaded
 
 #: Colours of slopes, at degrees.
 SLOPES = Ramp(
@@ -228,7 +229,7 @@ class _Given:
 def illumination(normal: NDArray[np.float64], light: Lighting) -> NDArray[np.float32]:
     """Light on a matt surface with these normals, 0 to 1; NaN where there is none."""
     n = normal * (light.exaggeration, light.exaggeration, 1.0)
-    sun = light.directions[0]
+    sun = directions(light)[0]
     return np.asarray(np.clip(n @ sun / np.linalg.norm(n, axis=-1), 0, None), np.float32)
 
 

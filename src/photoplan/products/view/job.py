@@ -24,7 +24,8 @@ from photoplan.products.view.photo import PhotoRequest, ViewPhoto
 from photoplan.products.view.stereo import anaglyph
 from photoplan.surfaces.seen import Seen, SeenSurface, ground_size
 from photoplan.targets.view import Bundle, ViewTarget
-from photoplan.terrain.shading import Lighting
+from photoplan.terrain.options import Lighting
+from photoplan.terrain.shading import directions
 
 Colour = tuple[int, int, int]
 
@@ -69,7 +70,7 @@ class LookRequest:
         for name in ("haze_colour", "sky", "nodata", "water_colour"):
             if not all(0 <= v <= 255 for v in getattr(self, name)):
                 raise UsageError(f"`{name}` {getattr(self, name)}; red, green and blue from 0 to 255 are needed")
-        Lighting(self.azimuth, self.altitude)
+        Lighting(azimuth=self.azimuth, altitude=self.altitude)
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,9 @@ def _open(address: ViewAddress) -> OpenView:
             raise InputError(f"{path}: has changed since the run was planned; run it again")
     ground = open_view_ground(Path(address.source), address.crs, address.water)
     camera = view_camera(address.camera, ground, force=True)
-    light = Lighting(address.look.azimuth, address.look.altitude, camera.request.exaggeration)
+    light = Lighting(
+        azimuth=address.look.azimuth, altitude=address.look.altitude, exaggeration=camera.request.exaggeration
+    )
     layers = open_layers(address.look.contents, ground, light, address.heights)
     matrix = None if address.matrix is None else MatrixFile(Path(address.matrix))
     photo = None if address.look.photo is None else ViewPhoto.open(address.look.photo, camera.target.bundle.size)
@@ -260,7 +263,7 @@ def colours_of(scene: ViewScene, view: OpenView, look: LookRequest) -> Colours:
         opacity = np.float32(1.0 if request.kind == "shade" and k else request.opacity)
         out = np.where(there, out + opacity * (over - out), out)
     if look.shadows:
-        dark = scene.surface.in_shadow(scene.target, seen, view.light.directions[0])
+        dark = scene.surface.in_shadow(scene.target, seen, directions(view.light)[0])
         out = np.where(dark, out * 0.45, out)
     if look.haze:
         out = hazy(out, scene.target.distance(seen.uvh), look.haze, look.haze_colour)

@@ -15,11 +15,12 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, same_crs
 from photoplan.geometry.units import MetricSystem, agreed_metres, metric_system
 from photoplan.io.drawn_features import DrawnFeatures, read_drawn_features
-from photoplan.products.dtm.contours import ContourRequest, contour_parts
+from photoplan.products.dtm.contours import contour_parts
 from photoplan.products.view.ground import ViewGround
 from photoplan.project.open_terrain import open_terrain
 from photoplan.surfaces.seen_lines import Lines
-from photoplan.terrain.contours.run import ContourOptions, trace_contours
+from photoplan.terrain.contours.run import trace_contours
+from photoplan.terrain.options import ContourOptions
 
 T = TypeVar("T")
 Colour = tuple[int, int, int]
@@ -151,10 +152,10 @@ def _contours(request: LinesRequest, ground: ViewGround, reach: float, center: N
     if not same_crs(terrain.crs, ground.crs):
         XY = crs_step(ground.crs, terrain.crs, ground.bounds)(XY)
     bounds = (float(XY[0] - reach), float(XY[1] - reach), float(XY[0] + reach), float(XY[1] + reach))
-    asked = ContourRequest(path, path, ContourOptions(request.interval), bounds=bounds)
+    levels = ContourOptions(interval=request.interval)
     vertices: list[NDArray[np.float64]] = []
     index: list[bool] = []
-    for line in trace_contours(contour_parts(terrain, asked)[0], asked.options):
+    for line in trace_contours(contour_parts(terrain, levels, bounds)[0], levels):
         vertices.append(line.xy)
         index.append(line.index)
         if sum(map(len, vertices[-1000:])) * max(1, len(vertices) // 1000) > _MOST:

@@ -38,7 +38,7 @@ from photoplan.products.view.photo import ViewPhoto
 from photoplan.products.view.result import ViewResult
 from photoplan.products.view.stereo import Stereo, eyes
 from photoplan.surfaces.seen_lines import LinesOfSight
-from photoplan.terrain.shading import Lighting
+from photoplan.terrain.options import Lighting
 
 TILE = 512
 
@@ -166,7 +166,9 @@ def plan_view(request: ViewRequest) -> ViewPlan:
         raise GeometryError(_sees_nothing(camera, ground))
     heights = (0.0, 1.0) if first.lowest is None or first.highest is None else _rounded(first.lowest, first.highest)
     contents = () if request.kind == "matrix" else request.look.contents
-    light = Lighting(request.look.azimuth, request.look.altitude, camera.request.exaggeration)
+    light = Lighting(
+        azimuth=request.look.azimuth, altitude=request.look.altitude, exaggeration=camera.request.exaggeration
+    )
     layers = open_layers(contents, ground, light, heights)
     matrix = None if request.matrix is None else _fitting(request.matrix, camera)
     files = dict.fromkeys([*ground.files, *(f for each in layers for f in each.files)])

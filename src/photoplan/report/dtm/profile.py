@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from photoplan.errors import UsageError
 from photoplan.products.dtm.contours import ContourFacts
-from photoplan.products.dtm.profile import Profile
+from photoplan.products.dtm.profile import Profile, Profiles
 from photoplan.report.drawing import mpl, png
 
 MOST = 12
@@ -17,7 +16,7 @@ MOST = 12
 _GROUND, _BAND = "#5b4a33", "#d9a441"
 
 
-def profile_picture(profiles: Sequence[Profile]) -> bytes:
+def profile_picture(profiles: Profiles) -> bytes:
     """A PNG: a panel for each profile, all in one scale.
 
     Raises

@@ -20,7 +20,6 @@ Pieces become whole lines from part to part, with no more in memory than the swe
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -32,6 +31,7 @@ from photoplan.errors import UsageError
 from photoplan.kernels.contour import count_segments, cross_edges, fill_segments, link_segments, smooth_line, thin_line
 from photoplan.terrain.contours.mesh import Front, PartMesh, build_mesh
 from photoplan.terrain.contours.parts import SurfacePart
+from photoplan.terrain.options import ContourOptions
 
 #: More pieces in one part mean an interval far below what the heights say.
 MOST_PIECES = 30_000_000
@@ -42,36 +42,6 @@ THIN = 0.2
 Key = tuple[int, int, int]
 """Two vertex numbers of an edge in the whole terrain, and the level that crosses it."""
 Ends = dict[Key, "Chain"]
-
-
-@dataclass(frozen=True)
-class ContourOptions:
-    """Which contours are traced, and how."""
-
-    interval: float
-    """Difference of height between neighbouring contours, metres."""
-    base: float = 0.0
-    """Height of contour number 0, metres."""
-    index: int = 5
-    """Every so-manieth contour, counted from the base, is an index contour; 0: none."""
-    smooth: bool = False
-    """Pull lines smooth inside their bands."""
-    simplify: bool = False
-    """Leave out vertices that a line does not need to stay within a fifth of the way to the ends of its band."""
-    band: float = 0.25
-    """Half width of the bands in which lines are smoothed and simplified, as a part of the interval, below 0.5."""
-    shortest: float = 0.0
-    """Lines shorter than this are left out, metres."""
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.interval) and self.interval > 0 and math.isfinite(self.base)):
-            raise UsageError(
-                f"contour interval {self.interval} from {self.base}; a positive number of metres is needed"
-            )
-        if not 0 < self.band < 0.5:
-            raise UsageError(f"band of {self.band}; more than 0 and less than 0.5 of the interval is needed")
-        if self.index < 0 or not self.shortest >= 0:
-            raise UsageError(f"index {self.index}, shortest {self.shortest}; neither may be negative")
 
 
 @dataclass(frozen=True, eq=False)

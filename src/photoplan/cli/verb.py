@@ -1,0 +1,210 @@
+"""Click commands made from requests: options from the fields, the run, and what is printed."""
+
+from __future__ import annotations
+
+import importlib
+import types
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
+
+import click
+
+from photoplan.cli.options import BYTES, NEW_FOLDER, PATH, all_cores, json_option, listed, quiet_option
+from photoplan.cli.output import show, show_json, talking
+
+if TYPE_CHECKING:
+    from photoplan.request import Request
+
+#: Sections of the help, in their order.
+SECTIONS = {"input": "Input", "result": "Result", "method": "Method", "run": "Run"}
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A row of the table of verbs; places are written ``module:name``, below photoplan."""
+
+    short: str
+    help: str
+    request: str
+    make: str
+    draw: Mapping[str, str] = field(default_factory=dict)
+    """By option, or option and ending such as ``outputs.png``: the function that draws that file from the result."""
+    record: str = ""
+    """Kind of the run record, for operations that write none themselves."""
+
+    def command(self, name: str) -> click.Command:
+        """Return the click command."""
+        return self.command_of(load(self.request), name, partial(run, self))
+
+    def command_of(self, kind: type[Request], name: str, call: Callable[..., None]) -> click.Command:
+        """Return the click command of a request; `call` takes the request and the two options of what is printed."""
+
+        def callback(as_json: bool, quiet: bool, **given: Any) -> None:
+            call(_request(kind, given), as_json=as_json, quiet=quiet)
+
+        command = VerbCommand(name, callback=callback, help=self.help)
+        command.params = list(_parameters(kind, command.section_of))
+        for add in (quiet_option, json_option):
+            add(command)
+        command.params = [*(p for p in command.params if p.name not in ("quiet", "as_json")),
+                          *(p for p in reversed(command.params) if p.name in ("quiet", "as_json"))]  # fmt: skip
+        return command
+
+
+class VerbCommand(click.Command):
+    """A command whose help lists options by section."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.section_of: dict[str, str] = {"as_json": "run", "quiet": "run", "help": "run"}
+        """Section of each option, by its name."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, those of a section together."""
+        for section, title in SECTIONS.items():
+            rows = [
+                p.get_help_record(ctx) for p in self.get_params(ctx) if self.section_of.get(p.name or "") == section
+            ]
+            if rows := [row for row in rows if row is not None]:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+
+def load(place: str) -> Any:
+    """Return what ``module:name`` below photoplan names."""
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(f"photoplan.{module}"), name)
+
+
+def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
+    """Run the operation of a verb, draw what is drawn, and print the result."""
+    from photoplan.cli.telling import Telling
+    from photoplan.io.naming import together
+    from photoplan.io.run_record import recording
+    from photoplan.report.page import open_picture, open_report
+
+    dry_run, overwrite = getattr(request, "dry_run", False), getattr(request, "overwrite", False)
+    drawn = {
+        path: verb.draw[key]
+        for name, paths in request.files_written().items()
+        for path in paths
+        for key in (name, name + path.suffix.lower())
+        if key in verb.draw
+    }
+    opened = {} if dry_run else {
+        path: (open_report if path.suffix.lower() == ".html" else open_picture)(
+            path, request.files_read(), overwrite=overwrite
+        )
+        for path in drawn
+    }  # fmt: skip
+    recorded = recording(verb.record, request, request.files_read()) if verb.record and not dry_run else nullcontext()
+    with recorded as record, together() if opened else nullcontext():
+        with Telling(quiet) as events:
+            result = load(verb.make)(request, events)
+        for path, file in opened.items():
+            if file is not None:
+                file.write(load(drawn[path])(result))
+        files = [*result.written(), *(path for path in opened if path not in result.written())]
+        if record is not None:
+            record(files, result)
+    if as_json:
+        more = {name: path for name in type(request).model_fields if (path := getattr(request, name)) in opened}
+        show_json(result, **more)
+    else:
+        for line in (*files, *result.summary()):
+            show(line)
+    talk = talking(quiet)
+    for message in result.messages():
+        if not as_json or message.startswith(("note:", "warning:")):
+            talk(message)
+
+
+def _request(kind: type[Request], given: dict[str, Any]) -> Request:
+    """Return the request, with the requests that it holds; options that were not given keep their defaults."""
+    values: dict[str, Any] = {}
+    for name, entry in kind.model_fields.items():
+        if _is_group(entry.annotation):
+            values[name] = _request(entry.annotation, given)  # type: ignore[arg-type]
+        elif name in given and (value := given.pop(name)) is not None and value != ():
+            values[name] = value
+    return kind(**values)
+
+
+def _is_group(annotation: Any) -> bool:
+    return isinstance(annotation, type) and hasattr(annotation, "model_fields")
+
+
+def _parameters(kind: type[Request], section_of: dict[str, str]) -> Iterator[click.Parameter]:
+    """Yield the parameters of a request, those of the requests that it holds among them."""
+    for name, entry in kind.model_fields.items():
+        if _is_group(entry.annotation):
+            yield from _parameters(entry.annotation, section_of)  # type: ignore[arg-type]
+            continue
+        how = entry.json_schema_extra if isinstance(entry.json_schema_extra, dict) else {}
+        if not how.get("argument"):
+            section_of[name] = str(how.get("section") or ("result" if how.get("writes") else "method"))
+        yield _parameter(name, entry, how)
+
+
+def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter:
+    hint, optional = entry.annotation, False
+    if get_origin(hint) in (Union, types.UnionType):
+        kinds = [each for each in get_args(hint) if each is not type(None)]
+        hint, optional = (kinds[0] if len(kinds) == 1 or kinds[0] is not str else str), True
+    more: dict[str, Any] = {"metavar": how["metavar"]} if "metavar" in how else {}
+    if get_origin(hint) is tuple:
+        parts = get_args(hint)
+        if parts[-1] is not Ellipsis:
+            more["nargs"], hint = len(parts), parts[0]
+        else:
+            hint = parts[0]
+            if get_origin(hint) is tuple:
+                more["nargs"], hint = len(get_args(hint)), get_args(hint)[0]
+            more["multiple"] = True
+            if how.get("listed"):
+                more["callback"] = _numbers if hint in (int, float) else _words
+    choices = [str(each) for each in get_args(hint)] if get_origin(hint) is Literal else how.get("choices")
+    kind: Any = click.Choice(choices) if choices else BYTES if how.get("size") else hint
+    kind = (NEW_FOLDER if how.get("folder") else PATH) if hint is Path else kind
+    if more.get("callback") is _numbers:
+        kind = str
+    if how.get("argument"):
+        if more.pop("multiple", False):
+            more["nargs"] = -1
+        return click.Argument([name], type=kind, **more)
+    flag = "--" + str(how.get("flag", name.replace("_", "-")))
+    default = None if entry.is_required() else entry.get_default(call_default_factory=True)
+    if hint is bool:
+        if flag[2:].startswith("no-"):
+            return click.Option([name, flag], is_flag=True, flag_value=False, default=True, help=entry.description)
+        both = bool(default) or optional
+        names = [name, flag + (f"/--{'no'}-{flag[2:]}" if both else "")]
+        return click.Option(names, is_flag=True, default=None if optional else default, help=entry.description)
+    if name == "workers":
+        more["callback"], kind = all_cores, click.IntRange(1)
+    names = [name, *(["-o"] if name in ("output", "outputs") else []), flag]
+    shown = default is not None and default != () and "[" not in (entry.description or "")
+    if "multiple" in more:
+        default = default or None
+    needed = entry.is_required() or bool(how.get("required"))
+    return click.Option(
+        names, type=kind, required=needed, help=entry.description, default=default, show_default=shown, **more
+    )
+
+
+def _words(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> tuple[str, ...]:
+    return listed(given)
+
+
+def _numbers(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> tuple[float, ...]:
+    try:
+        return tuple(float(word) for text in given for word in text.replace(",", " ").split())
+    except ValueError:
+        example = f", such as {parameter.metavar}" if parameter.metavar else ""
+        raise click.BadParameter(
+            f"{' '.join(given)!r}: numbers with commas are required{example}", context, parameter
+        ) from None

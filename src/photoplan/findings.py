@@ -1,0 +1,24 @@
+"""Results of operations: what a command prints, writes as JSON and shows in a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+class Result:
+    """What an operation returns, a data class; its JSON holds its fields, see `photoplan.plain`."""
+
+    def written(self) -> Sequence[Path]:
+        """Return the files that were written; the first is the product. By default all fields that are paths."""
+        values: dict[str, Any] = vars(self)
+        return [value for value in values.values() if isinstance(value, Path)]
+
+    def summary(self) -> Sequence[str]:
+        """Return the figures for people, printed on stdout after the files."""
+        return ()
+
+    def messages(self) -> Sequence[str]:
+        """Return remarks, printed on stderr; ``note:`` and ``warning:`` also with `quiet`."""
+        return ()

@@ -1,0 +1,147 @@
+"""Requests: the options of an operation, each declared once with its type, limits, default and help.
+
+The command line, the Python call, the JSON schema and the defaults that a project file may state come from one frozen
+pydantic model. Modules of requests import nothing heavy, so that the help answers at once.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+
+from photoplan.errors import UsageError
+from photoplan.public import fitted
+
+#: Bounds of numbers, as pydantic calls them, and how messages call them.
+_LIMITS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
+
+
+def opt(help: str, default: Any = ..., **how: Any) -> Any:
+    """Declare a field that is an option of the command line; without a default it is required.
+
+    Parameters
+    ----------
+    help : str
+        Names the thing, with its unit; the default in brackets if it is not a plain value.
+    default : object
+    **how
+        Limits ``gt``, ``ge``, ``lt``, ``le``, and ``infinite=True`` if infinity is accepted; ``flag``, a name other
+        than the field's; ``metavar``; ``section`` of the help; ``writes=True``, a file that is written;
+        ``advanced=True``, rarely needed; ``listed=True``, a tuple that is written with commas; ``size=True``, a number
+        of bytes; ``required=True``, at least one of several.
+    """
+    limits = {name: how.pop(name) for name in _LIMITS if name in how}
+    if how.pop("infinite", False):
+        limits["allow_inf_nan"] = True
+    return Field(default, description=help, json_schema_extra=how, **limits)
+
+
+def arg(help: str = "", **how: Any) -> Any:
+    """Declare a field that is a positional argument of the command line."""
+    return opt(help, argument=True, **how)
+
+
+class Request(BaseModel):
+    """Options of an operation, checked when they are set.
+
+    Raises
+    ------
+    UsageError
+        A value is not of the declared type or beyond its limits, or an option is missing or unknown.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False)
+
+    def __init__(self, *values: Any, **named: Any) -> None:
+        fields = tuple(type(self).model_fields)
+        if len(values) > len(fields):
+            raise UsageError(f"{type(self).__name__} takes {len(fields)} values at most, found {len(values)}")
+        named = dict(zip(fields, values)) | named
+        for name in set(named).intersection(fields):
+            annotation = type(self).model_fields[name].annotation
+            named[name] = fitted(named[name], annotation, f"{type(self).__name__}: {name}")
+        try:
+            super().__init__(**named)
+        except ValidationError as error:
+            raise UsageError("; ".join(_message(each, type(self)) for each in error.errors())) from None
+        seen: dict[Path, str] = {}
+        for name, paths in self.files_written().items():
+            for path in paths:
+                if (other := seen.setdefault(path.resolve(), name)) != name or len(paths) > len(set(paths)):
+                    raise UsageError(f"{path}: `{other}` and `{name}` are the same file; choose two names")
+        self.check()
+
+    def check(self) -> None:
+        """Refuse values that are allowed one by one, but not together."""
+
+    def json_fields(self) -> Mapping[str, Any]:
+        """Return the options by name."""
+        return dict(self)
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with other values, checked."""
+        return type(self)(**({name: getattr(self, name) for name in type(self).model_fields} | changes))
+
+    def files_read(self) -> list[Path]:
+        """Return the files that it reads, in the order of the fields."""
+        return [path for paths in self._files(False).values() for path in paths]
+
+    def files_written(self) -> dict[str, list[Path]]:
+        """Return the files that it writes, by option."""
+        return self._files(True)
+
+    def _files(self, written: bool) -> dict[str, list[Path]]:
+        found: dict[str, list[Path]] = {}
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            if isinstance(value, Request):
+                found |= value._files(written)
+            elif how_of(field).get("writes", False) == written:
+                values = value if isinstance(value, tuple) else (value,)
+                found |= {name: [each for each in values if isinstance(each, Path)]}
+        return found
+
+
+def how_of(field: FieldInfo) -> Mapping[str, Any]:
+    """Return what `opt` or `arg` declared of a field beside its type, default and limits."""
+    return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+
+
+def _message(error: Any, kind: type[Request]) -> str:
+    """Return an error of pydantic in the grammar of our messages: what was given, what is accepted, what it means."""
+    name, *inner = error["loc"] or ("",)
+    field = kind.model_fields.get(str(name))
+    if field is None:
+        return f"{kind.__name__} has no option {name!r}; its options are {', '.join(kind.model_fields)}"
+    if error["type"] == "missing" and not inner:
+        return f"`{name}` is required"
+    meaning = re.sub(r"\s*\[.*", "", field.description or "").rstrip(".")
+    where = f"`{name}`" + "".join(f"[{part}]" for part in inner if isinstance(part, int))
+    bounds = [f"{word} {getattr(each, key):g}" for each in field.metadata for key, word in _LIMITS.items()
+              if hasattr(each, key)]  # fmt: skip
+    match error["type"]:
+        case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal" if bounds:
+            accepted = " and ".join(bounds)
+        case "finite_number":
+            accepted = "a finite number"
+        case "literal_error":
+            accepted = f"one of {error['ctx']['expected'].replace(chr(39), '')}"
+        case _:
+            return f"{where} {error['input']!r}: {str(error['msg']).removeprefix('Value error, ')} ({meaning})"
+    return f"{where} {error['input']} must be {accepted} ({meaning[:1].lower()}{meaning[1:]})"
+
+
+#: Options that many operations share; their order in a request is that of the help.
+def crs_option(of: str = "terrain files that state none") -> Any:
+    """Declare the CRS of inputs."""
+    return opt(f"CRS of {of}.", None, section="input")
+
+
+OVERWRITE: Any = opt("Replace files that exist.", False, section="run")
+WORKERS: Any = opt("Number of parallel workers [all cores].", None, ge=1, section="run")
+BOUNDS: Any = opt("Part to process [all].", None, metavar="XMIN YMIN XMAX YMAX")
