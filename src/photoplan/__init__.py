@@ -78,7 +78,7 @@ __getattr__, __dir__, __all__ = public(
         "products.dtm.flow": "FlowRequest dtm_flow",
         "products.dtm.refine": "RefineRequest dtm_refine",
         "products.dtm.shading": "PictureRequest make_picture dtm_shade dtm_slope dtm_tint",
-        "products.dtm.request": "ShadeRequest SlopeRequest TintRequest",
+        "requests.terrain": "ShadeRequest SlopeRequest TintRequest",
         "products.dtm.export": "ExportRequest dtm_export",
         "products.describe": "dtm_info",
         "products.monoplot": "MonoplotRequest monoplot_file",

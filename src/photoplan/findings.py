@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,14 @@ class Result:
         """Return the figures for people, printed on stdout after the files."""
         return ()
 
+    def raise_failures(self) -> None:
+        """Raise if a part of the inputs failed, after the rest is written."""
+
     def messages(self) -> Sequence[str]:
         """Return remarks, printed on stderr; ``note:`` and ``warning:`` also with `quiet`."""
         return ()
+
+
+def noted(notes: Iterable[str]) -> list[str]:
+    """Return notes that begin with ``note:``, but for warnings, once each."""
+    return [note if note.startswith(("note:", "warning:")) else f"note: {note}" for note in dict.fromkeys(notes)]

@@ -64,7 +64,7 @@ class Request(BaseModel):
         named = dict(zip(fields, values)) | named
         for name in set(named).intersection(fields):
             annotation = type(self).model_fields[name].annotation
-            named[name] = fitted(named[name], annotation, f"{type(self).__name__}: {name}")
+            named[name] = fitted(named[name], annotation, f"`{name}`")
         try:
             super().__init__(**named)
         except ValidationError as error:
@@ -86,6 +86,11 @@ class Request(BaseModel):
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other values, checked."""
         return type(self)(**({name: getattr(self, name) for name in type(self).model_fields} | changes))
+
+    @property
+    def product(self) -> Path:
+        """The file beside which pictures stand: the first that is written."""
+        return next(path for paths in self.files_written().values() for path in paths)
 
     def files_read(self) -> list[Path]:
         """Return the files that it reads, in the order of the fields."""
@@ -143,5 +148,15 @@ def crs_option(of: str = "terrain files that state none") -> Any:
 
 
 OVERWRITE: Any = opt("Replace files that exist.", False, section="run")
-WORKERS: Any = opt("Number of parallel workers [all cores].", None, ge=1, section="run")
+PROJECT: Any = arg("Project file, or the folder that holds `project.toml`.", project=True)
+IMAGES: Any = opt("Images or patterns; may be repeated [all].", (), listed=True, metavar="NAME,…", section="input")
+PICTURE: Any = opt("Write no picture of the result.", True, flag="no-picture", section="result")
+DRY_RUN: Any = opt("Say what would be done, and stop.", False, section="run")
+_EXECUTORS = "threads, processes, or the address of a Dask scheduler, tcp://host:port."
+EXECUTOR: Any = opt(_EXECUTORS, "threads", metavar="KIND", section="run")
+MEMORY: Any = opt("Largest memory of the run, such as 2GB.", None, size=True, metavar="SIZE", section="run")
+_WORKERS = "Number of parallel workers [all cores]."
+WORKERS: Any = opt(_WORKERS, None, ge=1, section="run")
+ONE_WORKER: Any = opt(_WORKERS, 1, ge=1, section="run")
+"""For calls from Python that use one worker unless told otherwise; the command line uses all cores."""
 BOUNDS: Any = opt("Part to process [all].", None, metavar="XMIN YMIN XMAX YMAX")

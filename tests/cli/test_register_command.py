@@ -94,9 +94,9 @@ def test_images_without_a_map_are_compared_pixel_by_pixel(photoplan: Here, tmp_p
         ({"nodata": 0, "black": True}, (), 3, "hardly a valid pixel in common"),
         ({}, ("--radius", "2"), 2, "--radius 2; allowed are 4 to 50"),
         ({}, ("--spacing", "0"), 2, "--spacing 0; allowed are"),
-        ({}, ("--search", "nan"), 2, "--search nan; allowed are"),
+        ({}, ("--search", "nan"), 2, "--search is not a number"),
         ({}, ("--sigma", "1e300"), 2, "--sigma 1e+300; allowed are"),
-        ({}, ("--model", "spline"), 2, "model 'spline'; allowed are none, shift, affine"),
+        ({}, ("--model", "spline"), 2, "'spline' is not one of 'none', 'shift', 'affine'"),
         ({}, ("-o", "v.shp"), 2, "give it a name that ends with .gpkg"),
     ],
 )

@@ -142,7 +142,7 @@ def test_text_is_one_name_and_paths_are_paths(small: Block) -> None:
         (lambda: pp.ResectRequest("p", sigma_control=(1.0,)), "1 values; needed are 2"),
         (lambda: pp.ResectRequest("p", sigma_image="1"), "sigma_image: str '1'; needed is a number"),
         (lambda: pp.ResectRequest("p", critical=float("nan")), r"critical is not a number \(NaN\)"),
-        (lambda: pp.SampleRequest(np.zeros((3, 3)), "a", "b"), r"model: ndarray of shape \(3, 3\); needed is a path"),
+        (lambda: pp.SampleRequest(np.zeros((3, 3)), "a", "b"), r"`model`: ndarray of shape \(3, 3\); needed is a path"),
     ):
         with pytest.raises(UsageError, match=says):
             call()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from photoplan.cli.lazy import LazyGroup
 from photoplan.cli.verb import Verb
 
-_R, _P = "products.dtm.request:", "products.dtm."
+_R, _P = "requests.terrain:", "products.dtm."
 #: A row for each command; `build` has a module of its own.
 VERBS: dict[str, str | Verb] = {
     "build": "Predict a terrain model from points and lines.",

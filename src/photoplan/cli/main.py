@@ -15,32 +15,82 @@ import click
 
 from photoplan.cli.interrupt import CODE, catch_interrupts, stop_children
 from photoplan.cli.lazy import LazyGroup
+from photoplan.cli.verb import Verb
 from photoplan.errors import PhotoplanError, PhotoplanWarning, ResourceError
 
 #: Verb and its one-line help, in the order of a job; the command is `photoplan.cli.<verb>:command`.
-VERBS = {
+VERBS: dict[str, str | Verb] = {
     "init": "Write a project file from the files you have.",
     "convert": "Orientations from one file format to another.",
     "fiducials": "Find the fiducial marks of film scans.",
     "interior": "Interior orientation of film scans from their marks.",
     "tie": "Find tie points between images.",
-    "control": "Propose control points from an orthophoto and heights.",
+    "control": Verb(
+        "Propose control points from an orthophoto and heights.",
+        """Propose control for the approximately oriented images of PROJECT.
+
+        Patches of an orthophoto are found in the images. Their places with heights become ground points, written with
+        the image points beside them (NAME_points.csv); both become entries of [observations] in PROJECT. Points that do
+        not agree on one correction of an image's orientation are left out.
+        """,
+        "requests.orient:ControlRequest",
+        "products.control.run:propose_control",
+    ),
     "resect": "Orient single images by control points.",
     "adjust": "Adjust a block of images (bundle adjustment).",
     "check": "Validate a project and print what to expect of it.",
     "budget": "What limits the accuracy of products, cause by cause.",
     "balance": "Even colours: tables by which images agree where they overlap.",
-    "seams": "Find where images of a mosaic are best joined.",
+    "seams": Verb(
+        "Find where images of a mosaic are best joined.",
+        """Find seams between the images of PROJECT where they are least seen.
+
+        They run where two images show the same, around what stands out of the ground. The regions are a GeoPackage with
+        a column `image`, which `photoplan mosaic --seams` takes and QGIS edits.
+        """,
+        "requests.ortho:SeamsRequest",
+        "products.seams.run:make_seams",
+        {"picture": "report.maps:seams_picture"},
+    ),
     "ortho": "Make orthophotos.",
     "mosaic": "Make one orthophoto of many images.",
-    "illumination": "Take the light on slopes, and haze, out of an orthophoto.",
+    "illumination": Verb(
+        "Take the light on slopes, and haze, out of an orthophoto.",
+        """Take the light on slopes, and haze, out of PICTURE, an orthophoto.
+
+        Parameters are estimated from the picture and printed with standard deviations. If terrain casts its shadow on a
+        slope, or a slope turns away from the sun, it is not corrected.
+        """,
+        "requests.ortho:IlluminationRequest",
+        "products.illumination:correct_illumination",
+        {"preview": "report.illumination:draw_light"},
+    ),
     "object": "Make a product of each object alone.",
     "surface": "Heights and grey values from all images at once.",
-    "register": "Compare two images to a small part of a pixel.",
+    "register": Verb(
+        "Compare two images to a small part of a pixel.",
+        """Find by how much SECOND lies beside FIRST, patch by patch, to a small part of a pixel.
+
+        Both have the same pixels, or places on one map. Each vector, in pixels of FIRST, is the distance of the content
+        of a patch from its expected place in SECOND, with its standard deviation.
+        """,
+        "requests.measure:RegisterRequest",
+        "products.register.run:register",
+        {"picture": "report.register:draw_vectors"},
+    ),
     "run": "Execute a plan written by `ortho --plan`.",
     "dtm": "Terrain models: build, sample, contours, volumes …",
     "view": "Perspective views, with the ground of every pixel.",
-    "monoplot": "Image points to ground points on a terrain model.",
+    "monoplot": Verb(
+        "Image points to ground points on a terrain model.",
+        """Compute ground points of image points, with standard deviations.
+
+        POINTS is a table with columns x, y (pixels; the middle of the upper-left one is 0, 0), or a vector file with
+        points or lines in pixels. Points whose ray meets no terrain keep their row, with the reason.
+        """,
+        "requests.measure:MonoplotRequest",
+        "products.monoplot:monoplot_file",
+    ),
     "mtf": "Measure spread function and MTF from edges and patterns.",
     "restore": "Restore images with a filter, given or measured.",
     "characterise": "Know a camera from image series.",

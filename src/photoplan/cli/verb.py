@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 
 import click
 
-from photoplan.cli.options import BYTES, NEW_FOLDER, PATH, all_cores, json_option, listed, quiet_option
-from photoplan.cli.output import show, show_json, talking
+from photoplan.cli.options import BYTES, NEW_FOLDER, PATH, PROJECT, all_cores, json_option, listed, quiet_option
+from photoplan.cli.output import can_draw, show, show_json, talking
 
 if TYPE_CHECKING:
     from photoplan.request import Request
@@ -88,6 +88,7 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     from photoplan.report.page import open_picture, open_report
 
     dry_run, overwrite = getattr(request, "dry_run", False), getattr(request, "overwrite", False)
+    talk = talking(quiet)
     drawn = {
         path: verb.draw[key]
         for name, paths in request.files_written().items()
@@ -95,6 +96,9 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
         for key in (name, name + path.suffix.lower())
         if key in verb.draw
     }
+    picture = next((name for name in verb.draw if getattr(request, name, None) is True), None)
+    if picture and not dry_run and can_draw(True, talk):
+        drawn[request.product.with_suffix(".png")] = verb.draw[picture]
     opened = {} if dry_run else {
         path: (open_report if path.suffix.lower() == ".html" else open_picture)(
             path, request.files_read(), overwrite=overwrite
@@ -105,22 +109,26 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     with recorded as record, together() if opened else nullcontext():
         with Telling(quiet) as events:
             result = load(verb.make)(request, events)
+        made: list[Path] = []
         for path, file in opened.items():
-            if file is not None:
-                file.write(load(drawn[path])(result))
-        files = [*result.written(), *(path for path in opened if path not in result.written())]
+            if file is not None and (content := load(drawn[path])(result)) is not None:
+                file.write(content)
+                made.append(path)
+        files = [*result.written(), *made]
         if record is not None:
             record(files, result)
     if as_json:
-        more = {name: path for name in type(request).model_fields if (path := getattr(request, name)) in opened}
+        more = {name: path for name in type(request).model_fields if (path := getattr(request, name)) in made}
+        if picture:
+            more["picture"] = next((path for path in made if path not in more.values()), None)
         show_json(result, **more)
     else:
         for line in (*files, *result.summary()):
             show(line)
-    talk = talking(quiet)
     for message in result.messages():
         if not as_json or message.startswith(("note:", "warning:")):
             talk(message)
+    result.raise_failures()
 
 
 def _request(kind: type[Request], given: dict[str, Any]) -> Request:
@@ -169,7 +177,8 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
                 more["callback"] = _numbers if hint in (int, float) else _words
     choices = [str(each) for each in get_args(hint)] if get_origin(hint) is Literal else how.get("choices")
     kind: Any = click.Choice(choices) if choices else BYTES if how.get("size") else hint
-    kind = (NEW_FOLDER if how.get("folder") else PATH) if hint is Path else kind
+    if hint is Path:
+        kind = NEW_FOLDER if how.get("folder") else PROJECT if how.get("project") else PATH
     if more.get("callback") is _numbers:
         kind = str
     if how.get("argument"):
@@ -185,7 +194,7 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
         names = [name, flag + (f"/--{'no'}-{flag[2:]}" if both else "")]
         return click.Option(names, is_flag=True, default=None if optional else default, help=entry.description)
     if name == "workers":
-        more["callback"], kind = all_cores, click.IntRange(1)
+        more["callback"], kind, default = all_cores, click.IntRange(1), None
     names = [name, *(["-o"] if name in ("output", "outputs") else []), flag]
     shown = default is not None and default != () and "[" not in (entry.description or "")
     if "multiple" in more:

@@ -47,11 +47,11 @@ from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.model_tables import GrossError
 from photoplan.io.vector_layer import layers_of, read_layer
 from photoplan.plain import pick
-from photoplan.products.dtm.request import InfoRequest
 from photoplan.products.simulate.form import stated_model
 from photoplan.project.filter_files import load_filter
 from photoplan.quality.restoration.borders import Convolution
 from photoplan.quality.restoration.filters import FilterKernel
+from photoplan.requests.terrain import InfoRequest
 from photoplan.surfaces.units import LineElement, UnitFigures
 
 

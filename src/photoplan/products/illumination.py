@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from photoplan import __version__
 from photoplan.cameras.sun import SunProjection
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.frames import triple
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.image_form import form_of, placement_of
@@ -27,6 +29,7 @@ from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.project.restored import kept_nodata
 from photoplan.radiometry.illumination import LightModel, LitGround, estimate_light
 from photoplan.radiometry.tone import fitted
+from photoplan.requests.ortho import IlluminationRequest
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.options import Lighting
 from photoplan.terrain.shading import directions, even_slopes
@@ -37,24 +40,8 @@ _ALONG, _SIDE = 8, 64
 _MOST = 30_000
 
 
-@dataclass(frozen=True)
-class IlluminationRequest:
-    """What is asked."""
-
-    picture: Path
-    terrain: Path
-    output: Path
-    sun: tuple[float, float]
-    """Azimuth from grid north and altitude above the horizon, degrees."""
-    correct: tuple[str, ...] = ("c",)
-    """Names of `photoplan.radiometry.illumination.CORRECTIONS`."""
-    overwrite: bool = False
-    workers: int | None = None
-    dry_run: bool = False
-
-
 @dataclass(frozen=True, eq=False)
-class IlluminationReport:
+class IlluminationReport(Result):
     """What was found and made."""
 
     path: Path | None
@@ -83,6 +70,20 @@ class IlluminationReport:
         own = pick(self.model, "corrections", "cos_z", "height", "bands")
         shadow = float(np.mean(~self.sample.lit))
         return {"path": self.path, **own, "not_lit": shadow, "correlation_before": before, "correlation_after": after}
+
+    def summary(self) -> Sequence[str]:
+        """Return the parameters of each band, and how much lies in shadow."""
+        model, lines = self.model, []
+        names = ("per cos i", "a of c" if "c" in model.corrections else "sky", "haze", "haze per 100 m")
+        for number, (band, before, after) in enumerate(zip(model.bands, *self.correlations), 1):
+            values = zip(names, (band.slope, band.sky, band.haze, band.haze_by_height), band.sigmas)
+            listed = ", ".join(f"{name} {value:.4g} ± {sigma:.2g}" for name, value, sigma in values if value or sigma)
+            lines.append(f"band {number}: {listed}; correlation with cos i {before:+.3f}, then {after:+.3f}")
+        dark = float((~self.sample.lit).mean())
+        return [
+            *lines,
+            f"{dark:.1%} of the sample lie in shadow or turn away from the sun; slopes are not corrected there",
+        ]
 
 
 @dataclass(frozen=True, eq=False)

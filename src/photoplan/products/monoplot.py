@@ -13,6 +13,8 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted
 from photoplan.geometry.rotation import axes_of_angles
 from photoplan.io.names import ImageNames
 from photoplan.io.orientation.table import angle_in_radians
@@ -32,6 +34,7 @@ from photoplan.project.open_terrain import open_terrain
 from photoplan.project.posed import pose_of
 from photoplan.project.scene import input_files
 from photoplan.project.uncertain import known_height_errors
+from photoplan.requests.measure import MonoplotRequest
 from photoplan.terrain.monoplot import REASONS, MonoplotErrors, MonoplotPoints, monoplot
 
 #: Points higher than this above the bare ground lie on objects, metres.
@@ -43,31 +46,7 @@ COLUMNS = ("X", "Y", "Z", "sigma_X", "sigma_Y", "sigma_Z", "angle_deg", "reason"
 
 
 @dataclass(frozen=True)
-class MonoplotRequest:
-    """What is asked."""
-
-    project: Path
-    image: str
-    points: Path
-    """Table with columns x, y, or vector file with points or lines in pixels."""
-    output: Path
-    """Table of ground points."""
-    vectors: Path | None = None
-    """Points or lines in space, as a GeoPackage."""
-    gis_axes: bool = False
-    """Vector coordinates are those of a GIS that shows the image without georeference: (0, 0) is the upper-left corner,
-    y points up."""
-    sigma_image: float = 0.5
-    sigma_terrain: float | None = None
-    """Metres; None: the model's own."""
-    sigma_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    sigma_angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the three angles of the orientation, in the project's unit."""
-    overwrite: bool = False
-
-
-@dataclass(frozen=True)
-class MonoplotReport:
+class MonoplotReport(Result):
     """What came out."""
 
     output: Path
@@ -87,6 +66,20 @@ class MonoplotReport:
         counts = pick(self, "points", "met", "grazing", "through_holes", without_ground_point="reasons")
         return {**pick(self, "output", "vectors", "median_sigma", "height_system", "notes"), **counts}
 
+    def summary(self) -> Sequence[str]:
+        """Return counts, reasons, and standard deviations."""
+        lines = [f"{self.met} of {self.points} points on the ground"]
+        lines += [f"  {count} without: {reason}" for reason, count in self.reasons.items()]
+        if self.grazing or self.through_holes:
+            lines.append(f"  {self.grazing} under less than 5° to the terrain, {self.through_holes} through holes")
+        if self.median_sigma is not None:
+            lines.append("median standard deviation X {:.3f} Y {:.3f} Z {:.3f} m".format(*self.median_sigma))
+        return lines
+
+    def messages(self) -> Sequence[str]:
+        """Return the height system and the notes."""
+        return [f"height system: {self.height_system}", *noted(self.notes)]
+
 
 @dataclass(frozen=True, eq=False)
 class _Given:
@@ -101,7 +94,7 @@ class _Given:
     """Of points, or of lines."""
 
 
-def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
+def monoplot_file(request: MonoplotRequest, events: Events = SILENT) -> MonoplotReport:
     """Ground points of all image points of a file, written as a table.
 
     Raises

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.io.naming import write_atomically
 from photoplan.io.quicklook import read_reduced
+from photoplan.products.seams.run import SeamsReport
 from photoplan.products.surface.job import MISFIT
 from photoplan.report.drawing import (
     BLUE,
@@ -88,6 +89,11 @@ def draw_accuracy(raster: Path) -> Path:
     return picture
 
 
+def seams_picture(found: SeamsReport) -> bytes | None:
+    """Return the regions of a search for seams as a PNG; None if no images are joined."""
+    return regions_picture(found.shapes, "Images of the mosaic") if found.shapes else None
+
+
 def draw_regions(path: Path, shapes: Mapping[str, Any], title: str) -> Path:
     """Draw the regions of images, the larger ones with their names, as a PNG; replaces an older one.
 
@@ -102,6 +108,12 @@ def draw_regions(path: Path, shapes: Mapping[str, Any], title: str) -> Path:
         matplotlib is not installed, or the folder cannot be written.
     """
     load_matplotlib("a picture of the regions", "leave `sources` out")
+    write_atomically(path, regions_picture(shapes, title))
+    return path
+
+
+def regions_picture(shapes: Mapping[str, Any], title: str) -> bytes:
+    """Return the regions of images, the larger ones with their names, as a PNG."""
     left, bottom, right, top = shapely.total_bounds(list(shapes.values())).tolist()
     fig, ax = axes_of(9.0, float(np.clip(9.0 * (top - bottom) / (right - left), 3.0, 14.0)))
     area = sum(shape.area for shape in shapes.values())
@@ -113,8 +125,7 @@ def draw_regions(path: Path, shapes: Mapping[str, Any], title: str) -> Path:
             at = max(shape.geoms, key=lambda part: part.area).representative_point()
             ax.annotate(shortened(name), (at.x, at.y), ha="center", va="center", fontsize=8, color=INK)
     _on_map(ax, title, xlim=(left, right), ylim=(bottom, top))
-    write_atomically(path, png(fig))
-    return path
+    return png(fig)
 
 
 def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.engine.steps import steps
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.io.ground_points import write_ground_points
 from photoplan.io.image_points import write_image_points
@@ -31,39 +33,11 @@ from photoplan.plain import pick
 from photoplan.products.control.patches import Ortho, choose_patches
 from photoplan.project.cameras import central_without_pixels
 from photoplan.project.scene import input_files, open_scene
+from photoplan.requests.orient import ControlRequest
 
 
 @dataclass(frozen=True)
-class ControlRequest:
-    """What is asked."""
-
-    project: Path
-    ortho: tuple[Path, ...]
-    """Orthophotos in the project's CRS, of one resolution; the first one that has a value counts."""
-    height_sigma: float
-    """Standard deviation of the heights, metres."""
-    heights: Path | None = None
-    """Heights; None: the project's terrain."""
-    height_system: str | None = None
-    """Of `heights`, where the file does not state it."""
-    ortho_sigma: float | None = None
-    """Standard deviation of X and of Y in the orthophoto, metres; None: one of its pixels."""
-    images: tuple[str, ...] = ()
-    grid: int = 8
-    """Patches along each side of an image."""
-    search: float = 30.0
-    """How far off the approximate orientation may put a point, metres on the ground."""
-    radius: int = 15
-    """Of a patch, pixels of the coarser of orthophoto and photo."""
-    correlation: float = 0.7
-    output: Path | None = None
-    workers: int = 1
-    overwrite: bool = False
-    dry_run: bool = False
-
-
-@dataclass(frozen=True)
-class ControlReport:
+class ControlReport(Result):
     """What was found."""
 
     output: Path | None
@@ -84,6 +58,32 @@ class ControlReport:
         of_image = ("tried", "matched", "shift", "rms", "factor", "reasons")
         images = [{**pick(i, *of_image, image="name"), "kept": len(i.points)} for i in self.images]
         return {**pick(self, *own), "sigma": dict(zip(("plane", "height", "image"), self.sigma)), "images": images}
+
+    def summary(self) -> Sequence[str]:
+        """Return counts and standard deviations, and a line for each image."""
+        if self.output is None:
+            return [f"{self.patches} patches at {self.resolution:g} m"]
+        plane, height, image = self.sigma
+        width = max(5, *(len(i.name) for i in self.images))
+        lines = [
+            f"{self.points} control points of {self.patches} patches at {self.resolution:g} m; standard deviations "
+            f"{plane:.2g} m, height {height:.2g} m, image {image:.2g} px (medians)",
+            f"{'image':{width}}  tried found  kept  shift px          residual px",
+        ]
+        for i in self.images:
+            numbers = zip((*i.shift, i.rms), (1, 1, 2))
+            x, y, rms = (f"{v:.{digits}f}" if math.isfinite(v) else "–" for v, digits in numbers)
+            counts = f"{i.tried:6} {i.matched:5} {len(i.points):5}"
+            lines.append(f"{i.name:{width}} {counts}  {x:>7} {y:>7}  {rms:>10}")
+        return lines
+
+    def messages(self) -> Sequence[str]:
+        """Return the images without control, with the reasons."""
+        return [
+            f"note: {i.name}: no control ({', '.join(f'{count} {reason}' for reason, count in i.reasons.items())})"
+            for i in self.images
+            if not len(i.points)
+        ]
 
 
 def propose_control(request: ControlRequest, events: Events = SILENT) -> ControlReport:

@@ -16,8 +16,8 @@ from photoplan.findings import Result
 from photoplan.io.contour_file import ContourRow, LabelRow, contour_files, write_contours
 from photoplan.io.product import check_output
 from photoplan.plain import pick
-from photoplan.products.dtm.request import ContourRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.requests.terrain import ContourRequest
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.terrain.contours.labels import Labeller, decimals_of
 from photoplan.terrain.contours.parts import SurfacePart, grid_parts, unit_parts

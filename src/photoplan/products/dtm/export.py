@@ -19,8 +19,8 @@ from photoplan.io.naming import together
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
 from photoplan.products.dtm.raster import GridOptions, write_grid
-from photoplan.products.dtm.request import ExportRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.requests.terrain import ExportRequest
 from photoplan.targets.map import MapTarget
 
 RASTERS = (".tif", ".tiff")

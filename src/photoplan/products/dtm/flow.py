@@ -23,9 +23,9 @@ from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.plain import advised, pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
-from photoplan.products.dtm.request import FlowRequest
 from photoplan.products.dtm.visible import Place, named_points, own_grid, read_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.requests.terrain import FlowRequest
 from photoplan.terrain.flow import CELL_BYTES, Flow, flow_of, snapped
 
 TILE = 512

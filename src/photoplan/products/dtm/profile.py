@@ -20,8 +20,8 @@ from photoplan.io.table_lines import csv_line
 from photoplan.io.tables import Dialect
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
-from photoplan.products.dtm.request import ProfileRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.requests.terrain import ProfileRequest
 from photoplan.surfaces.profile import profile
 
 TABLES = (".csv", ".txt")

@@ -24,8 +24,8 @@ from photoplan.io.terrain.model_read import ModelReader
 from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.plain import pick
-from photoplan.products.dtm.request import RefineRequest
 from photoplan.project.open_terrain import open_terrain
+from photoplan.requests.terrain import RefineRequest
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.raster_units import RasterUnits
 from photoplan.surfaces.refined_units import LinedUnits, refine_units

@@ -21,8 +21,8 @@ from photoplan.io.tables import Dialect
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
 from photoplan.plain import pick
-from photoplan.products.dtm.request import SampleRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.requests.terrain import SampleRequest
 
 PART = 100_000
 """Points that are in memory at once."""

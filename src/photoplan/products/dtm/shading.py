@@ -22,8 +22,8 @@ from photoplan.io.quicklook import write_quicklook
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
-from photoplan.products.dtm.request import PictureRequest, ShadeRequest, SlopeRequest, TintRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.requests.terrain import PictureRequest, ShadeRequest, SlopeRequest, TintRequest
 from photoplan.terrain import shading
 from photoplan.terrain.options import Lighting
 from photoplan.terrain.shading import surface_slopes

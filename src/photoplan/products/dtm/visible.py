@@ -26,8 +26,8 @@ from photoplan.io.result_log import ResultLog
 from photoplan.io.tables import Columns, read_table
 from photoplan.plain import advised, pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
-from photoplan.products.dtm.request import VisibleRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.requests.terrain import VisibleRequest
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights, parts
 

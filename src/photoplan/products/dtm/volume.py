@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from photoplan.engine.steps import steps
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result
+from photoplan.findings import Result, noted
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import USUAL_TILE, MapGrid, Window, check_resolution, refuse_absurd
 from photoplan.geometry.heights import common_system
@@ -25,8 +25,8 @@ from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
-from photoplan.products.dtm.request import VolumeRequest
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.requests.terrain import VolumeRequest
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.volume import TILE, ErrorModel, Volume, VolumeSettings, VolumeSigma, volume_between, volume_sigma
 
@@ -79,7 +79,7 @@ class VolumeReport(Result):
 
     def messages(self) -> Sequence[str]:
         """Return the height system and the notes."""
-        return [f"height system: {self.height_system}", *(f"note: {note}" for note in self.notes)]
+        return [f"height system: {self.height_system}", *noted(self.notes)]
 
 
 def dtm_volume(request: VolumeRequest, events: Events = SILENT) -> VolumeReport:

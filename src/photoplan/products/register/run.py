@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from photoplan.engine.steps import steps
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted
 from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.naming import when_named
 from photoplan.io.product import check_output
@@ -36,51 +37,13 @@ from photoplan.matching.smooth_displacement import MODELS, SmoothModel, fit_smoo
 from photoplan.plain import pick
 from photoplan.products.register.figures import RegisterFigures, figures_of
 from photoplan.products.register.pair import Pair, open_pair
+from photoplan.requests.measure import RegisterRequest
 
 #: Patches of a tile along each side, and of all at most.
 _TILE, _MOST = 24, 2_000_000
 #: Part of the patches with texture below which those that were found are few.
 _FEW = 0.25
 _COLUMNS = ("x", "y", "dx", "dy", "sigma_x", "sigma_y", "covariance", "correlation", "state")
-
-
-@dataclass(frozen=True)
-class RegisterRequest:
-    """What is asked."""
-
-    first: Path
-    second: Path
-    output: Path
-    """GeoPackage of the vectors; the table stands beside it."""
-    radius: int = 10
-    """Of a patch, pixels."""
-    spacing: int | None = None
-    """Of the patches, pixels; None: they touch."""
-    search: float = 3.0
-    """Largest displacement along each axis, pixels."""
-    correlation: float = 0.7
-    sigma: float = 0.2
-    """Largest standard deviation of a coordinate, pixels."""
-    model: str = "affine"
-    """What is laid through the vectors, see `figures.MODELS`."""
-    workers: int = 1
-    overwrite: bool = False
-    dry_run: bool = False
-
-    @property
-    def patch(self) -> PatchSettings:
-        """How patches are matched."""
-        return PatchSettings(self.radius, self.search, self.correlation, self.sigma)
-
-    @property
-    def step(self) -> int:
-        """Distance of the patches."""
-        return 2 * self.radius + 1 if self.spacing is None else self.spacing
-
-    @property
-    def table(self) -> Path:
-        """CSV of the vectors."""
-        return self.output.with_suffix(".csv")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +73,7 @@ class PatchGrid:
 
 
 @dataclass(frozen=True, eq=False)
-class RegisterReport:
+class RegisterReport(Result):
     """What was found."""
 
     output: Path | None
@@ -120,6 +83,7 @@ class RegisterReport:
     shape: tuple[int, int]
     """Rows and columns of patches."""
     step: int
+    radius: int
     figures: RegisterFigures | None
     model: SmoothModel | None
     found: PatchDisplacements | None
@@ -136,6 +100,33 @@ class RegisterReport:
         images = [str(path) for path in self.pair.paths]
         own = pick(self, "output", "table", "figures", "model", grid="shape", spacing_px="step")
         return {**own, "images": images, "pixel": self.pair.pixel, "notes": list(self.notes)}
+
+    def summary(self) -> Sequence[str]:
+        """Return the figures, or how many patches there are after a dry run."""
+        f = self.figures
+        if f is None:
+            rows, columns = self.shape
+            return [f"{columns} × {rows} patches of {2 * self.radius + 1} px, every {self.step} px"]
+        left = ", ".join(f"{count} {name}" for name, count in f.counts.items() if count and name != "found")
+        shares = ", ".join(f"{name} % {value:.3f}" for name, value in f.percentiles.items())
+        metres = "" if self.pair.pixel is None else f"; a pixel is {self.pair.pixel:.4g} on the map"
+        lines = [
+            ("patches", f"{f.counts['found']} of {f.patches} found" + (f"; left out: {left}" if left else "")),
+            ("median", f"dx {f.median[0]:+.4f}, dy {f.median[1]:+.4f} px{metres}"),
+            ("rms", f"dx {f.rms[0]:.4f}, dy {f.rms[1]:.4f} px"),
+            ("lengths", f"{shares}, longest {f.largest:.3f} px"),
+            ("within", f"1/4 px {f.quarter:.2%}, 1/2 px {f.half:.2%}"),
+            ("sigma", f"{f.sigma[0]:.4f}, {f.sigma[1]:.4f} px (median), correlation {f.correlation:.3f}"),
+        ]
+        if self.model is not None:
+            m, sigma = self.model, (self.model.covariances[:, 0, 0] ** 0.5).tolist()
+            shift = ", ".join(f"{name} {m.unknowns[k, 0]:+.4f} ± {sigma[k]:.4f}" for k, name in enumerate(("dx", "dy")))
+            lines.append((m.kind, f"in the middle {shift} px; residuals {m.rms[0]:.4f}, {m.rms[1]:.4f} px (rms)"))
+        return [f"{what:8} {text}" for what, text in lines]
+
+    def messages(self) -> Sequence[str]:
+        """Return the notes."""
+        return noted(self.notes)
 
 
 def register(request: RegisterRequest, events: Events = SILENT) -> RegisterReport:
@@ -160,7 +151,15 @@ def register(request: RegisterRequest, events: Events = SILENT) -> RegisterRepor
     pair = open_pair(request.first, request.second)
     grid = _grid(pair, request)
     empty = RegisterReport(
-        output=None, table=None, pair=pair, shape=grid.shape, step=request.step, figures=None, model=None, found=None
+        output=None,
+        table=None,
+        pair=pair,
+        shape=grid.shape,
+        step=request.step,
+        radius=request.radius,
+        figures=None,
+        model=None,
+        found=None,
     )
     if request.dry_run:
         return empty
@@ -172,7 +171,8 @@ def register(request: RegisterRequest, events: Events = SILENT) -> RegisterRepor
     ) as log:  # fmt: skip
         tiles = grid.tiles()
         events.begin("matching", len(tiles))
-        match = partial(match_grid, pair.images, pair.transfer, settings=request.patch)
+        settings = PatchSettings(request.radius, request.search, request.correlation, request.sigma)
+        match = partial(match_grid, pair.images, pair.transfer, settings=settings)
         with steps(request.output.name, request.workers, events, log) as run:
             parts = list(run(match, [grid.at(tile) for tile in tiles], tiles, lambda at: len(at) * request.step**2))
         found = contradicting(_together(parts, tiles, grid), grid.shape)
@@ -187,6 +187,7 @@ def register(request: RegisterRequest, events: Events = SILENT) -> RegisterRepor
             pair=pair,
             shape=grid.shape,
             step=request.step,
+            radius=request.radius,
             figures=figures,
             model=model,
             found=found,

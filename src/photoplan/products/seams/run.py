@@ -18,6 +18,7 @@ from photoplan.engine.run import tiles_in_flight
 from photoplan.engine.steps import Steps, steps
 from photoplan.errors import GeometryError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import make_folder
 from photoplan.io.naming import scratch, together, when_named
@@ -32,9 +33,10 @@ from photoplan.products.balance.sample import Survey, survey
 from photoplan.products.one_colour import one_colour_told
 from photoplan.products.orthophoto.shown import shown
 from photoplan.products.run import BASE_MEMORY, question
-from photoplan.project.scene import Attempts, SceneAddress, input_files
+from photoplan.project.scene import Attempts, SceneAddress, input_files, refuse_unusable
 from photoplan.radiometry.seams import AROUND, find_seams, standing_out, without_overlap
 from photoplan.radiometry.shown import ArrayStore, SeamFeatures, SeamLayer, Shown, features_of
+from photoplan.requests.ortho import SeamsRequest
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
 
@@ -44,35 +46,8 @@ _COSTS, _PART = 3.0, 1024
 _PIXEL, _MAP = 60, 24
 
 
-@dataclass(frozen=True)
-class SeamsRequest:
-    """What is asked."""
-
-    project: Path
-    images: tuple[str, ...] = ()
-    """Names or patterns; none: all."""
-    resolution: float | None = None
-    """Pixels along whose edges seams run, metres; None: 256 of them across an image."""
-    keep: Path | None = None
-    """Regions that somebody has drawn: they stay, where their image sees the ground."""
-    output: Path | None = None
-    workers: int = 1
-    executor: str = "threads"
-    """Who looks at the images: ``threads``, ``processes`` or a Dask scheduler's address. Seams between them are found
-    by threads of this process."""
-    memory: int | None = None
-    """Bytes the run should stay under; None: no bound but the images and parts under way."""
-    overwrite: bool = False
-    dry_run: bool = False
-
-    @property
-    def path(self) -> Path:
-        """The file of regions."""
-        return self.output or self.project.resolve().parent / "products" / "seams.gpkg"
-
-
 @dataclass(frozen=True, eq=False)
-class SeamsReport:
+class SeamsReport(Result):
     """What was found."""
 
     survey: Survey
@@ -96,6 +71,26 @@ class SeamsReport:
         areas = {name: shape.area for name, shape in self.shapes.items()}
         return {**facts, "path": self.path, "halfway": halfway, "found": found, "areas_m2": areas}
 
+    def summary(self) -> Sequence[str]:
+        """Return how many images are joined, and how much they differ along the seams."""
+        grid, names = self.survey.grid, self.survey.names
+        if self.shapes is None or self.differences is None:
+            return [f"{len(names)} images on {grid.width} × {grid.height} pixels of {grid.resolution:g} m"]
+        halfway, best = self.differences
+        along = "no seams"
+        if best is not None and halfway is not None:
+            along = f"fine detail of the two images along seams differs by {best:.2f} grey values"
+            along += f", halfway between them by {halfway:.2f}"
+        return [f"{len(self.shapes)} of {len(names)} images joined at {grid.resolution:g} m · {along}"]
+
+    def messages(self) -> Sequence[str]:
+        """Return the notes."""
+        return noted(self.notes)
+
+    def raise_failures(self) -> None:
+        """Name the images that could not be used."""
+        refuse_unusable(self.unusable, len(self.survey.names) + len(self.survey.blind))
+
 
 def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     """Find where the images of a project are best joined, and write the regions.
@@ -114,8 +109,8 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     """
     times, project = run_times(), load_project(request.project)
     files = [*input_files(project), *([request.keep] if request.keep else [])]
-    check_output(request.path, files, overwrite=request.overwrite)
-    check_vectors(request.path)
+    check_output(request.product, files, overwrite=request.overwrite)
+    check_vectors(request.product)
     executor_factory(request.executor, request.workers)
     attempts = Attempts(project, request.images or None)
     for attempt in attempts:
@@ -135,23 +130,25 @@ def _make(request: SeamsRequest, times: Callable[[], dict[str, Any]], events: Ev
     workers = tiles_in_flight(request.workers, request.memory, kept, _image_bytes(found, images))
     if request.dry_run:
         return SeamsReport(found, notes)
-    make_folder(request.path.parent)
+    make_folder(request.product.parent)
     settings = {"resolution": found.grid.resolution, "images": list(found.names)}
     inputs = [input_entry(file) for file in files]
     key = run_key("seams", settings, inputs)
-    with together(), ResultLog.beside(request.path, key, locked=False) as log:
-        layers = _read(replace(request, workers=workers), found, images, log, events)
+    with together(), ResultLog.beside(request.product, key, locked=False) as log:
+        layers = _read(request.replace(workers=workers), found, images, log, events)
         notes += _odd(found, layers, log)
         with threads(workers) as pool:
-            run = Steps(request.path.name, pool, events, log, root="seams")
+            run = Steps(request.product.name, pool, events, log, root="seams")
             labels, differences = _seams(request, found, layers, log, run, events, notes)
         polygons = label_polygons(labels.astype(np.int32), found.grid)
         shapes = {row: _multi(shape) for row, shape in sorted(polygons.items())}
-        write_regions(request.path, found.names, shapes, found.grid.crs)
+        write_regions(request.product, found.names, shapes, found.grid.crs)
         named = {found.names[row - 1]: shape for row, shape in shapes.items()}
-        report = SeamsReport(survey=found, notes=notes, path=request.path, shapes=named, differences=differences)
+        report = SeamsReport(survey=found, notes=notes, path=request.product, shapes=named, differences=differences)
         ran = {"workers": request.workers, "executor": request.executor, "memory": request.memory, **times()}
-        write_run_record(request.path, key=key, inputs=inputs, run=ran, kind="seams", product=report, settings=settings)
+        write_run_record(
+            request.product, key=key, inputs=inputs, run=ran, kind="seams", product=report, settings=settings
+        )
         when_named(log.remove)
     return report
 
@@ -165,10 +162,10 @@ def _read(
         return tuple(each.kept(log) for each in made) if isinstance(made, tuple) else made
 
     events.begin("reading", len(found.looked), "images")
-    asked = question((file for one in found.looked for file in one.scene.files), request.path.parent)
-    parcels = partial(scratch, request.path.parent)
+    asked = question((file for one in found.looked for file in one.scene.files), request.product.parent)
+    parcels = partial(scratch, request.product.parent)
     with steps(
-        request.path.name, request.workers, events, log, executor=request.executor, question=asked, scratch=parcels
+        request.product.name, request.workers, events, log, executor=request.executor, question=asked, scratch=parcels
     ) as run:
         return list(run(_Map(found.grid, found.tiles.side), images, kept=kept))
 

@@ -1,0 +1,1 @@
+"""Requests by group of commands: the options of each operation, declared once."""
