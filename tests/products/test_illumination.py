@@ -127,7 +127,7 @@ def test_what_cannot_be_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[st
     words = ("illumination", mountain.picture, "--terrain", mountain.terrain, "-o", tmp_path / "a.tif")
     for more, code, told in [
         (("--sun", SUN[0] + 180, SUN[1]), 3, "not brighter on slopes towards the sun"),
-        (("--sun", SUN[0], 95), 2, "altitude` 95"),
+        (("--sun", SUN[0], 95), 2, "altitude 95"),
         (("--sun", *SUN, "--correct", "c,cosine"), 2, "two models of one thing"),
         (("--sun", *SUN, "--correct", "clouds"), 2, "corrections clouds; name some of cosine, c"),
     ]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from photoplan.errors import UsageError
 from photoplan.request import (
     DRY_RUN,
     EXECUTOR,
@@ -58,3 +59,8 @@ class IlluminationRequest(Request):
     dry_run: bool = DRY_RUN
     workers: int | None = WORKERS
     overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse a sun below the horizon."""
+        if not 0 < self.sun[1] <= 90:
+            raise UsageError(f"`sun`: altitude {self.sun[1]:g} must be greater than 0 and at most 90 degrees")
