@@ -203,8 +203,8 @@ def require_projected_metres(text: str, where: str = "CRS") -> CRS:
     if crs.is_compound:
         horizontal, vertical = split_compound(text)
         raise InputError(
-            f"{where}: {crs.name!r} joins a horizontal and a vertical CRS; give crs = {crs_label(horizontal)!r} and "
-            f"state heights as height_system = {vertical!r}"
+            f"{where}: {crs.name!r} joins a horizontal and a vertical CRS; give crs = "
+            f"{crs_label(horizontal or '')!r} and state heights as height_system = {vertical!r}"
         )
     kind = "geographic" if crs.is_geographic else "geocentric" if crs.is_geocentric else "not projected"
     if not crs.is_projected:
@@ -240,13 +240,23 @@ def _east_north_of(crs: CRS) -> str:
     return f" ({twin or utm_codes((area.south + area.north) / 2, middle)[0]})"
 
 
-def split_compound(text: str) -> tuple[str, str | None]:
+def split_compound(text: str, where: str = "CRS") -> tuple[str | None, str | None]:
     """Horizontal CRS as a string, and the height system that the text states.
 
     The second is a vertical CRS's string for a compound CRS, ``"ellipsoidal"`` for a three-dimensional one (its own
-    string if its heights are not metres upwards), and None where nothing is said of heights.
+    string if its heights are not metres upwards), and None where nothing is said of heights. A local (engineering) CRS
+    in metres, or an undefined one of GeoPackage, names no place: both are None, as if nothing was stated.
+
+    Raises
+    ------
+    InputError
+        The text is not a CRS.
     """
-    crs = parse_crs(text)
+    crs = parse_crs(text, where)
+    if crs.name.casefold().startswith("undefined") or (
+        crs.type_name == "Engineering CRS" and all(axis.unit_conversion_factor == 1.0 for axis in crs.axis_info[:2])
+    ):
+        return None, None
     if crs.is_compound:
         parts = crs.sub_crs_list
         return canonical_crs(parts[0].to_wkt()), canonical_crs(parts[1].to_wkt())
@@ -264,14 +274,21 @@ def canonical_crs(text: str) -> str:
     code = crs.to_authority(min_confidence=100)
     if code is not None and code[0] == "EPSG" and CRS.from_authority(*code) == crs:
         return ":".join(code)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        proj = crs.to_proj4()
-    if proj and not crs.is_vertical:
-        proj = proj.removesuffix(" +type=crs")
-        if CRS.from_user_input(proj) == crs and len(proj) < 300:
+    if crs.is_projected or crs.is_geographic:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            proj = crs.to_proj4().removesuffix(" +type=crs")
+        # A PROJ string has no place for most datums, and PROJ calls a CRS without one equal to any with its ellipsoid.
+        found = CRS.from_user_input(proj) if proj and len(proj) < 300 else None
+        if found is not None and found == crs and _datum_name(found) == _datum_name(crs):
             return str(proj)
     return str(crs.to_wkt())
+
+
+def _datum_name(crs: CRS) -> str:
+    """Name of the datum, or of the ensemble of its realizations; `unknown` if only its ellipsoid is stated."""
+    name = "unknown" if crs.datum is None else crs.datum.name.removesuffix(" ensemble")
+    return "unknown" if name.casefold().startswith("unknown") else name
 
 
 def crs_label(text: str) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import parse_crs, split_compound
+from photoplan.geometry.crs import split_compound
 from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.appearance import looks_like
 from photoplan.io.project.errors import explain
@@ -260,8 +260,8 @@ def crs_beside(path: Path) -> StatedCrs | None:
     if side is None:
         return None
     text = read_text(side, _MAX_BYTES).strip()
-    parse_crs(text, str(side))
-    return StatedCrs(side, *split_compound(text), metric_system(text, str(side)))
+    crs, heights = split_compound(text, str(side))
+    return None if crs is None else StatedCrs(side, crs, heights, metric_system(text, str(side)))
 
 
 #: A project of 100,000 images stays far below; anything larger is not a project file.

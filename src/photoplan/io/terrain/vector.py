@@ -376,11 +376,9 @@ def _reference(path: Path, text: str | None, layer: _Layer, notes: list[str]) ->
     if text is None:
         return None, None
     crs = parse_crs(text, f"{path}: CRS")
-    if crs.name.casefold().startswith("undefined"):
-        return None, None
     bounds = shapely.total_bounds(layer.geometry[:1000])
     if path.suffix.casefold() in (".geojson", ".json") and crs.is_geographic and np.abs(bounds).max() > 360:
         # GeoJSON without a CRS is WGS 84 by its standard; coordinates that are no degrees say otherwise.
         notes.append(f"{path.name}: states no CRS, and its coordinates are no degrees")
         return None, None
-    return split_compound(text)
+    return split_compound(text, f"{path}: CRS")
