@@ -18,7 +18,7 @@ from photoplan.geometry.crs import topocentric_poses
 from photoplan.geometry.earth_poses import enu_poses
 from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.observed_positions import read_observed_positions
-from photoplan.io.orientation.exif import rotation_from_gimbal
+from photoplan.io.orientation.exif import read_folder, rotation_from_gimbal
 from photoplan.io.orientation.file import read_orientation, read_orientation_block
 
 Entries = dict[int, tuple[int, Any]]
@@ -317,6 +317,15 @@ def test_without_attitudes_there_is_no_orientation(tmp_path: Path) -> None:
     jpeg(tmp_path / "b.jpg", exif(MAIN, OWN, datum))
     with pytest.raises(InputError, match="datum TOKYO"):
         read_orientation(tmp_path, format="exif")
+
+
+def test_an_image_of_another_datum_is_left_out_of_a_folder(tmp_path: Path) -> None:
+    """One image in Tokyo's datum had refused the whole folder."""
+    for name, datum in (("a", "WGS-84"), ("b", "TOKYO"), ("c", "WGS 84")):
+        jpeg(tmp_path / f"{name}.jpg", exif(MAIN, OWN, gps(46, -91, 100) | {18: (ASCII, datum)}))
+    placed = read_folder(tmp_path)
+    assert [m.file.name for m in placed.placed] == ["a.jpg", "c.jpg"]
+    assert "1 of 3 images refer to another datum than WGS 84 and are left out: b.jpg: datum TOKYO" in placed.notes[0]
 
 
 def test_the_brighton_blocks_gimbal_angles_agree_with_its_adjusted_ones(shared: Path) -> None:

@@ -194,7 +194,7 @@ def test_losses() -> None:
         (
             CAMERAS,
             IMAGES.replace("\n2362.39 248.498 58396 1784.7 268.254 59027 1784.7 268.254 -1", ""),
-            r"images\.txt:7: 6 col",
+            r"images\.txt:6: .* after image",
         ),
         (CAMERAS, "", "holds no image"),
     ],
@@ -202,6 +202,15 @@ def test_losses() -> None:
 def test_fault_18_broken_models(tmp_path: Path, cameras: str, images: str, says: str) -> None:
     with pytest.raises(InputError, match=says):
         read_orientation_block(model(tmp_path, cameras, images), format="colmap")
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a 1.jpg", "folder/my a 1.jpg", "7"])
+def test_images_without_lines_of_points_are_not_lost(tmp_path: Path, name: str) -> None:
+    """Every second image was taken for the points of the one before."""
+    one = "1 1 0 0 0 0 0 0 1 "
+    model(tmp_path, "1 PINHOLE 200 150 200 200 100 75\n", f"{one}x.jpg\n{'2' + one[1:]}{name}\n{'3' + one[1:]}y.jpg\n")
+    with pytest.raises(InputError, match=r"images\.txt:2: .* after image 'x.jpg'; an empty line, or X, Y, POINT3D_ID"):
+        read_orientation_block(tmp_path)
 
 
 def test_an_incomplete_model_is_refused(tmp_path: Path) -> None:

@@ -183,7 +183,7 @@ def _degrees(exif: dict[str, ExifValue], name: str, negative: str) -> float | No
         return None
     degrees = sum(v / 60.0**k for k, v in enumerate(value[:3]))
     sign = _text(exif, f"{name}Ref") or ""
-    return -degrees if sign.upper().startswith(negative) else degrees
+    return -abs(degrees) if sign.upper().startswith(negative) else degrees
 
 
 def _sigma(

@@ -11,6 +11,7 @@ rig-from-world. COLMAP itself uses these and ignores the poses of ``images``; he
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -291,7 +292,13 @@ def _text_images(path: Path, model: _Model) -> None:
         if key in model.images:
             raise InputError(f"{where}: image number {key} is given twice ({model.images[key][0]!r} and {name!r})")
         model.images[key] = (name, words[8], pose, number)
-        next(lines, None)
+        _, points = next(lines, (0, ""))
+        fields = points.split()
+        if len(fields) % 3 or (fields and not re.fullmatch(r"-?\d+", fields[-1])):
+            raise InputError(
+                f"{path}:{number + 1}: {points[:40]!r} after image {name!r}; an empty line, or X, Y, POINT3D_ID of its "
+                "points, must follow every image"
+            )
 
 
 def _text_rigs(folder: Path, model: _Model) -> None:
