@@ -13,8 +13,10 @@ from pyproj import CRS
 from tools.command import inside
 from tools.small_block import write_image
 
+from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, crs_step, split_compound
 from photoplan.geometry.units import metric_system
+from photoplan.io.orientation.file import read_orientation
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import ReadOptions
 
@@ -64,6 +66,36 @@ def test_local_systems_in_metres_state_no_place(tmp_path: Path, text: str) -> No
     place = Affine(1, 0, 5e5, 0, -1, 5.2e6)
     raster = write_image(tmp_path / "d.tif", np.full((1, 8, 9), 5, np.float32), crs=text, transform=place)
     assert inside("info", raster).code == 0
+
+
+@pytest.mark.parametrize("code", ["EPSG:32118", "EPSG:2263"])
+def test_a_missing_grid_is_answered_with_a_system_that_needs_none(code: str) -> None:
+    system = metric_system(code)
+    XY = 300_000.0, 60_000.0
+    with pytest.raises(
+        InputError, match=r"the grid us_noaa_\w+\.tif .* is missing.*on the datum .* such as EPSG:26918"
+    ):
+        crs_step(system.crs, "EPSG:32618", (XY[0], XY[1], XY[0] + 1, XY[1] + 1))
+    crs_step(system.crs, "EPSG:26918")(XY)
+
+
+def test_units_that_are_stated_twice(tmp_path: Path) -> None:
+    path = tmp_path / "s.xml"
+    path.write_text('<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2"><Units><Imperial linearUnit="foot"/>'
+                    '<Metric linearUnit="meter"/></Units></LandXML>')  # fmt: skip
+    with pytest.raises(InputError, match=r"s\.xml: states its units twice"):
+        read_measured([path], ReadOptions())
+
+
+def test_orientations_in_local_feet_are_refused_by_name(tmp_path: Path) -> None:
+    """They were taken as metres."""
+    path = tmp_path / "o.txt"
+    text = "# CoordinateSystem: {}\n#PhotoID, X, Y, Z, Omega, Phi, Kappa\na.jpg\t1\t2\t3\t0\t0\t0\n"
+    path.write_text(text.format(LOCAL_FEET))
+    with pytest.raises(InputError, match=r"o\.txt:1: .* is a local system in foot"):
+        read_orientation(path)
+    path.write_text(text.format(LOCAL))
+    assert read_orientation(path).centers.tolist() == [[1, 2, 3]]
 
 
 def test_local_systems_in_feet_are_refused_by_name(tmp_path: Path) -> None:

@@ -11,11 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
-from pyproj.aoi import AreaOfInterest
-from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import ProjError
 
-from photoplan.geometry.crs import crs_label, nearest_turn, parse_crs, utm_codes
+from photoplan.geometry.crs import crs_label, fitting_utm, nearest_turn, parse_crs, utm_codes
 from photoplan.geometry.rotation import ANGLE_UNITS
 
 #: Map coordinates beyond this lie on no map of the earth, metres.
@@ -132,7 +130,8 @@ def _told(crs: str, XY: ArrayLike, names: Sequence[str], most: float, asks: str)
     if zone and (XY[known, 0] // 1e6 == int(zone)).all():
         begins = f"does X begin with {zone}, the number of the zone? Without it they lie inside"
         readings.append((begins, XY[known] % (1e6, np.inf)))
-    readings.append(("are they millimetres? In metres they lie inside", XY[known] / 1e3))
+    if np.abs(XY[known]).max() >= 1e7:
+        readings.append(("are they millimetres? In metres they lie inside", XY[known] / 1e3))
     likely = next((text for text, meant in readings if not (beyond_area(crs, meant) > _NOTED).any()), None)
     if not np.isfinite(lon + lat):
         return f"{what} has no place in {of}{asks if likely is None else f'; {likely}'}"
@@ -143,17 +142,6 @@ def _told(crs: str, XY: ArrayLike, names: Sequence[str], most: float, asks: str)
         f"{what} lies {beyond.max():.0f} km outside the area of {of}, at latitude {lat:.4f}°, longitude {lon:.4f}°"
         f"{fits}{asks}"
     )
-
-
-def fitting_utm(crs: str, latitude: float, longitude: float) -> str:
-    """Code of the UTM zone at a place (degrees), on the datum of a CRS if that has zones there, else on WGS 84."""
-    geographic = parse_crs(crs).geodetic_crs
-    here = AreaOfInterest(longitude, latitude, longitude, latitude)
-    known = [] if geographic is None else query_utm_crs_info(datum_name=geographic.name, area_of_interest=here)
-    zone = utm_codes(latitude, longitude)[0]
-    same = [f"{found.auth_name}:{found.code}" for found in known if found.name.endswith(f"zone {int(zone[-2:])}"
-            f"{'N' if latitude >= 0 else 'S'}")]  # fmt: skip
-    return same[0] if same else zone
 
 
 def is_no_fix(latitude: float, longitude: float) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
@@ -402,9 +403,10 @@ def crs_step(
     if not group.transformers or not group.best_available:
         missing = missing_grids(group)
         what = f"the grid {missing[0]} is missing" if missing else "there is none without an inexact fallback"
+        own = "" if area is None else _own_utm(source, target, area)
         raise InputError(
             f"no exact transformation from {crs_label(source)} to {crs_label(target)}: {what}; "
-            "give the inputs in one CRS" + (", or install the grid" if missing else "")
+            f"give the inputs in one CRS{own}" + (", or install the grid" if missing else "")
         )
     best = group.transformers[0]
     accuracy = best.accuracy if best.accuracy is not None and best.accuracy >= 0 else None
@@ -429,6 +431,25 @@ def utm_codes(latitude: float, longitude: float) -> list[str]:
     """The UTM zone of WGS 84 at a place (degrees), then the zones beside it, as EPSG codes."""
     zone = int((longitude + 180) // 6) % 60
     return [f"EPSG:{326 if latitude >= 0 else 327}{(zone + shift) % 60 + 1:02d}" for shift in (0, -1, 1)]
+
+
+def fitting_utm(crs: str, latitude: float, longitude: float) -> str:
+    """Code of the UTM zone at a place (degrees), on the datum of a CRS if that has zones there, else on WGS 84."""
+    geographic = parse_crs(crs).geodetic_crs
+    here = AreaOfInterest(longitude, latitude, longitude, latitude)
+    known = [] if geographic is None else query_utm_crs_info(datum_name=geographic.name, area_of_interest=here)
+    zone = utm_codes(latitude, longitude)[0]
+    same = [f"{found.auth_name}:{found.code}" for found in known if found.name.endswith(f"zone {int(zone[-2:])}"
+            f"{'N' if latitude >= 0 else 'S'}")]  # fmt: skip
+    return same[0] if same else zone
+
+
+def _own_utm(source: str, target: str, area: Any) -> str:
+    """What to choose instead of a target on another datum: the UTM zone on the source's datum; empty: there is none."""
+    middle = area.west_lon_degree + (area.east_lon_degree - area.west_lon_degree) % 360.0 / 2
+    code = fitting_utm(source, (area.south_lat_degree + area.north_lat_degree) / 2, middle)
+    same = parse_crs(code).datum == parse_crs(source).datum and not same_crs(code, target)
+    return f", choose a CRS on the datum of the first, such as {code}" if same else ""
 
 
 def missing_grids(group: TransformerGroup) -> list[str]:

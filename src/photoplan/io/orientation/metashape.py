@@ -218,7 +218,7 @@ def _geodetic(references: _Floats, chunk: Element, path: Path) -> _Floats | None
     """Latitude, longitude and height (n, 3) of receivers' positions; None: none, or in no CRS that leads there."""
     crs = (chunk.findtext("./reference") or "").strip()
     there = np.isfinite(references[:, :2]).all(axis=1) & (references[:, :2] != 0).any(axis=1)
-    if not there.any() or not crs or is_local_crs(crs):
+    if not there.any() or not crs or is_local_crs(crs, f"{path}: reference"):
         return None
     try:
         system = metric_system(crs, f"{path}: reference")
@@ -312,7 +312,7 @@ def _place(chunk: Element, centers: _Floats, rotations: _Floats, georeferenced: 
     if not georeferenced:
         note = f"{path.name}: the chunk has no position, scale and rotation; coordinates are the program's own"
         return _Placed(centers, rotations, notes=(note,))
-    if not stated or is_local_crs(stated):
+    if not stated or is_local_crs(stated, f"{path}: reference"):
         return _Placed(centers, rotations, notes=(f"{path.name}: coordinates are in a local system",))
     where = f"{path}: reference"
     crs = parse_crs(stated, where)

@@ -86,7 +86,7 @@ def _in_tangential_system(table: OrientationTable) -> OrientationTable:
 
 def _system(text: str, where: str) -> tuple[str | None, bool]:
     """CRS of a header line, and whether it is a local one."""
-    if is_local_crs(text):
+    if is_local_crs(text, where):
         return None, True
     parse_crs(text, where)
     return text, False

@@ -73,7 +73,7 @@ def _block(
     crs = heights = None
     if side.is_file():
         text = read_text(side, 100_000).strip()
-        if is_local_crs(text):
+        if is_local_crs(text, str(side)):
             notes.append(f"{side.name}: coordinates are in a local system")
         else:
             parse_crs(text, str(side))

@@ -114,6 +114,8 @@ class _Reader:
 
     def _units(self, element: Element, tag: str) -> None:
         linear = element.get("linearUnit") or ("meter" if tag == "Metric" else "foot")
+        if self.unit is not None:
+            raise InputError(f"{self.path}: states its units twice; keep one of Metric and Imperial")
         self.unit = metres_in(linear, f"{self.path}: linearUnit")
         heights = element.get("elevationUnit")
         foot = abs(self.unit - FOOT) < 1e-5
