@@ -17,8 +17,10 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, crs_step, split_compound
 from photoplan.geometry.units import metric_system
 from photoplan.io.orientation.file import read_orientation
+from photoplan.io.project.file import load_project
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import ReadOptions
+from photoplan.project.ground import ground_of
 
 LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]'
 LOCAL_FEET = LOCAL.replace('"metre",1', '"foot",0.3048')
@@ -163,3 +165,18 @@ def test_vertical_codes_of_the_first_geotiff(
     measured = read_measured([tmp_path / "a.las"], ReadOptions())
     np.testing.assert_allclose(measured.points[0].xyz[:, 2], np.array([300, 301]) * metres)
     assert measured.height_system == system
+
+
+def test_a_declared_crs_and_the_one_of_the_file(tmp_path: Path) -> None:
+    """The declaration was passed over in silence."""
+    path = write_image(tmp_path / "d.tif", np.full((1, 20, 20), 5, np.float32), crs="EPSG:32632", transform=PLACE)
+    words = ("dtm", "contours", path, "--interval", "1", "-o", tmp_path / "c.gpkg", "--crs")
+    said = inside(*words, "EPSG:25833")
+    assert said.code == 3 and "d.tif: states EPSG:32632, declared is EPSG:25833" in said.err
+    said = inside(*words, "EPSG:32632")
+    assert "declared is" not in said.err
+    project = 'format = 1\ncrs = "EPSG:32632"\n[terrain]\nfile = "d.tif"\ncrs = "EPSG:32633"\nheight_system = "same"\n'
+    image = '[cameras.c]\ntype = "frame"\nsize = [9, 9]\nfocal_px = 9.0\n[[images]]\nname = "i"\nfile = "i.tif"\n'
+    (tmp_path / "project.toml").write_text(f'{project}[orientation]\nheight_system = "same"\n{image}camera = "c"\n')
+    with pytest.raises(InputError, match=r"d\.tif: states EPSG:32632, declared is EPSG:32633"):
+        ground_of(load_project(tmp_path / "project.toml"))

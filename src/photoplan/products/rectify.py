@@ -331,7 +331,7 @@ def _surface(surface: Any, target: Target) -> Surface:
             "from a file, one height, or a surface such as photoplan.RasterSurface"
         )
     crs = target.placement.crs
-    terrain = open_terrain(Path(file), crs)
+    terrain = open_terrain(Path(file), default_crs=crs)
     if crs is None or not isinstance(target, MapTarget):
         return (terrain if crs is None else terrain.in_crs(crs)[0]).surface
     own = terrain.crs

@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
 from photoplan.geometry.agreement import agreement, misfit
+from photoplan.geometry.bounds import is_no_fix
 from photoplan.geometry.crs import crs_label, crs_step, topocentric_poses, utm_codes
 from photoplan.geometry.earth_poses import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
 from photoplan.io.appearance import looks_like
@@ -331,6 +332,11 @@ def _origin(reconstruction: dict[str, Any], path: Path) -> tuple[float, float, f
     lat, lon, alt = (finite(lla.get(k), f"{path}: reference_lla.{k}") for k in ("latitude", "longitude", "altitude"))
     if abs(lat) > 90 or abs(lon) > 360:
         raise InputError(f"{path}: reference_lla latitude {lat}, longitude {lon} are not on the earth")
+    if is_no_fix(lat, lon):
+        raise InputError(
+            f"{path}: reference_lla is latitude 0, longitude 0, which OpenSfM writes if no image states a position; the "
+            "reconstruction is not georeferenced"
+        )
     return lat, lon, alt
 
 

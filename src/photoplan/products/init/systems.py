@@ -219,7 +219,10 @@ def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDAr
         The positions are in a CRS to whose axes angles cannot refer.
     """
     if table.origin is not None:
-        centers, axes = topocentric_poses(table.origin, crs, table.centers)
+        try:
+            centers, axes = topocentric_poses(table.origin, crs, table.centers)
+        except InputError as error:
+            raise InputError(f"{table.file}: {error}") from None
         return centers, degrees_of(axes @ table.rotations)
     if table.crs is None or same_crs(table.crs, crs):
         return table.centers, table.opk_degrees()

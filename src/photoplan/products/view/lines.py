@@ -146,7 +146,7 @@ def _contours(request: LinesRequest, ground: ViewGround, reach: float, center: N
         if project.ground.file is None:
             raise UsageError("contours of a project whose ground has one height everywhere; leave them out")
         path, crs = project.resolve(project.ground.file), project.ground.crs or ground.crs
-    terrain = open_terrain(path, crs)
+    terrain = open_terrain(path, default_crs=crs)
     XY = center[:2]
     if not same_crs(terrain.crs, ground.crs):
         XY = crs_step(ground.crs, terrain.crs, ground.bounds)(XY)
