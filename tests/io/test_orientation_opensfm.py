@@ -65,7 +65,7 @@ def test_several_reconstructions_and_the_origin_beside(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="2 different origins"):
         read_orientation(write(tmp_path, two))
     nowhere = {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
-    with pytest.raises(InputError, match="latitude 0, longitude 0, .* not georeferenced"):
+    with pytest.raises(InputError, match=r"latitude 0, longitude 0: .* not georeferenced"):
         read_orientation(write(tmp_path, [reconstruction({"a": shot}) | {"reference_lla": nowhere}]))
     del two[0]["reference_lla"]
     with pytest.raises(InputError, match="not georeferenced"):

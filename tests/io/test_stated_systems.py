@@ -16,11 +16,13 @@ from tools.small_block import write_image
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, crs_step, split_compound
 from photoplan.geometry.units import metric_system
+from photoplan.io.gcp_list import read_gcp_list
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.project.file import load_project
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.project.ground import ground_of
+from photoplan.project.open_terrain import open_terrain
 
 LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]'
 LOCAL_FEET = LOCAL.replace('"metre",1', '"foot",0.3048')
@@ -180,3 +182,13 @@ def test_a_declared_crs_and_the_one_of_the_file(tmp_path: Path) -> None:
     (tmp_path / "project.toml").write_text(f'{project}[orientation]\nheight_system = "same"\n{image}camera = "c"\n')
     with pytest.raises(InputError, match=r"d\.tif: states EPSG:32632, declared is EPSG:32633"):
         ground_of(load_project(tmp_path / "project.toml"))
+
+
+def test_a_missing_grid_is_told_with_the_file(tmp_path: Path) -> None:
+    place = Affine(10, 0, 4e5, 0, -10, 3e5)
+    path = write_image(tmp_path / "d.tif", np.full((1, 20, 20), 5, np.float32), crs="EPSG:27700", transform=place)
+    with pytest.raises(InputError, match=r"d\.tif: no exact transformation from EPSG:27700 to EPSG:32630: the grid"):
+        open_terrain(path).in_crs("EPSG:32630")
+    (tmp_path / "gcp_list.txt").write_text("EPSG:27700\n400000 300000 50 5 6 a.jpg p\n")
+    with pytest.raises(InputError, match=r"gcp_list\.txt: no exact transformation"):
+        read_gcp_list(tmp_path / "gcp_list.txt", "EPSG:32630")

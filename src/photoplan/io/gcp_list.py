@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.cameras.observed import GroundPoints, ImagePoints
-from photoplan.errors import InputError
+from photoplan.errors import InputError, named_by
 from photoplan.geometry.crs import crs_label, crs_step, parse_crs, same_crs
 from photoplan.geometry.heights import heights_in
 from photoplan.geometry.units import metric_system
@@ -96,7 +96,8 @@ def read_gcp_list(path: Path, crs: str | None = None, height_system: str | None 
     XYZ = system.to_metres(np.array([row.XYZ for row in places.values()], float), f"{path}: heights")
     XYZ = heights_in(XYZ, own, system.heights, height_system, str(path))
     if crs is not None and not same_crs(own, crs):
-        XYZ[:, :2] = crs_step(own, crs)(XYZ[:, :2])
+        with named_by(path):
+            XYZ[:, :2] = crs_step(own, crs)(XYZ[:, :2])
         own = crs
     elif parse_crs(own).is_geographic:
         raise InputError(

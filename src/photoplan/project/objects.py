@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import HeightSystemError, InputError
+from photoplan.errors import HeightSystemError, InputError, named_by
 from photoplan.geometry.bounds import MOST_HEIGHT
 from photoplan.geometry.crs import CrsStep, crs_label, crs_step, require_projected_metres, same_crs
 from photoplan.geometry.heights import OPTIONS, HeightStep, check_height_system, height_step
@@ -118,8 +118,9 @@ def _placed(path: Path, own: ObjectFile, stated: Objects, place: Place) -> tuple
     if not same_crs(crs, place.crs):
         require_projected_metres(crs, f"{path}: CRS")
         low, high = corners[..., :2].min(axis=(0, 1)), corners[..., :2].max(axis=(0, 1))
-        step = crs_step(crs, place.crs, (*low.tolist(), *high.tolist()))
-        corners = np.concatenate([step(corners[..., :2]), corners[..., 2:]], axis=-1)
+        with named_by(path):
+            step = crs_step(crs, place.crs, (*low.tolist(), *high.tolist()))
+            corners = np.concatenate([step(corners[..., :2]), corners[..., 2:]], axis=-1)
         steps.append(step)
     if not np.isfinite(corners).all():
         raise InputError(f"{path}: coordinates that {crs_label(crs)} does not reach; is the CRS right?")

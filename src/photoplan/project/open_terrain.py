@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.errors import GeometryError, InputError, UsageError, named_by
 from photoplan.geometry.bounds import bounds_fault
 from photoplan.geometry.crs import (
     CrsStep,
@@ -82,7 +82,8 @@ class OpenTerrain:
         """
         if same_crs(self.crs, crs):
             return self, ()
-        back = crs_step(self.crs, crs, self.bounds)
+        with named_by(self.path):
+            back = crs_step(self.crs, crs, self.bounds)
         t = np.linspace(0, 1, 17)
         xmin, ymin, xmax, ymax = self.bounds
         x, y = xmin + t * (xmax - xmin), ymin + t * (ymax - ymin)
@@ -93,7 +94,8 @@ class OpenTerrain:
             raise InputError(f"{self.path}: nothing of its area has coordinates in {crs_label(crs)}; is the CRS right?")
         low, high = corners.min(axis=0), corners.max(axis=0)
         bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        step = crs_step(crs, self.crs, bounds, self._about(crs))
+        with named_by(self.path):
+            step = crs_step(crs, self.crs, bounds, self._about(crs))
         surface: RasterSurface | HybridSurface
         if isinstance(self.surface, RasterSurface):
             surface = replace(self.surface, to_grid_crs=step)
@@ -160,9 +162,9 @@ def open_terrain(
             resolution=reader.finest,
             model=reader,
         )
-    reader = TerrainReader(path, crs or default_crs, height_system)
-    _refuse_other(path, reader.info.crs, crs)
-    return _of_raster(path, reader, option)
+    raster = TerrainReader(path, crs or default_crs, height_system)
+    _refuse_other(path, raster.info.crs, crs)
+    return _of_raster(path, raster, option)
 
 
 def _refuse_other(path: Path, stated: str | None, declared: str | None) -> None:

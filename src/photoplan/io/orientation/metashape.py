@@ -24,7 +24,7 @@ from xml.etree.ElementTree import Element, tostring
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.errors import InputError
+from photoplan.errors import InputError, named_by
 from photoplan.geometry.crs import crs_step, parse_crs
 from photoplan.geometry.earth_poses import (
     enu_axes,
@@ -328,10 +328,8 @@ def _place(chunk: Element, centers: _Floats, rotations: _Floats, georeferenced: 
             f"{where}: {crs.name!r} is geographic on another datum than WGS 84; choose a projected CRS in Metashape "
             "(Reference, Convert) and export again"
         )
-    try:
+    with named_by(path):
         XYZ, axes = map_poses(horizontal, centers)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
     return _Placed(XYZ, np.swapaxes(axes, 1, 2) @ rotations, crs=horizontal)
 
 

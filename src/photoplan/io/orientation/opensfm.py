@@ -334,7 +334,7 @@ def _origin(reconstruction: dict[str, Any], path: Path) -> tuple[float, float, f
         raise InputError(f"{path}: reference_lla latitude {lat}, longitude {lon} are not on the earth")
     if is_no_fix(lat, lon):
         raise InputError(
-            f"{path}: reference_lla is latitude 0, longitude 0, which OpenSfM writes if no image states a position; the "
+            f"{path}: reference_lla is latitude 0, longitude 0: OpenSfM writes so if no image states a position; the "
             "reconstruction is not georeferenced"
         )
     return lat, lon, alt

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import InputError, UsageError, named_by
 from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, same_crs
 from photoplan.geometry.units import MetricSystem, agreed_metres, metric_system
 from photoplan.io.drawn_features import DrawnFeatures, read_drawn_features
@@ -238,7 +238,8 @@ def in_crs_of_ground(table: DrawnFeatures, options: dict[str, str], ground: View
     if crs is not None and not same_crs(crs, ground.crs):
         low, high = XYZ[:, :2].min(axis=0), XYZ[:, :2].max(axis=0)
         bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        XYZ[:, :2] = crs_step(crs, ground.crs, bounds)(XYZ[:, :2])
+        with named_by(table.path):
+            XYZ[:, :2] = crs_step(crs, ground.crs, bounds)(XYZ[:, :2])
     return XYZ
 
 
