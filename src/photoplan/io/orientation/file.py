@@ -62,6 +62,8 @@ def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
         return orientation_format("csv")
     head = "" if path.is_dir() else read_head(path)
     claiming = [f for f in map(orientation_format, FORMATS) if f.sniff(path, head)]
+    if path.is_dir() and not claiming:
+        raise InputError(f"{path}: a folder without photographs (JPEG, TIFF) or a COLMAP model; give one, or a file")
     if len(claiming) > 1:
         kinds = ", ".join(f"{f.name} ({f.title})" for f in claiming)
         raise InputError(f"{path}: its content does not tell which format it is: {kinds}; say it with `format`")
