@@ -118,6 +118,13 @@ def test_fault_03_killed_at_every_name_the_same_command_completes(name: str, tmp
         shutil.rmtree(folder)
 
 
+def test_a_folder_that_is_not_there_is_named_and_no_working_file(tmp_path: Path) -> None:
+    block = write_block(tmp_path / "block")
+    for words in (("shade", "-o", "s.tif"), ("contours", "--interval", 2, "-o", "c.gpkg")):
+        said = inside("dtm", words[0], block.terrain, *words[1:-1], tmp_path / "missing" / str(words[-1]))
+        assert said.code == 2 and f"{tmp_path / 'missing'}: no such folder; make it first" in said.err
+
+
 def test_records_say_nothing_of_the_disk(tmp_path: Path) -> None:
     project = write_block(tmp_path / "block").project
     said = inside("ortho", project, "--images", "one", "--resolution", 4, "-o", tmp_path / "out" / "deep")
