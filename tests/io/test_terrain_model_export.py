@@ -132,7 +132,7 @@ def test_obj_ply_and_landxml_say_the_same(model: MemoryUnits, tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("crs", "heights"),
-    some([("EPSG:25832", "EPSG:7837"), ("EPSG:3875", "ellipsoidal"), (LOCAL, None), ("EPSG:25832", None)], 0, 2),
+    some([("EPSG:25832", "EPSG:7837"), ("EPSG:25833", "ellipsoidal"), (LOCAL, None), ("EPSG:25832", None)], 0, 2),
 )
 def test_landxml_states_its_systems_and_is_read_with_them(
     model: MemoryUnits, tmp_path: Path, crs: str, heights: str | None

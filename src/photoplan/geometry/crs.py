@@ -53,12 +53,17 @@ def parse_crs(text: str, where: str = "CRS") -> CRS:
 _SCALES = 0.1, 10.0
 #: The inverse of a projection undoes it to this, metres (PROJ's LAEA on the earth: tenths of a millimetre).
 INVERTED = 1e-3
+#: Units of angles, radians: from milliarcseconds to full turns.
+_ANGLES = 1e-9, 7.0
 #: Radii of bodies that ellipsoids describe, from Phobos to Jupiter, metres; those of planets in kilometres are not.
 _RADII = 1e4, 1e8
 
 
 def _unusable(crs: CRS) -> str:
     """Why a projected CRS describes no map, though it is well formed: numbers may have any size in WKT; else empty."""
+    angles = [] if crs.geodetic_crs is None or crs.geodetic_crs.is_geocentric else crs.geodetic_crs.axis_info[:1]
+    if not all(_ANGLES[0] < axis.unit_conversion_factor < _ANGLES[1] for axis in angles):
+        return f"a unit of angles of {angles[0].unit_conversion_factor:g} rad"
     if not crs.is_projected:
         return ""
     radius = 6378137.0 if crs.ellipsoid is None else crs.ellipsoid.semi_major_metre

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -227,9 +228,14 @@ def finite(value: Any, where: str, count: int | None = None) -> Any:
         if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
             raise InputError(f"{where}: {value!r} given; {count} numbers are needed")
         return tuple(finite(v, where) for v in value)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: {value!r} given; a finite number is needed")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
+        raise InputError(f"{where}: {repr(value)[:80]} given; a finite number is needed")
     return float(value)
+
+
+def whole_number(word: str) -> int | None:
+    """Whole number of up to 18 ASCII digits; None if a word is anything else, such as a superscript."""
+    return int(word) if word.isascii() and word.isdecimal() and len(word) <= 18 else None
 
 
 _MAX_BYTES = 100_000

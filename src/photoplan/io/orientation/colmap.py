@@ -28,7 +28,7 @@ from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, openc
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras
 from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
 from photoplan.io.orientation.text import numbers
-from photoplan.io.plain_files import finite, read_text
+from photoplan.io.plain_files import finite, read_text, whole_number
 
 MAX_BYTES = 2 << 30
 #: Parameters of every camera model, in the order of COLMAP's model numbers (0, 1, 2, …).
@@ -216,9 +216,10 @@ def read_cameras(path: Path) -> dict[str, CameraEntry]:
 
 def _model_name(given: str, where: str) -> str:
     """Name of a camera model that is given by name or number."""
-    name = _NUMBERED[int(given)] if given.isdecimal() and int(given) < len(_NUMBERED) else given
+    number = whole_number(given)
+    name = given if number is None or number >= len(_NUMBERED) else _NUMBERED[number]
     if name not in _MODELS:
-        raise InputError(f"{where}: camera model {given!r} is not supported; it must be one of {', '.join(_MODELS)}")
+        raise InputError(f"{where}: camera model {given[:40]!r} is not supported; accepted are {', '.join(_MODELS)}")
     return name
 
 
@@ -321,9 +322,10 @@ def _text_rigs(folder: Path, model: _Model) -> None:
 
 
 def _whole(word: str, where: str) -> int:
-    if not word.isdecimal() or len(word) > 20:
+    number = whole_number(word)
+    if number is None:
         raise InputError(f"{where}: {word[:40]!r} is not a whole number")
-    return int(word)
+    return number
 
 
 class _Words:
