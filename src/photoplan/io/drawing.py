@@ -12,7 +12,7 @@ import io
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from photoplan.geometry.units import DRAWING_UNITS
 MAX_BYTES = 2 << 30
 #: Entities that unfolded blocks may have in all, and levels of blocks in blocks.
 MOST_ENTITIES, MOST_LEVELS = 2_000_000, 32
+#: Attributes of blocks that are kept.
+MOST_TAGS = 100
 #: Vertices that one curve may have, and how far its chords may lie from it, as a part of its extent.
 MOST_VERTICES, _FLATNESS = 100_000, 1e-4
 #: Key of the entities of all block references together; no block is called so.
@@ -54,6 +56,8 @@ class DrawingFile:
     """Text of each entity, shape (n,); None if it is no text."""
     unit: int
     """$INSUNITS; 0: not stated."""
+    attributes: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Texts of the attributes of block references that are points, by tag, shape (n,); None: it has none."""
     notes: tuple[str, ...] = ()
 
 
@@ -65,6 +69,8 @@ class _Found:
     layers: list[str] = field(default_factory=list)
     handles: list[str] = field(default_factory=list)
     texts: list[str | None] = field(default_factory=list)
+    attributes: dict[str, dict[int, str]] = field(default_factory=dict)
+    """By tag, the texts of shapes by their number."""
     left_out: Counter[str] = field(default_factory=Counter)
     unreadable: Counter[str] = field(default_factory=Counter)
     first: str = ""
@@ -142,12 +148,20 @@ def read_drawing(path: Path) -> DrawingFile:
                      f"(first {found.first})")  # fmt: skip
     shapes = np.empty(len(found.shapes), object)
     shapes[:] = found.shapes
+    attributes = {tag: np.full(len(shapes), None, object) for tag in found.attributes}
+    for tag, values in found.attributes.items():
+        attributes[tag][list(values)] = list(values.values())
+    if attributes:
+        notes.append(
+            f"{path.name}: blocks have attributes: {', '.join(attributes)[:200]}; `height_field` takes heights of one"
+        )
     return DrawingFile(
         shapes=shapes,
         layers=np.array(found.layers, object),
         handles=np.array(found.handles, object),
         texts=np.array(found.texts, object),
         unit=unit if isinstance(unit, int) else -1,
+        attributes=attributes,
         notes=tuple(notes),
     )
 
@@ -233,6 +247,10 @@ def _take(entity: Any, found: _Found, sizes: dict[str, float]) -> None:
             parts, unfolded = _block(entity, sizes, found)
             found.unfolded += unfolded
             found.symbols += not unfolded
+            for attribute in () if unfolded else entity.attribs:
+                tag = str(attribute.dxf.tag)
+                if tag in found.attributes or len(found.attributes) < MOST_TAGS:
+                    found.attributes.setdefault(tag, {})[len(found.shapes)] = str(attribute.dxf.text).strip()
         else:
             parts = [(layer, *item) for item in _geometry(entity, kind)]
     except (MemoryError, KeyboardInterrupt):

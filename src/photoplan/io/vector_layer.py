@@ -72,7 +72,8 @@ def read_layer(path: Path, name: str | None = None) -> FeatureLayer:
     """
     if name == ENTITIES:
         drawn = read_drawing(path)
-        fields = {"Layer": drawn.layers, "EntityHandle": drawn.handles, "Text": drawn.texts}
+        own = {"Layer": drawn.layers, "EntityHandle": drawn.handles, "Text": drawn.texts}
+        fields = {**drawn.attributes, **own}
         return FeatureLayer(drawn.shapes, fields, None, drawing_metres(path, drawn.unit), drawn.notes)
     if name is None:
         names = layers_of(path)
