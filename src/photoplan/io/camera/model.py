@@ -35,6 +35,10 @@ Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Fiducials = dict[Name, Pair]
 
 
+class UnusableCamera(InputError):
+    """A camera of a model that has no form here; only its images suffer."""
+
+
 class Entry(BaseModel):
     """Base of every entry: unknown keys are errors, values never change."""
 

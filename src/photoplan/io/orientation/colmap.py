@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import CameraEntry
+from photoplan.io.camera.model import CameraEntry, UnusableCamera
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
-from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras
+from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras, without_unusable
 from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
 from photoplan.io.orientation.text import numbers
 from photoplan.io.plain_files import finite, read_text, whole_number
@@ -93,6 +94,8 @@ class _Model:
     cameras: dict[str, CameraEntry] = field(default_factory=dict)
     images: dict[int, tuple[str, str, _Rigid, int | None]] = field(default_factory=dict)
     """Name, camera, pose and line of the file."""
+    faults: dict[str, UnusableCamera] = field(default_factory=dict)
+    """Cameras that have no form here."""
     rigs: dict[int, dict[int, _Rigid | None]] = field(default_factory=dict)
     """Sensor-from-rig of every camera; None: not stated."""
     frames: dict[int, tuple[int, _Rigid, list[tuple[int, int]]]] = field(default_factory=dict)
@@ -138,9 +141,10 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         posed(name, pose.center, pose.R.T @ FLIP, camera, line) for name, camera, pose, line in model.images.values()
     )
     notes.append("a COLMAP model states no CRS; unless it was georeferenced, position, scale and axes are its own")
-    used = {i.camera for i in images}
+    table = without_unusable(OrientationTable(file, images, notes=tuple(notes)), model.faults)
+    used = {i.camera for i in table.images}
     cameras = {name: c for name, c in model.cameras.items() if name in used}
-    return OrientationBlock(OrientationTable(file, images, notes=tuple(notes)), cameras)
+    return OrientationBlock(table, cameras)
 
 
 def _contradiction(stated: dict[str, _Rigid], others: dict[str, _Rigid]) -> str | None:
@@ -192,8 +196,10 @@ def _check_rigs(model: _Model, folder: Path, suffix: str) -> list[str]:
     return notes
 
 
-def read_cameras(path: Path) -> dict[str, CameraEntry]:
+def read_cameras(path: Path, faults: dict[str, UnusableCamera] | None = None) -> dict[str, CameraEntry]:
     """Cameras of a ``cameras.txt`` or ``cameras.bin`` by their number, as text.
+
+    Those that have no form here are entered into `faults`; None: they are errors.
 
     Raises
     ------
@@ -201,17 +207,29 @@ def read_cameras(path: Path) -> dict[str, CameraEntry]:
         A line is not of the format, or the model is not supported.
     """
     if path.suffix.lower() == ".bin":
-        return _Binary(path).cameras()
+        return _Binary(path).cameras(faults)
     cameras: dict[str, CameraEntry] = {}
     for number, line in _lines(path):
         words = line.split()
         where = f"{path}:{number}"
         if len(words) < 4:
             raise InputError(f"{where}: {line[:50]!r}; CAMERA_ID, MODEL, WIDTH, HEIGHT and parameters are needed")
-        model = _model_name(words[1], where)
-        values = numbers(words[2:], where, f"camera model {model}", 2 + len(_MODELS[model]))
-        _add_camera(cameras, words[0], model, values, where)
+        with _unusable(words[0], faults):
+            model = _model_name(words[1], where)
+            values = numbers(words[2:], where, f"camera model {model}", 2 + len(_MODELS[model]))
+            _add_camera(cameras, words[0], model, values, where)
     return cameras
+
+
+@contextmanager
+def _unusable(key: str, faults: dict[str, UnusableCamera] | None) -> Iterator[None]:
+    """Enter a camera that has no form here into `faults`."""
+    try:
+        yield
+    except UnusableCamera as error:
+        if faults is None:
+            raise
+        faults[key] = error
 
 
 def _model_name(given: str, where: str) -> str:
@@ -219,7 +237,8 @@ def _model_name(given: str, where: str) -> str:
     number = whole_number(given)
     name = given if number is None or number >= len(_NUMBERED) else _NUMBERED[number]
     if name not in _MODELS:
-        raise InputError(f"{where}: camera model {given[:40]!r} is not supported; accepted are {', '.join(_MODELS)}")
+        accepted = ", ".join(_MODELS)
+        raise UnusableCamera(f"{where}: camera model {given[:40]!r} is not supported; accepted are {accepted}")
     return name
 
 
@@ -229,7 +248,7 @@ def _add_camera(cameras: dict[str, CameraEntry], key: str, model: str, values: I
     odd = [f"{name} = {v[name]:g}" for name in _ZERO.get(model, ()) if v[name] != 0]
     if odd or "cx" not in v:
         terms = f" with {', '.join(odd)}" if odd else ""
-        raise InputError(
+        raise UnusableCamera(
             f"{where}: camera model {model}{terms} has no form here; undistort the images with "
             "`colmap image_undistorter`, or calibrate with OPENCV, FULL_OPENCV or OPENCV_FISHEYE"
         )
@@ -261,7 +280,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 def _read_model(folder: Path, suffix: str) -> _Model:
     """All files of one form; rigs and frames only where both are there."""
     rigged = all((folder / f"{name}.{suffix}").is_file() for name in ("rigs", "frames"))
-    model = _Model(read_cameras(folder / f"cameras.{suffix}"))
+    faults: dict[str, UnusableCamera] = {}
+    model = _Model(read_cameras(folder / f"cameras.{suffix}", faults), faults=faults)
     if suffix == "bin":
         model.images = _Binary(folder / "images.bin").images()
         if rigged:
@@ -374,8 +394,8 @@ class _Binary:
         where = f"{self._path}: {what}"
         return _rigid(finite(self._take("7d"), where, 7), where)
 
-    def cameras(self) -> dict[str, CameraEntry]:
-        """Return the cameras of ``cameras.bin``."""
+    def cameras(self, faults: dict[str, UnusableCamera] | None) -> dict[str, CameraEntry]:
+        """Return the cameras of ``cameras.bin``; `faults` is as in `read_cameras`."""
         cameras: dict[str, CameraEntry] = {}
         for _ in range(self._take("Q")[0]):
             key, number, width, height = self._take("IiQQ")
@@ -384,7 +404,8 @@ class _Binary:
             if max(width, height) > 1 << 31:
                 raise InputError(f"{where}: {width} × {height} pixels; the file is damaged")
             values = finite(self._take(f"{len(_MODELS[model])}d"), where, len(_MODELS[model]))
-            _add_camera(cameras, str(key), model, (width, height, *values), where)
+            with _unusable(str(key), faults):
+                _add_camera(cameras, str(key), model, (width, height, *values), where)
         return cameras
 
     def images(self) -> dict[int, tuple[str, str, _Rigid, int | None]]:

@@ -37,7 +37,7 @@ from photoplan.geometry.earth_poses import (
     map_poses,
 )
 from photoplan.geometry.units import metric_system
-from photoplan.io.camera.model import CameraEntry
+from photoplan.io.camera.model import CameraEntry, UnusableCamera
 from photoplan.io.lens_forms import AgisoftForm, agisoft_form, frame_camera
 from photoplan.io.markup_files import numbers, read_xml
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
@@ -100,6 +100,20 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     kept = [c for c, p in zip(oriented, placed) if p is not None or not georeferenced]
     if len(kept) < len(oriented):
         notes.append(f"{path.name}: {len(oriented) - len(kept)} cameras of a component without position; left out")
+    described: dict[str, tuple[str, CameraEntry]] = {}
+    faults: dict[str, UnusableCamera] = {}
+    for s in dict.fromkeys(c.get("sensor_id", "") for c in kept):
+        try:
+            described[s] = _sensor(sensors.get(s), s, path)
+        except UnusableCamera as error:
+            faults[s] = error
+    if faults:
+        if not described:
+            raise next(iter(faults.values()))
+        usable = [c for c in kept if c.get("sensor_id", "") in described]
+        lost, first = len(kept) - len(usable), next(iter(faults.values()))
+        notes.append(f"warning: {lost} of {len(kept)} images are left out, whose camera cannot be used: {first}")
+        kept = usable
     for camera in kept:
         world = by_component.get(camera.get("component_id", ""), shared) or _Similarity()
         R, t = poses[camera]
@@ -110,7 +124,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         centers.append(world.scale * world.R @ t + world.t)
         rotations.append(world.R @ R @ FLIP)
         references.append(_reference(camera))
-    cameras = _named(chunk, {s: _sensor(sensors.get(s), s, path) for s in dict.fromkeys(s for _, s in names)})
+    cameras = _named(chunk, described)
     placing = _place(chunk, np.array(centers), np.array(rotations), georeferenced, path)
     images = tuple(
         posed(name, at, R, cameras[s][0]) for (name, s), at, R in zip(names, placing.centers, placing.rotations)
@@ -244,12 +258,12 @@ def _sensor(sensor: Element | None, key: str, path: Path) -> tuple[str, CameraEn
     calibration = next((c for c in given if c.get("class") == "adjusted"), given[-1])
     kind = calibration.get("type") or sensor.get("type") or "frame"
     if kind not in ("frame", "fisheye"):
-        raise InputError(f"{where}: type {kind!r} is not supported; allowed are frame and fisheye")
+        raise UnusableCamera(f"{where}: type {kind!r} is not supported; allowed are frame and fisheye")
     v = {c: numbers(calibration.find(c), f"{where}: {c}", 1)[0] for c in _COEFFICIENTS if _has(calibration, c)}
     if "f" not in v:
         raise InputError(f"{where}: its calibration states no focal length f")
     if v.get("p3") or v.get("p4"):
-        raise InputError(f"{where}: p3 and p4 are not supported; fix them to 0, align and export again")
+        raise UnusableCamera(f"{where}: p3 and p4 are not supported; fix them to 0, align and export again")
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     sides = ("width", "height")

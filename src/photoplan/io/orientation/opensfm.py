@@ -32,10 +32,17 @@ from photoplan.geometry.bounds import is_no_fix
 from photoplan.geometry.crs import crs_label, crs_step, topocentric_poses, utm_codes
 from photoplan.geometry.earth_poses import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
 from photoplan.io.appearance import looks_like
-from photoplan.io.camera.model import CameraEntry
+from photoplan.io.camera.model import CameraEntry, UnusableCamera
 from photoplan.io.camera.opensfm import cameras_of
 from photoplan.io.lens_forms import opencv_form, opencv_losses
-from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
+from photoplan.io.orientation.block import (
+    Loss,
+    OrientationBlock,
+    OrientationFormat,
+    height_losses,
+    require_cameras,
+    without_unusable,
+)
 from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
 from photoplan.io.plain_files import elements, finite, members, read_json
 
@@ -315,8 +322,10 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         positions=geodetic_of_enu(origin, shots.gps) if known else None,
         notes=tuple(notes),
     )
+    faults: dict[str, UnusableCamera] = {}
     described = all(isinstance(r.get("cameras"), dict) for r in contents)
-    return OrientationBlock(table, cameras_of(contents, path) if described else {})
+    cameras = cameras_of(contents, path, faults) if described else {}
+    return OrientationBlock(without_unusable(table, faults), cameras)
 
 
 def _reconstructions(path: Path) -> list[dict[str, Any]]:
