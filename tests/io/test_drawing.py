@@ -188,3 +188,20 @@ def test_heights_in_attributes_of_blocks_and_in_texts(tmp_path: Path) -> None:
     alone.saveas(tmp_path / "t.dxf")
     with pytest.raises(InputError, match="3 of its texts are numbers; `height_field` Text takes them for heights"):
         read_measured([tmp_path / "t.dxf"], ReadOptions(crs="EPSG:32632", beyond_area=True))
+
+
+@pytest.mark.parametrize("version", ["AC1004", "AC2.10", "AC1009", ""])
+def test_elevations_of_the_oldest_drawings(tmp_path: Path, version: str) -> None:
+    """Before release 11, group 38 states the elevation of any entity; all of them lay in height 0."""
+    points = [f"0\nPOINT\n8\nC\n38\n{80 + k}\n10\n{k}\n20\n{k * k}" for k in range(3)]
+    line = (
+        "0\nLINE\n8\nC\n38\n88\n10\n0\n20\n0\n11\n10\n21\n5\n0\nLINE\n8\nC\n10\n0\n20\n0\n30\n7\n11\n10\n21\n5\n31\n9"
+    )
+    vertices = "".join(f"\n0\nVERTEX\n8\nC\n10\n{x}\n20\n6" for x in (0, 5))
+    chain = f"0\nPOLYLINE\n8\nC\n66\n1\n38\n77.5\n70\n0{vertices}\n0\nSEQEND"
+    head = f"9\n$ACADVER\n1\n{version}\n" if version else ""
+    entities = "\n".join([*points, line, chain])
+    (tmp_path / "o.dxf").write_text(
+        f"0\nSECTION\n2\nHEADER\n{head}0\nENDSEC\n0\nSECTION\n2\nENTITIES\n{entities}\n0\nENDSEC\n0\nEOF\n"
+    )
+    assert heights(tmp_path / "o.dxf") == [[80], [81], [82], [88, 88], [7, 9], [77.5, 77.5]]

@@ -115,7 +115,7 @@ def read_drawing(path: Path) -> DrawingFile:
     notes: list[str] = []
     try:
         try:
-            document = ezdxf.readfile(path)
+            document = _repaired(path, None, notes) if _has_old_elevations(path) else ezdxf.readfile(path)
         except (ezdxf.DXFError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
             document = _repaired(path, error, notes)
         entities = list(document.modelspace())
@@ -173,12 +173,28 @@ _SUBCLASSES = {"LWPOLYLINE": "AcDbPolyline", "SPLINE": "AcDbSpline", "ELLIPSE": 
                "MESH": "AcDbSubDMesh", "HATCH": "AcDbHatch", "HELIX": "AcDbSpline"}  # fmt: skip
 
 
-def _repaired(path: Path, error: Exception, notes: list[str]) -> Any:
-    """The drawing without entities that cannot be read, and with the marks of subclasses that programs leave out."""
+#: Versions of drawings in which group 38 may state the elevation of any entity (before release 11; 12 keeps some).
+_OLD = (b"AC1.", b"AC2.", b"AC1001", b"AC1002", b"AC1003", b"AC1004", b"AC1006", b"AC1009")
+
+
+def _has_old_elevations(path: Path) -> bool:
+    """Whether a drawing is of an old version, or states none, and has groups 38."""
+    with path.open("rb") as file:
+        head = file.read(10_000)
+    version = re.search(rb"\$ACADVER\s+1\s+(\S+)", head)
+    old = version is None or version[1].startswith(_OLD)
+    if not old or head.startswith(b"AutoCAD Binary DXF"):
+        return False
+    return re.search(rb"[\r\n] *38\r?\n", path.read_bytes()) is not None
+
+
+def _repaired(path: Path, error: Exception | None, notes: list[str]) -> Any:
+    """The drawing without entities that cannot be read, with the marks of subclasses that programs leave out, and with
+    elevations of old entities as Z; without an error the text is that of a drawing that can be read."""
     import ezdxf.recover  # noqa: PLC0415
 
     raw = path.read_bytes()
-    if raw.startswith(b"AutoCAD Binary DXF") or b"SECTION" not in raw[:100_000]:
+    if error is not None and (raw.startswith(b"AutoCAD Binary DXF") or b"SECTION" not in raw[:100_000]):
         raise error
     lines = raw.decode("utf-8", errors="surrogateescape").replace("\r\n", "\n").replace("\r", "\n").split("\n")
     out: list[str] = []
@@ -194,6 +210,12 @@ def _repaired(path: Path, error: Exception, notes: list[str]) -> Any:
                 lost += 1
                 continue
             codes = [code.strip() for code in tags[::2]]
+            if kind in _POINTS_ONCE and "38" in codes and "30" not in codes:
+                own = tags[2 * codes.index("38") + 1]
+                if "10" not in codes:  # polylines whose vertices alone have places
+                    tags, codes = [*tags, "10", "0", "20", "0"], [*codes, "10", "20"]
+                tags += [line for code in codes if re.fullmatch("1[0-3]", code) for line in (f"3{code[1]}", own)]
+                codes = [code.strip() for code in tags[::2]]
             if kind in _POINTS_ONCE:
                 # X, Y and Z of a point follow each other.
                 key = [(int(c) % 10, int(c)) if c.isdigit() and 10 <= int(c) <= 39 else (-1, 0) for c in codes]
