@@ -192,3 +192,24 @@ def test_a_missing_grid_is_told_with_the_file(tmp_path: Path) -> None:
     (tmp_path / "gcp_list.txt").write_text("EPSG:27700\n400000 300000 50 5 6 a.jpg p\n")
     with pytest.raises(InputError, match=r"gcp_list\.txt: no exact transformation"):
         read_gcp_list(tmp_path / "gcp_list.txt", "EPSG:32630")
+
+
+def test_objects_whose_heights_are_declared_otherwise(tmp_path: Path) -> None:
+    """What [[objects]] declared was passed over if the file states a height system."""
+    square = shapely.from_wkt("POLYGON Z ((0 0 9, 1 0 9, 1 1 9, 0 0 9))")
+    square = shapely.transform(square, lambda XYZ: np.add(XYZ, (500050, 5199950, 0)), include_z=True)
+    pyogrio.raw.write(tmp_path / "o.gpkg", shapely.to_wkb([square]), [np.array(["a"], object)], ["name"],
+                      driver="GPKG", layer="o", geometry_type="Polygon Z", crs="EPSG:32632+5703")  # fmt: skip
+    write_image(tmp_path / "d.tif", np.full((1, 20, 20), 5, np.float32), crs="EPSG:32632", transform=PLACE)
+    text = (
+        'format = 1\ncrs = "EPSG:32632"\n[terrain]\nfile = "d.tif"\nheight_system = "EPSG:5703"\n[orientation]\n'
+        'height_system = "EPSG:5703"\n[[objects]]\nfile = "o.gpkg"\nheight_system = "{}"\n[cameras.c]\n'
+        'type = "frame"\nsize = [9, 9]\nfocal_px = 9.0\n[[images]]\nname = "i"\nfile = "i.tif"\ncamera = "c"\n'
+    )
+    project = tmp_path / "project.toml"
+    for declared in ("EPSG:5703", "EPSG:8228", "same"):
+        project.write_text(text.format(declared))
+        ground_of(load_project(project))
+    project.write_text(text.format("EPSG:5773"))
+    with pytest.raises(InputError, match=r"o\.gpkg: states heights NAVD88 .*\[\[objects\]\] states EGM96"):
+        ground_of(load_project(project))
