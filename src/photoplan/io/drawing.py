@@ -211,10 +211,10 @@ def _repaired(path: Path, error: Exception | None, notes: list[str]) -> Any:
                 continue
             codes = [code.strip() for code in tags[::2]]
             if kind in _POINTS_ONCE and "38" in codes and "30" not in codes:
-                own = tags[2 * codes.index("38") + 1]
+                height = tags[2 * codes.index("38") + 1]
                 if "10" not in codes:  # polylines whose vertices alone have places
                     tags, codes = [*tags, "10", "0", "20", "0"], [*codes, "10", "20"]
-                tags += [line for code in codes if re.fullmatch("1[0-3]", code) for line in (f"3{code[1]}", own)]
+                tags += [line for code in codes if re.fullmatch("1[0-3]", code) for line in (f"3{code[1]}", height)]
                 codes = [code.strip() for code in tags[::2]]
             if kind in _POINTS_ONCE:
                 # X, Y and Z of a point follow each other.
