@@ -18,6 +18,10 @@ A message says what was given, what is allowed, which file, point or image, and 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 
 class PhotoplanError(Exception):
     """Base of every error that photoplan raises on purpose; `exit_code` is what the command line returns."""
@@ -51,6 +55,17 @@ class GeometryError(InputError):
 
 class DatumDefect(GeometryError):
     """The observations of a block do not determine where it lies, how it is turned, or its scale."""
+
+
+@contextmanager
+def named_by(path: Path) -> Iterator[None]:
+    """Put a file's name before the message of an error that is raised inside."""
+    try:
+        yield
+    except InputError as error:
+        if str(path) in str(error):
+            raise
+        raise type(error)(f"{path}: {error}") from None
 
 
 class TilesFailed(PhotoplanError):

@@ -88,3 +88,26 @@ def test_what_is_no_kind_is_refused(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
         assert inside("info", tmp_path / name).code == 3
     assert "TOML of no kind that is known, with the entries x" in inside("info", tmp_path / "a.toml").err
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("a.las", b"LASF" + b"\0" * 300, "a.las: "),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 99999999999\nend_header\n", "vert"),
+        ("a.geojson", b'{"type": "FeatureCollection", "features": [', "GeoJSON"),
+        ("a.city.jsonl", b'{"type": "CityJSON", "version": "1.1", "transform": 5}\n', "transform"),
+        ("a.city.json", b'{"type": "CityJSON", "version": "1.1", "transform": 5, "vertices": []}', "transform"),
+    ],
+)
+def test_a_damaged_file_is_refused_by_the_reader_of_its_kind(
+    tmp_path: Path, name: str, content: bytes, says: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    said = inside("info", tmp_path / name)
+    assert said.code == 3 and says in said.err and "not a raster" not in said.err and "no kind" not in said.err
+
+
+def test_a_folder_of_nothing(tmp_path: Path) -> None:
+    said = inside("info", tmp_path)
+    assert said.code == 3 and "a folder without photographs (JPEG, TIFF) or a COLMAP model" in said.err

@@ -71,21 +71,23 @@ RUNS = {
     "ortho": ["ortho", "--resolution", 2, "--tile", 128, "--hidden", "mark"],
     "mosaic": ["mosaic", "--resolution", 2, "--tile", 128, "--sources", "--sheets", 100],
     "balance": ["balance"],
+    "convert": ["convert", "--to", "colmap", "-o", "points.colmap"],
     "tie": ["tie", "--features", 600, "--per-image", 60],
     "surface": ["surface", *SURFACE, "--points", "points.las", "--report", "report.html"],
 }
 
 
 @pytest.mark.parametrize(
-    "name", [each if each == "mosaic" else pytest.param(each, marks=pytest.mark.slow) for each in RUNS]
+    "name", [each if each in ("mosaic", "convert") else pytest.param(each, marks=pytest.mark.slow) for each in RUNS]
 )
 def test_fault_03_killed_at_every_name_the_same_command_completes(name: str, tmp_path: Path) -> None:
     """Also after the last product and before its pictures: whatever has its name does not stand in the way."""
     verb, *words = RUNS[name]
+    workers = [] if verb == "convert" else ["--workers", 1]
 
     def run(folder: Path, mishap: Mishap = QUIET) -> Ran:
         placed = [folder / word if str(word).startswith(("points.", "report.")) else word for word in words]
-        return forked([verb, folder / "project.toml", *placed, "--workers", 1], tmp_path / "said", mishap)
+        return forked([verb, folder / "project.toml", *placed, *workers], tmp_path / "said", mishap)
 
     if name in ("tie", "surface"):
         (tmp_path / "in").mkdir()
@@ -116,6 +118,13 @@ def test_fault_03_killed_at_every_name_the_same_command_completes(name: str, tmp
         different = [each for each in wanted if made[each] != wanted[each] and not each.endswith(".run.json")]
         assert not different, (count, different)
         shutil.rmtree(folder)
+
+
+def test_a_folder_that_is_not_there_is_named_and_no_working_file(tmp_path: Path) -> None:
+    block = write_block(tmp_path / "block")
+    for words in (("shade", "-o", "s.tif"), ("contours", "--interval", 2, "-o", "c.gpkg")):
+        said = inside("dtm", words[0], block.terrain, *words[1:-1], tmp_path / "missing" / str(words[-1]))
+        assert said.code == 2 and f"{tmp_path / 'missing'}: no such folder; make it first" in said.err
 
 
 def test_records_say_nothing_of_the_disk(tmp_path: Path) -> None:

@@ -115,6 +115,9 @@ def test_refusals_and_kinds() -> None:
         geocentric_poses("EPSG:27572", [[6e5, 2.4e6, 0.0]])
     with pytest.raises(InputError, match="no place in"):
         map_poses("EPSG:32632", [[0.0, 0.0, np.nan]])
-    assert is_local_crs('LOCAL_CS["Local Coordinates (m)"]') and not is_local_crs("EPSG:32632")
+    local = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]'
+    assert is_local_crs(local, "x") and not is_local_crs("EPSG:32632", "x")
+    with pytest.raises(InputError, match=r"x: .* local system in foot"):
+        is_local_crs(local.replace('"metre",1', '"foot",0.3048'), "x")
     assert is_wgs84_geographic("EPSG:4326", "x") and is_wgs84_geographic("EPSG:4258", "x")
     assert not is_wgs84_geographic("EPSG:4314", "x") and not is_wgs84_geographic("EPSG:32632", "x")

@@ -157,3 +157,51 @@ def test_a_unit_that_leads_out_of_the_area_is_refused_and_can_be_declared(tmp_pa
         read_measured([path], ReadOptions(crs="EPSG:32632"))
     measured = read_measured([path], ReadOptions(crs="EPSG:32632", unit="m"))
     assert measured.points[0].xyz.tolist() == [[500_000, 5_400_000, 300]]
+
+
+def test_heights_in_attributes_of_blocks_and_in_texts(tmp_path: Path) -> None:
+    """Spot heights of surveyors: the block or the text lies in height 0, and the number beside it is the height."""
+    drawing = ezdxf.new("R2010")
+    space = drawing.modelspace()
+    drawing.blocks.new("SPOT").add_circle((0, 0), 0.2)
+    for k in range(4):
+        reference = space.add_blockref("SPOT", (k, k * k, 0))
+        reference.add_attrib("ELEV", f"{200 + k / 2}", (k, k))
+        reference.add_attrib("NO", f"P{k}", (k, k))
+        space.add_text(f" {300 + k} ").set_placement((10 + k, k * k))
+    space.add_text("road").set_placement((5, 5))
+    space.add_line((0, 9, 201), (9, 9, 202))
+    drawing.saveas(tmp_path / "s.dxf")
+    measured = read_measured([tmp_path / "s.dxf"], ReadOptions(crs="EPSG:32632", beyond_area=True))
+    assert any("blocks have attributes: ELEV, NO; `height_field` takes" in note for note in measured.notes)
+    for name, heights, x in (("ELEV", [200, 200.5, 201, 201.5], 0.0), ("Text", [300, 301, 302, 303], 10.0)):
+        options = ReadOptions(crs="EPSG:32632", beyond_area=True, height_field=name.lower())
+        found = read_measured([tmp_path / "s.dxf"], options)
+        points = np.concatenate([group.xyz for group in found.points])
+        mine = points[(points[:, 0] >= x) & (points[:, 0] < x + 4)]
+        assert sorted(mine[:, 2]) == heights and found.lines[0].xyz[:, 2].tolist() == [201, 202]
+    with pytest.raises(InputError, match="'P0' in NO is not a number"):
+        read_measured([tmp_path / "s.dxf"], ReadOptions(crs="EPSG:32632", beyond_area=True, height_field="NO"))
+    alone = ezdxf.new("R2010")
+    for k in range(3):
+        alone.modelspace().add_text(f"{300 + k}").set_placement((k, k * k))
+    alone.saveas(tmp_path / "t.dxf")
+    with pytest.raises(InputError, match="3 of its texts are numbers; `height_field` Text takes them for heights"):
+        read_measured([tmp_path / "t.dxf"], ReadOptions(crs="EPSG:32632", beyond_area=True))
+
+
+@pytest.mark.parametrize("version", ["AC1004", "AC2.10", "AC1009", ""])
+def test_elevations_of_the_oldest_drawings(tmp_path: Path, version: str) -> None:
+    """Before release 11, group 38 states the elevation of any entity; all of them lay in height 0."""
+    points = [f"0\nPOINT\n8\nC\n38\n{80 + k}\n10\n{k}\n20\n{k * k}" for k in range(3)]
+    line = (
+        "0\nLINE\n8\nC\n38\n88\n10\n0\n20\n0\n11\n10\n21\n5\n0\nLINE\n8\nC\n10\n0\n20\n0\n30\n7\n11\n10\n21\n5\n31\n9"
+    )
+    vertices = "".join(f"\n0\nVERTEX\n8\nC\n10\n{x}\n20\n6" for x in (0, 5))
+    chain = f"0\nPOLYLINE\n8\nC\n66\n1\n38\n77.5\n70\n0{vertices}\n0\nSEQEND"
+    head = f"9\n$ACADVER\n1\n{version}\n" if version else ""
+    entities = "\n".join([*points, line, chain])
+    (tmp_path / "o.dxf").write_text(
+        f"0\nSECTION\n2\nHEADER\n{head}0\nENDSEC\n0\nSECTION\n2\nENTITIES\n{entities}\n0\nENDSEC\n0\nEOF\n"
+    )
+    assert heights(tmp_path / "o.dxf") == [[80], [81], [82], [88, 88], [7, 9], [77.5, 77.5]]

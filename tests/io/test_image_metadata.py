@@ -12,97 +12,25 @@ import numpy as np
 import pytest
 from pyproj import Proj, Transformer
 from scipy.spatial.transform import Rotation
+from tools.image_headers import (
+    ASCII,
+    MAIN,
+    OWN,
+    RATIONAL,
+    exif,
+    folder,
+    gps,
+    jpeg,
+    xmp,
+)
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import topocentric_poses
 from photoplan.geometry.earth_poses import enu_poses
 from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.observed_positions import read_observed_positions
-from photoplan.io.orientation.exif import rotation_from_gimbal
+from photoplan.io.orientation.exif import read_folder, rotation_from_gimbal
 from photoplan.io.orientation.file import read_orientation, read_orientation_block
-
-Entries = dict[int, tuple[int, Any]]
-ASCII, SHORT, LONG, RATIONAL, BYTE = 2, 3, 4, 5, 1
-
-
-def directory(entries: Entries, at: int, order: str) -> bytes:
-    """A directory that lies at `at`, with its values behind it."""
-    body, tail = b"", b""
-    values = at + 2 + 12 * len(entries) + 4
-    for tag, (kind, value) in sorted(entries.items()):
-        if kind == ASCII:
-            raw, count = value.encode() + b"\0", len(value) + 1
-        elif kind == RATIONAL:
-            raw, count = b"".join(struct.pack(order + "II", *pair) for pair in value), len(value)
-        elif kind == BYTE:
-            raw, count = bytes(value), len(value)
-        else:
-            raw, count = struct.pack(order + {SHORT: "H", LONG: "I"}[kind], value), 1
-        if len(raw) > 4:
-            body += struct.pack(order + "HHII", tag, kind, count, values + len(tail))
-            tail += raw
-        else:
-            body += struct.pack(order + "HHI", tag, kind, count) + raw.ljust(4, b"\0")
-    return struct.pack(order + "H", len(entries)) + body + b"\0" * 4 + tail
-
-
-def exif(main: Entries, own: Entries, gps: Entries, order: str = "<") -> bytes:
-    main = main | {34665: (LONG, 0), 34853: (LONG, 0)}
-    first = directory(main, 8, order)
-    second = directory(own, 8 + len(first), order)
-    main |= {34665: (LONG, 8 + len(first)), 34853: (LONG, 8 + len(first) + len(second))}
-    third = directory(gps, 8 + len(first) + len(second), order)
-    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
-    return head + directory(main, 8, order) + second + third
-
-
-def degrees(value: float) -> tuple[int, list[tuple[int, int]]]:
-    """Degrees, minutes and seconds to 1e-7 seconds."""
-    d, rest = divmod(abs(value), 1)
-    m, s = divmod(rest * 60, 1)
-    return RATIONAL, [(int(d), 1), (int(m), 1), (round(s * 60 * 10_000_000), 10_000_000)]
-
-
-def gps(lat: float, lon: float, h: float) -> Entries:
-    return {
-        1: (ASCII, "N" if lat >= 0 else "S"),
-        2: degrees(lat),
-        3: (ASCII, "E" if lon >= 0 else "W"),
-        4: degrees(lon),
-        5: (BYTE, [int(h < 0)]),
-        6: (RATIONAL, [(round(abs(h) * 1000), 1000)]),
-    }
-
-
-MAIN: Entries = {271: (ASCII, "DJI"), 272: (ASCII, "FC6310"), 274: (SHORT, 3)}
-OWN: Entries = {
-    36867: (ASCII, "2018:09:11 14:05:09"),
-    37521: (ASCII, "25"),
-    37386: (RATIONAL, [(8800, 1000)]),
-    41989: (SHORT, 24),
-    40962: (LONG, 5472),
-    40963: (LONG, 3648),
-}
-
-
-def xmp(**values: Any) -> bytes:
-    attributes = " ".join(f'drone-dji:{k}="{v}"' for k, v in values.items())
-    return (
-        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
-        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="DJI Meta Data" '
-        f'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" {attributes}></rdf:Description></rdf:RDF></x:xmpmeta>'
-        '   <?xpacket end="w"?>\0\0'
-    ).encode()
-
-
-def jpeg(path: Path, tiff: bytes | None = None, packet: bytes | None = None) -> Path:
-    out = b"\xff\xd8\xff\xe0\x00\x10JFIF\0\x01\x01\0\0\x01\0\x01\0\0"
-    segments = [] if tiff is None else [b"Exif\0\0" + tiff]
-    segments += [] if packet is None else [b"http://ns.adobe.com/xap/1.0/\0" + packet]
-    for segment in segments:
-        out += b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment
-    path.write_bytes(out + b"\xff\xda\x00\x02pixels\xff\xd9")
-    return path
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -256,23 +184,6 @@ def test_gimbal_axes_by_hand() -> None:
             np.testing.assert_allclose(R @ camera, [e, n, -d], atol=1e-14)
 
 
-def folder(tmp_path: Path, images: int = 3) -> Path:
-    out = tmp_path / "images"
-    out.mkdir()
-    for k in range(images):
-        place = (46.84 + 1e-3 * k, -91.99 - 2e-3 * k, 200.0 + k)
-        packet = xmp(
-            GimbalYawDegree=40 + k,
-            GimbalPitchDegree=-85,
-            GimbalRollDegree=1,
-            RtkStdLon=0.01,
-            RtkStdLat=0.02,
-            RtkStdHgt=0.03,
-        )
-        jpeg(out / f"DJI_{k}.JPG", exif(MAIN, OWN, gps(*place)), packet)
-    return out
-
-
 def test_a_folder_as_orientation(tmp_path: Path) -> None:
     images = folder(tmp_path)
     jpeg(images / "no_gps.jpg")
@@ -317,6 +228,15 @@ def test_without_attitudes_there_is_no_orientation(tmp_path: Path) -> None:
     jpeg(tmp_path / "b.jpg", exif(MAIN, OWN, datum))
     with pytest.raises(InputError, match="datum TOKYO"):
         read_orientation(tmp_path, format="exif")
+
+
+def test_an_image_of_another_datum_is_left_out_of_a_folder(tmp_path: Path) -> None:
+    """One image in Tokyo's datum had refused the whole folder."""
+    for name, datum in (("a", "WGS-84"), ("b", "TOKYO"), ("c", "WGS 84")):
+        jpeg(tmp_path / f"{name}.jpg", exif(MAIN, OWN, gps(46, -91, 100) | {18: (ASCII, datum)}))
+    placed = read_folder(tmp_path)
+    assert [m.file.name for m in placed.placed] == ["a.jpg", "c.jpg"]
+    assert "1 of 3 images refer to another datum than WGS 84 and are left out: b.jpg: datum TOKYO" in placed.notes[0]
 
 
 def test_the_brighton_blocks_gimbal_angles_agree_with_its_adjusted_ones(shared: Path) -> None:

@@ -64,6 +64,14 @@ def test_cityjson_gives_the_finest_faces_of_what_stands(tmp_path: Path) -> None:
     # Five faces of 5 m × 5 m: the ground surface is the terrain's.
     assert area(found.corners[found.owner == 0]) == pytest.approx(5 * 25)
     assert found.corners[..., 2].max() == 8.0 and found.corners[..., :2].min(axis=(0, 1)).tolist() == [1000, 2000]
+    for text in (
+        "https://www.opengis.net/def/crs-compound?1=http://www.opengis.net/def/crs/EPSG/0/28992"
+        "&2=http://www.opengis.net/def/crs/EPSG/0/5709",
+        "urn:ogc:def:crs,crs:EPSG::28992,crs:EPSG::5709",
+        "http://www.opengis.net/def/crs/EPSG/10.0/7415",
+    ):
+        same = read_objects(written(tmp_path, city(metadata={"referenceSystem": text})))
+        assert (same.crs, same.height_system) == ("EPSG:28992", "EPSG:5709"), text
     road = read_objects(written(tmp_path, city()), "Road")
     assert road.names == ("road",) and area(road.corners) == pytest.approx(12.5)
     old = city(version="1.0", metadata={"referenceSystem": "urn:ogc:def:crs:EPSG::2056"})

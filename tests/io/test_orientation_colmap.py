@@ -183,7 +183,11 @@ def test_losses() -> None:
     [
         (CAMERAS.replace("SIMPLE_PINHOLE", "MINE"), IMAGES, r"cameras\.txt:4: camera model 'MINE' is not supported"),
         (CAMERAS.replace("SIMPLE_PINHOLE", "18"), IMAGES, r"cameras\.txt:4: camera model '18' is not supported"),
-        (CAMERAS.replace("SIMPLE_RADIAL", "12"), IMAGES, r"model SIMPLE_DIVISION with k = -0.0218531 has no form here"),
+        (
+            CAMERAS.replace("PINHOLE 3072 2304 2559.81 1536 1152", "DIVISION 3072 2304 2559.81 1536 1152 -0.02", 1),
+            IMAGES,
+            r"model SIMPLE_DIVISION with k = -0.02 has no form here",
+        ),
         (CAMERAS.replace("SIMPLE_PINHOLE 3072 2304 2559.81 1536", "17 8 4 8"), IMAGES, r".*4 numbers|EQUIRECTANGULAR"),
         (CAMERAS.replace("2559.81 ", ""), IMAGES, r"cameras\.txt:4: .*5 numbers"),
         (CAMERAS.replace("2559.81", "-1"), IMAGES, r"cameras\.txt:4: .*greater than 0"),
@@ -194,7 +198,7 @@ def test_losses() -> None:
         (
             CAMERAS,
             IMAGES.replace("\n2362.39 248.498 58396 1784.7 268.254 59027 1784.7 268.254 -1", ""),
-            r"images\.txt:7: 6 col",
+            r"images\.txt:6: .* after image",
         ),
         (CAMERAS, "", "holds no image"),
     ],
@@ -202,6 +206,33 @@ def test_losses() -> None:
 def test_fault_18_broken_models(tmp_path: Path, cameras: str, images: str, says: str) -> None:
     with pytest.raises(InputError, match=says):
         read_orientation_block(model(tmp_path, cameras, images), format="colmap")
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a 1.jpg", "folder/my a 1.jpg", "7"])
+def test_images_without_lines_of_points_are_not_lost(tmp_path: Path, name: str) -> None:
+    """Every second image was taken for the points of the one before."""
+    one = "1 1 0 0 0 0 0 0 1 "
+    model(tmp_path, "1 PINHOLE 200 150 200 200 100 75\n", f"{one}x.jpg\n{'2' + one[1:]}{name}\n{'3' + one[1:]}y.jpg\n")
+    with pytest.raises(InputError, match=r"images\.txt:2: .* after image 'x.jpg'; an empty line, or X, Y, POINT3D_ID"):
+        read_orientation_block(tmp_path)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_a_camera_that_has_no_form_costs_its_images(tmp_path: Path, binary: bool) -> None:
+    """One camera, even one that no image used, had refused the whole model."""
+    pinhole, fov = (200, 150, 200.0, 200.0, 100.0, 75.0), (200, 150, 200.0, 200.0, 100.0, 75.0, 0.9)
+    for used, left in ((1, ["a.jpg", "b.jpg"]), (2, ["a.jpg"])):
+        if binary:
+            cameras = [(1, NUMBERS["PINHOLE"], pinhole[2:]), (2, NUMBERS["FOV"], fov[2:])]
+            still = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+            model_bin(tmp_path, cameras, [(1, *still, 1, "a.jpg"), (2, *still, used, "b.jpg")])
+        else:
+            rows = [f"{k} {name} {' '.join(map(str, v))}" for k, name, v in ((1, "PINHOLE", pinhole), (2, "FOV", fov))]
+            model(tmp_path, "\n".join(rows), f"1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 0 0 0 {used} b.jpg\n\n")
+        block = read_orientation_block(tmp_path)
+        assert [image.name for image in block.table.images] == left
+        told = [note for note in block.table.notes if "camera model FOV" in note]
+        assert len(told) == (used == 2) and all("warning: 1 image is left out" in note for note in told)
 
 
 def test_an_incomplete_model_is_refused(tmp_path: Path) -> None:

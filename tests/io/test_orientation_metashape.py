@@ -363,3 +363,20 @@ def test_outsiders_labels_are_read(shared: Path) -> None:
     blocks = [read_orientation_block(shared / f"cases/15_metashape_same_labels/{name}.xml") for name in "efg"]
     assert [len(block.table.images) for block in blocks] == [2, 2, 2]
     assert [len(block.cameras) for block in blocks] == [2, 1, 2]
+
+
+def test_a_sensor_without_a_form_costs_its_images(tmp_path: Path) -> None:
+    """A spherical camera beside the others had refused the whole file."""
+    text = document(WKT2)
+    start, stop = text.index('<sensor id="0"'), text.index("</sensor>") + len("</sensor>")
+    other = text[start:stop].replace('id="0"', 'id="7"', 1).replace('type="frame"', 'type="spherical"')
+    text = text[:stop] + other + text[stop:]
+    (tmp_path / "c.xml").write_text(text)
+    assert len(read_orientation_block(tmp_path / "c.xml").table.images) == 3
+    (tmp_path / "c.xml").write_text(text.replace('id="1" sensor_id="0"', 'id="1" sensor_id="7"'))
+    block = read_orientation_block(tmp_path / "c.xml")
+    assert [i.name for i in block.table.images] == ["IMG 0.JPG", "IMG 2.JPG"]
+    assert any("warning: 1 of 3 images are left out" in n and "'spherical'" in n for n in block.table.notes)
+    (tmp_path / "c.xml").write_text(text.replace('sensor_id="0"', 'sensor_id="7"'))
+    with pytest.raises(InputError, match="type 'spherical' is not supported"):
+        read_orientation_block(tmp_path / "c.xml")

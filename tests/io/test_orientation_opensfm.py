@@ -64,6 +64,9 @@ def test_several_reconstructions_and_the_origin_beside(tmp_path: Path) -> None:
     two[1]["reference_lla"] = {**LLA, "latitude": 47.0}
     with pytest.raises(InputError, match="2 different origins"):
         read_orientation(write(tmp_path, two))
+    nowhere = {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
+    with pytest.raises(InputError, match=r"latitude 0, longitude 0: .* not georeferenced"):
+        read_orientation(write(tmp_path, [reconstruction({"a": shot}) | {"reference_lla": nowhere}]))
     del two[0]["reference_lla"]
     with pytest.raises(InputError, match="not georeferenced"):
         read_orientation(write(tmp_path, two[:1]))
@@ -89,3 +92,16 @@ def test_broken_shots_are_named(tmp_path: Path, change: dict[str, Any], says: st
 def test_other_json_is_refused(tmp_path: Path, content: Any) -> None:
     with pytest.raises(InputError, match=r"reconstruction\.json"):
         read_orientation(write(tmp_path, content))
+
+
+def test_a_camera_without_a_form_costs_its_images(tmp_path: Path) -> None:
+    shot = {"rotation": [0.1, 0, 0], "translation": [0, 0, 0]}
+    one = {"projection_type": "perspective", "width": 600, "height": 400, "focal": 0.8, "k1": 0, "k2": 0}
+    cameras = {"c": one, "d": one | {"projection_type": "spherical"}}
+    for used, left in (("c", ["a", "b"]), ("d", ["a"])):
+        shots = {"a": shot | {"camera": "c"}, "b": shot | {"camera": used}}
+        table = read_orientation(write(tmp_path, [reconstruction(shots) | {"cameras": cameras}]))
+        assert [i.name for i in table.images] == left
+        assert any("left out" in note and "spherical" in note for note in table.notes) is (used == "d")
+    with pytest.raises(InputError, match="'spherical' is not supported"):
+        read_orientation(write(tmp_path, [reconstruction({"b": shot | {"camera": "d"}}) | {"cameras": cameras}]))

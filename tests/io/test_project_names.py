@@ -17,6 +17,7 @@ from photoplan.io.names import (
     resolve_input,
     safe_stem,
     same_images,
+    shortest_paths,
     unique_stems,
 )
 
@@ -179,3 +180,12 @@ def test_a_link_to_itself_is_an_input_that_leads_nowhere(tmp_path: Path) -> None
     (tmp_path / "loop.obj").symlink_to(tmp_path / "loop.obj")
     with pytest.raises(InputError, match="leads to no file"):
         resolve_input(tmp_path, "loop.obj")
+
+
+def test_names_that_no_folder_tells_apart_stay_short() -> None:
+    """They had become the path of somebody's disk."""
+    short = shortest_paths(["/home/me/i/1.tif", "/home/me/i/1.tiff", "/home/me/i/A.tif", "/home/me/i/a.tif",
+                            "/home/me/j/2.tif", "/home/me/k/2.tif"])  # fmt: skip
+    assert ["/".join(parts) for parts in short.values()] == ["1", "1", "A", "a", "j/2", "k/2"]
+    mixed = shortest_paths(["/home/me/i/1.tif", "/home/me/i/1.tiff", "/home/me/j/1.tif"])
+    assert ["/".join(parts) for parts in mixed.values()] == ["i/1", "i/1", "j/1"]

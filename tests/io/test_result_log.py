@@ -83,6 +83,26 @@ def test_a_planted_log_does_nothing(tmp_path: Path, value: Any, monkeypatch: pyt
     assert not (tmp_path / "made").exists()
 
 
+def test_the_work_of_another_user_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever prepares a log knows its key, but not the secret of the user who receives it."""
+    for user, finished in (("one", 0), ("two", 0), ("two", 1), ("one", 0)):
+        monkeypatch.setenv("PHOTOPLAN_CACHE_DIR", str(tmp_path / user))
+        with log(tmp_path) as kept:
+            assert len(kept.finished) == finished
+            kept.append(1, np.zeros(3))
+    assert {p.stat().st_size for p in tmp_path.glob("*/own")} == {32}
+    assert os.name != "posix" or {p.stat().st_mode & 0o77 for p in tmp_path.glob("*/own")} == {0}
+
+
+def test_without_a_cache_folder_work_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("PHOTOPLAN_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    for finished in (0, 1):
+        with log(tmp_path) as kept:
+            assert len(kept.finished) == finished
+            kept.append(1, None)
+
+
 def test_logs_of_versions_that_pickled_start_afresh(tmp_path: Path) -> None:
     with TileLog(tmp_path / "kept", "k") as old:
         old.append(1, pickle.dumps(Command()))

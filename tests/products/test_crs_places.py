@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import CRS
 from tools.command import inside
 from tools.landxml import write_landxml
 
@@ -15,11 +19,13 @@ from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.none import NoLens
-from photoplan.errors import InputError
+from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.bounds import area_fault, area_note, beyond_area, is_no_fix
 from photoplan.geometry.crs import crs_step, grid_rotation, is_left_handed, require_projected_metres
 from photoplan.geometry.pose import Pose
+from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_metadata import read_image_metadata
+from photoplan.io.observed_positions import read_observed_positions
 
 IMAGES = Path(__file__).parents[1] / "data/drone_positions"
 LEFT = ("EPSG:5513", "EPSG:2065", "+proj=utm +zone=32 +axis=wnu", "+proj=tmerc +lon_0=15 +axis=esu")
@@ -106,6 +112,68 @@ def test_a_neighbouring_zone_is_used_with_a_note(tmp_path: Path) -> None:
     assert "lies 2" in said.out + said.err and "EPSG:32633 fits there" in said.out + said.err
     quiet = inside("resect", control_project(tmp_path, "EPSG:32632"))
     assert quiet.code == 0 and "outside the area" not in quiet.out + quiet.err
+
+
+def test_heights_of_control_in_another_system_than_the_project(tmp_path: Path) -> None:
+    """They were used as they stood, metres or decametres off; now they are converted or refused."""
+    file = control_project(tmp_path, "EPSG:32632+5703")
+    for header in ("EPSG:32632+5703", "EPSG:4979"):
+        control_project(tmp_path, "EPSG:32632")
+        text = (tmp_path / "gcp_list.txt").read_text().split("\n", 1)[1]
+        (tmp_path / "gcp_list.txt").write_text(f"{header}\n{text}")
+        said = inside("resect", file)
+        assert said.code == 3 and "gcp_list.txt" in said.err
+    control = tmp_path / "c.csv"
+    rows = [line.split() for line in text.strip().split("\n")]
+    control.write_text("name,x,y,z\n" + "".join(f"{r[6]},{r[0]},{r[1]},{r[2]}\n" for r in rows))
+    for stated in ("EPSG:32632+5703", CRS("EPSG:32632").to_3d().to_wkt()):
+        control.with_suffix(".prj").write_text(stated)
+        with pytest.raises(HeightSystemError, match=r"c\.csv: the file states heights .*, the project EGM96 height"):
+            read_ground_points(control, crs="EPSG:32632", height_system="EPSG:5773")
+    for stated, wanted in (("EPSG:32632+5773", "EPSG:5773"), ("EPSG:32632+5773", None), ("EPSG:32632", "EPSG:5773"),
+                           ("EPSG:32632+8228", "EPSG:5703"), ("EPSG:32632+5773", "same")):  # fmt: skip
+        control.with_suffix(".prj").write_text(stated)
+        found = read_ground_points(control, crs="EPSG:32632", height_system=wanted)
+        metres = 0.3048 if "8228" in stated else 1.0
+        assert found.XYZ[:, 2] == pytest.approx([float(r[2]) * metres for r in rows])
+    control.write_text("name,x,y,z,omega,phi,kappa\na,500000,5200000,900,0,0,0\n")
+    control.with_suffix(".prj").write_text("EPSG:32632+5703")
+    with pytest.raises(HeightSystemError, match="the project EGM96"):
+        read_observed_positions(control, crs="EPSG:32632", height_system="EPSG:5773")
+
+
+GEOID = """
+import sys; from pathlib import Path; from pyproj import datadir
+from tools.geoid import write_geoid
+datadir.append_data_dir(sys.argv[1]); write_geoid(Path(sys.argv[1]), "EPSG:32632", (5e5, 5.2e6))
+from photoplan.io.ground_points import read_ground_points
+print(read_ground_points(Path(sys.argv[1]) / "c.csv", crs="EPSG:32632", height_system="EPSG:5773").XYZ[:, 2].tolist())
+"""
+
+
+def test_ellipsoidal_heights_of_control_are_converted(tmp_path: Path) -> None:
+    (tmp_path / "c.csv").write_text("name,x,y,z\na,500000,5200000,147\nb,500010,5200000,\n")
+    (tmp_path / "c.prj").write_text(CRS("EPSG:32632").to_3d().to_wkt())
+    words = [sys.executable, "-c", GEOID, str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+    assert done.stdout.strip() == "[100.0, nan]", done.stderr
+
+
+@pytest.mark.parametrize(
+    ("factors", "shift", "says"),
+    [((1, 1), (32e6, 0), "begin with 32, the number of the zone"), ((1e3, 1e3), (0, 0), "are they millimetres")],
+)
+def test_places_that_a_map_does_not_have_are_guessed_at(
+    tmp_path: Path, factors: tuple[float, float], shift: tuple[float, float], says: str
+) -> None:
+    file = control_project(tmp_path, "EPSG:32632")
+    first, *rows = (tmp_path / "gcp_list.txt").read_text().strip().split("\n")
+    moved = [f"{float(x) * factors[0] + shift[0]} {float(y) * factors[1] + shift[1]} {rest}"
+             for x, y, rest in (row.split(" ", 2) for row in rows)]  # fmt: skip
+    (tmp_path / "gcp_list.txt").write_text("\n".join([first, *moved]))
+    said = inside("resect", file)
+    assert said.code == 3 and says in said.err, said.err
 
 
 def test_images_without_a_fix(tmp_path: Path) -> None:

@@ -52,6 +52,7 @@ def test_sources_and_surfaces_in_every_form(terrain: Path, tmp_path: Path) -> No
             forms = (
                 PIXELS,
                 np.ma.masked_array(PIXELS),
+                xarray.DataArray(PIXELS, dims=("band", "y", "x")).chunk({"y": 16}),
                 last,
                 str(tmp_path / "i.tif"),
                 tmp_path / "i.tif",
@@ -67,12 +68,22 @@ def test_sources_and_surfaces_in_every_form(terrain: Path, tmp_path: Path) -> No
             assert np.array_equal(pp.rectify(PIXELS, CAMERA, GRID, surface).values, wanted.values), type(surface)
 
 
+def test_pixels_of_the_other_byte_order() -> None:
+    """Arrays of files of other machines ended in an error of the compiler."""
+    for kind in ("u2", "i2", "f4"):
+        one, other = (pp.rectify(PIXELS.astype(order + kind), CAMERA, GRID, 0.0) for order in "<>")
+        assert np.array_equal(one.values, other.values) and other.valid.all()
+
+
 def test_a_data_array_keeps_what_is_none() -> None:
     holes = PIXELS.astype(np.float32)
     holes[:, 10:20, 20:40] = -9999.0
     array = xarray.DataArray(holes, dims=("band", "y", "x"), attrs={"_FillValue": -9999.0})
     found = pp.rectify(array, CAMERA, GRID, 0.0)
     assert 0 < (~found.valid).sum() < found.valid.size and found.values[:, found.valid].min() > -100
+    for name, value in (("missing_value", -9999.0), ("nodatavals", (-9999.0,) * 3), ("nodata", -9999)):
+        again = pp.rectify(array.drop_attrs().assign_attrs({name: value}), CAMERA, GRID, 0.0)
+        assert np.array_equal(again.valid, found.valid), name
     with pytest.raises(UsageError, match=r"DataArray with dimensions \('a', 'b'\)"):
         pp.rectify(xarray.DataArray(np.zeros((3, 3)), dims=("a", "b")), CAMERA, GRID, 0.0)
 

@@ -20,15 +20,20 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from pyproj import Transformer
 from tools.dem_file import write_dem, write_geojson
 from tools.format_examples import block_of, frame
+from tools.image_headers import folder as headers
 from tools.landxml import write_landxml
+from tools.line_strip import Strip
 from tools.mutations import Reader, run
 from tools.rpc_files import as_digitalglobe, as_dimap, as_rpb, as_text, tagged
 from tools.rpc_images import functions
 from tools.small_block import write_block
 from tools.small_model import write_small
 
+from photoplan.codec import NotData, decode, encode
+from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.balance_file import read_balance_file
 from photoplan.io.camera.csm_frame import read_frame
@@ -52,6 +57,7 @@ from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tabl
 from photoplan.io.polygons import read_features, write_features
 from photoplan.io.project.file import load_project
 from photoplan.io.regions import read_regions
+from photoplan.io.result_log import ResultLog
 from photoplan.io.sensor_file import read_sensor
 from photoplan.io.series.file import read_series
 from photoplan.io.terrain.files import read_measured
@@ -256,6 +262,88 @@ def read_tile_log(path: Path) -> Any:
         return [log.read(k) for k in sorted(log.finished)]
 
 
+def strip(folder: Path) -> Path:
+    return Strip(lines=12, columns=40).strip_file(folder)
+
+
+def read_strip(path: Path) -> Any:
+    return read_line(path, "nadir").camera("EPSG:32633", "ellipsoidal")
+
+
+def dimap(folder: Path) -> Path:
+    """A camera of lines in a circular orbit, as Pléiades states it."""
+
+    def model(name: str, *values: float) -> str:
+        return f"<{name}><COEFFICIENTS>{' '.join(map(str, values))}</COEFFICIENTS></{name}>"
+
+    points = "".join(
+        f"<Point><UTC_TIME>2020-05-05T10:00:{20 + 10 * k:02}.000Z</UTC_TIME><LOCATION_VALUES>{6.9e6 * np.cos(a)} "
+        f"{6.9e6 * np.sin(a)} 1000</LOCATION_VALUES></Point>"
+        for k, a in enumerate(np.linspace(-0.01, 0.01, 4))
+    )
+    half = 0.5**0.5  # turned about y: the camera looks along -x, down
+    attitudes = model("Q0", half) + model("Q1", 0, 1e-5) + model("Q2", -half) + model("Q3", 0)
+    (folder / "DIM.XML").write_text(
+        "<D><Raster_Dimensions><NROWS>60</NROWS><NCOLS>40</NCOLS></Raster_Dimensions><Sensor_Model_Characteristics>"
+        "<UTC_Sensor_Model_Range><START>2020-05-05T10:00:35.000Z</START><END>2020-05-05T10:00:35.006Z</END>"
+        "</UTC_Sensor_Model_Range><SENSOR_LINE_PERIOD>0.1</SENSOR_LINE_PERIOD>"
+        f"<Sensor_Ephemeris><Point_List>{points}</Point_List></Sensor_Ephemeris><Sensor_Attitudes><OFFSET>36035</OFFSET>"
+        f"<SCALE>15</SCALE><Polynomial_Models>{attitudes}</Polynomial_Models></Sensor_Attitudes><Sensor_Viewing_Model>"
+        f"<Viewing_Directions>{model('PsiX_Model', 1e-3, 0)}{model('PsiY_Model', -2e-5, 1e-6)}</Viewing_Directions>"
+        "</Sensor_Viewing_Model></Sensor_Model_Characteristics></D>"
+    )
+    return folder / "DIM.XML"
+
+
+def shots_geojson(folder: Path) -> Path:
+    features = []
+    for k in range(3):
+        place = [-87.16 + 1e-4 * k, 14.09, 1155.0 + k]
+        at = Transformer.from_crs("EPSG:4326", "EPSG:32616", always_xy=True).transform(*place[:2])
+        properties = {"filename": f"DJI_{k}.JPG", "camera": "c", "focal": 0.57, "width": 2048, "height": 1536,
+                      "translation": [*at, place[2]], "rotation": [3.1, 0.01, 0.02], "capture_time": 1.5e9}  # fmt: skip
+        features.append(
+            {"type": "Feature", "properties": properties, "geometry": {"type": "Point", "coordinates": place}}
+        )
+    (folder / "odm_report").mkdir()
+    (folder / "odm_report/shots.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    camera = {"projection_type": "brown", "width": 2048, "height": 1536, "focal_x": 0.57, "focal_y": 0.57, "c_x": 0.0,
+              "c_y": 0.0, "k1": -0.02, "k2": 0.01, "p1": 0.0, "p2": 0.0, "k3": 0.0}  # fmt: skip
+    (folder / "cameras.json").write_text(json.dumps({"c": camera}))
+    return folder / "odm_report/shots.geojson"
+
+
+def steps(folder: Path) -> Path:
+    with ResultLog(folder / "a.steps", "key", None) as log:
+        for k in range(4):
+            log.append(k, {"name": "a", "window": Window(1, 2, 3, 4), "values": (np.arange(6.0), None, [1, "x", b"y"])})
+    return folder / "a.steps"
+
+
+def read_steps(path: Path) -> Any:
+    with ResultLog(path, "key", None) as log:
+        return [log[k] for k in sorted(log.finished)]
+
+
+def record(folder: Path) -> Path:
+    (folder / "r").write_bytes(
+        encode({"window": Window(1, 2, 3, 4), "rows": (np.eye(3), np.array(["a", None], object), {1.5, 2})})
+    )
+    return folder / "r"
+
+
+def read_record(path: Path) -> Any:
+    try:
+        return decode(path.read_bytes())
+    except NotData as error:
+        raise InputError(str(error)) from error
+
+
+def exif(folder: Path) -> Path:
+    """One image's headers alone, so that bits fall on them and not on pixels."""
+    return headers(folder, 1) / "DJI_0.JPG"
+
+
 GRID = MapGrid(left=0.0, top=100.0, resolution=1.0, width=100, height=100, crs=CRS)
 POINTS = "x,y,z,code\n" + "".join(f"{k}.5,{k * 2},{100 + k / 7:.3f},1\n" for k in range(40))
 CONTROL = "name,x,y,z,sigma_xy,sigma_z,role\n" + "".join(
@@ -265,6 +353,7 @@ GCPS = "EPSG:32632\n" + "".join(f"{500000 + k} 5400000 90.5 {k} 20.5 img{k}.jpg 
 POSITIONS = "name,x,y,z,omega,phi,kappa,sigma_xy,sigma_z,time\n" + "".join(
     f"i{k}.jpg,{500000 + k},5400000,900.5,1.5,2.5,30,0.02,0.03,{k}\n" for k in range(9)
 )
+BLUH = "4711 512345.678 5274112.875 2630.44 -1.3894 0.8331 98.3333\n4712 513000.125 5274100.5 2641.0 7.9 -13.8 -101.1\n"
 BALANCE = (
     'format = "photoplan balance 1"\nsize = [40, 30]\ndescription = "d"\n\n[[bands]]\ngrey = [0.0, 100.0, 255.0]\n'
     "becomes = [1.0, 110.0, 250.0]\ntrend = [[1, 0, 0.01]]\n"
@@ -293,6 +382,10 @@ READERS = [
     Reader("orientation prj", copied("brighton/ext.csv", "brighton/ext.prj"), read_orientation_block, mutated="ext.prj"),
     Reader("orientation toml", oriented("toml", "o.toml"), read_orientation_block),
     Reader("opensfm", oriented("opensfm", "reconstruction.json"), read_orientation_block, "json"),
+    Reader("opendronemap", shots_geojson, read_orientation_block, "json"),
+    Reader("opendronemap cameras", shots_geojson, read_orientation_block, "json", mutated="cameras.json"),
+    Reader("bluh", text("b.dat", BLUH), lambda p: read_orientation_block(p, TableFormat(angle_unit="gon"), "bluh")),
+    Reader("exif orientation", exif, lambda p: read_orientation_block(p, format="exif"), "binary"),
     Reader("patb", oriented("patb", "o.ori"), lambda p: read_orientation_block(p, TableFormat(direction="camera-to-ground", declared=frozenset({"direction"})), "patb")),
     Reader("bingo", oriented("bingo", "o.dat"), lambda p: read_orientation_block(p, format="bingo")),
     Reader("inpho", oriented("inpho", "o.prj"), lambda p: read_orientation_block(p, format="inpho")),
@@ -317,6 +410,9 @@ READERS = [
     Reader("rpc tags", image, read_rpc, "binary"),
     Reader("isd frame", copied("csm_frame/vesta_radtan.json"), read_frame, "json"),
     Reader("isd line", copied("csm_line/kaguya_tc.json"), read_line, "json"),
+    Reader("dimap line", dimap, read_line),
+    Reader("strip", strip, read_strip, mutated="strip.toml"),
+    Reader("strip table", strip, read_strip, mutated="flight.csv"),
     Reader("terrain raster", terrain, read_terrain, "binary"),
     Reader("terrain model", small_model, read_model, "database"),
     Reader("terrain model info", small_model, describe, "database"),
@@ -352,8 +448,12 @@ READERS = [
     Reader("sensor", text("s.toml", SENSOR), read_sensor),
     Reader("series", frames, read_series, mutated="series.toml"),
     Reader("image metadata", copied("brighton/images/DJI_0018.jpg"), read_image_metadata, "binary"),
+    Reader("exif", exif, read_image_metadata, "binary"),
     Reader("image info", image, describe, "binary"),
     Reader("tile log", tile_log, read_tile_log, "binary"),
+    Reader("kept results", steps, read_steps, "binary"),
+    Reader("codec", record, read_record, "json"),
+    Reader("codec bytes", record, read_record, "binary"),
     Reader("run record", run_record, describe, "json"),
 ]  # fmt: skip
 

@@ -76,6 +76,15 @@ def test_rings_that_touch_themselves_are_filled() -> None:
     assert corners[..., 2] == pytest.approx(7.0)
 
 
+def test_two_squares_of_one_ring_are_filled_where_a_line_leads_from_one_to_the_other() -> None:
+    """Mended, they are a polygon of two parts and a line, which none of them belongs to."""
+    ring = [(0, 0), (4, 0), (4, 4), (12, 4), (12, 0), (16, 0), (16, 4), (12, 4), (4, 4), (0, 4)]
+    ring = [*ring[:6], (16, -3), (16, 0), *ring[6:]]
+    corners, _ = triangles_of([[np.array([(x, y, 7.0) for x, y in ring])]], ["two"], "test")
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2
+    assert np.abs(areas).sum() == pytest.approx(32.0)
+
+
 def test_polygons_without_an_inside_give_nothing() -> None:
     line = np.array([(0.0, 0, 0), (5, 0, 0), (9, 0, 0)])
     corners, polygon = triangles_of([[line], [line[:2]]], ["line", "two"], "test")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,22 @@ FOCAL = 260.0
 """Camera constant, pixels; the corner lies 31 degrees off axis, where cos⁴ is 0.54."""
 X0, Y0, FLYING_HEIGHT = 500_000.0, 5_300_000.0, 260.0
 """A pixel covers one metre of level ground."""
+
+
+def _equalised(light: _Floats) -> _Floats:
+    return np.asarray(np.searchsorted(np.sort(light.ravel()), light) / light.size * 255)
+
+
+#: Characteristic curves: from light on the sensor, after the fall-off, to grey values.
+CURVES: dict[str, Callable[[_Floats], _Floats]] = {
+    "straight": lambda light: light,
+    "gamma 0.7": lambda light: 255 * (np.clip(light, 0, None) / 255) ** 0.7,
+    "gamma 1.3": lambda light: 255 * (np.clip(light, 0, None) / 255) ** 1.3,
+    "veil": lambda light: 40 + 0.62 * light,
+    "film": lambda light: 255 / (1 + np.exp(-(light - 115) / 42)),
+    "dark": lambda light: 0.8 * light + 3,
+    "equalised": _equalised,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +71,15 @@ class RadiometricBlock:
 
     def mosaic(self, images: list[_Floats]) -> tuple[_Floats, _Floats]:
         """Return a mosaic from the nearest image of each place, and the scene there."""
+        value, truth, _, _ = self._nearest(images)
+        # Means of squares of 12 metres: noise and interpolation count little.
+        rows, cols = (n // 6 * 6 for n in value.shape)
+        parts = [each[:rows, :cols].reshape(rows // 6, 6, -1, 6).mean(axis=(1, 3)) for each in (value, truth)]
+        seen = np.isfinite(parts[0])
+        return parts[0][seen], parts[1][seen]
+
+    def _nearest(self, images: list[_Floats]) -> tuple[_Floats, _Floats, _Floats, _Floats]:
+        """Mosaic, scene, and places from -1 to 1 east and north, at every second metre."""
         low = self.centres.min(axis=0) - (WIDTH / 2 - 4, HEIGHT / 2 - 4)
         high = self.centres.max(axis=0) + np.array([WIDTH / 2 - 4, HEIGHT / 2 - 4])
         col, row = np.meshgrid(np.arange(low[0], high[0], 2.0), np.arange(low[1], high[1], 2.0))
@@ -65,12 +91,8 @@ class RadiometricBlock:
             nearer = inside & (apart < best)
             best[nearer] = apart[nearer]
             value[nearer] = map_coordinates(image, [y[nearer], x[nearer]], order=1)
-        truth = map_coordinates(self.scene, [row, col], order=1)
-        # Means of squares of 12 metres: noise and interpolation count little.
-        rows, cols = (n // 6 * 6 for n in value.shape)
-        parts = [each[:rows, :cols].reshape(rows // 6, 6, -1, 6).mean(axis=(1, 3)) for each in (value, truth)]
-        seen = np.isfinite(parts[0])
-        return parts[0][seen], parts[1][seen]
+        east, south = ((each - (a + b) / 2) / ((b - a) / 2) for each, a, b in zip((col, row), low, high))
+        return value, map_coordinates(self.scene, [row, col], order=1), east, -south
 
     def error(self, images: list[_Floats]) -> float:
         """Return the rms error of the mosaic after the best straight line: a block's gain is unknowable."""
@@ -82,6 +104,22 @@ class RadiometricBlock:
         """Return the rms error of the mosaic after one factor."""
         value, truth = self.mosaic(images)
         return float(np.sqrt(np.mean((value * (value @ truth) / (value @ value) - truth) ** 2)))
+
+    def modes(self, images: list[_Floats]) -> _Floats:
+        """Return slopes and bends of the mosaic, parts of its brightness from its middle to its edge, (5,).
+
+        Slope east, slope north, bend east, twist, bend north, beside the best curve from the scene to the mosaic.
+        """
+        value, scene, X, Y = self._nearest(images)
+        seen = np.isfinite(value)
+        value, truth, X, Y = value[seen], (scene[seen] - 110) / 60, X[seen], Y[seen]
+        curve, shapes = np.stack([truth**k for k in range(6)], axis=1), np.stack([X, Y, X**2, X * Y, Y**2], axis=1)
+        base = value
+        for _ in range(3):
+            A = np.concatenate([curve, shapes * base[:, None]], axis=1)
+            found = np.linalg.lstsq(A, value, rcond=None)[0]
+            base = curve @ found[:6]
+        return np.asarray(found[6:])
 
     def overlaps(self, images: list[_Floats]) -> float:
         """Return the rms difference of images that show the same ground, of single pixels four metres apart."""
@@ -100,7 +138,7 @@ class RadiometricBlock:
 
 
 def _applied(path: Path, image: _Floats) -> _Floats:
-    """Apply a balance file as the documentation describes it: divide by the trend, look up in the table."""
+    """Apply a balance file as documented: look up the light, divide by the trend, look up in the table."""
     (band,) = tomllib.loads(path.read_text())["bands"]
     half = np.hypot(WIDTH, HEIGHT) / 2
     u, v = np.meshgrid((np.arange(WIDTH) - (WIDTH - 1) / 2) / half, (np.arange(HEIGHT) - (HEIGHT - 1) / 2) / half)
@@ -108,8 +146,12 @@ def _applied(path: Path, image: _Floats) -> _Floats:
     for i, j, c in band.get("trend", ()):
         term = u**i * v**j
         trend += c * (term - term.mean())
-    x = image / np.maximum(trend, 0.2)
-    grey, becomes = np.array(band["grey"]), np.array(band["becomes"])
+    light = _line(image, band["curve_grey"], band["curve_light"]) if "curve_grey" in band else image
+    return _line(light / np.maximum(trend, 0.2), band["grey"], band["becomes"])
+
+
+def _line(x: _Floats, of: list[float], to: list[float]) -> _Floats:
+    grey, becomes = np.array(of), np.array(to)
     k = np.clip(np.searchsorted(grey, x) - 1, 0, len(grey) - 2)
     slope = (becomes[k + 1] - becomes[k]) / (grey[k + 1] - grey[k])
     return np.asarray(becomes[k] + (x - grey[k]) * slope)
@@ -137,6 +179,8 @@ def simulate(
     shared_haze: float = 0.0,
     wander: float = 0.0,
     gammas: float = 0.0,
+    curves: Sequence[str] = (),
+    printed: bool = False,
     turned: bool = False,
     forward: float = 0.6,
     side: float = 0.4,
@@ -148,8 +192,9 @@ def simulate(
     `steps`: exposures differ by up to this part, evenly distributed; `wander`: standard deviation of a random walk of
     exposures from image to image; `fall_off`: power of the cosine; `haze`: brightness gradient of each image across its
     width, direction and size drawn by lot up to this; `shared_haze`: a gradient towards the east that all images have;
-    `gammas`: exponents of the images' characteristic curves differ by up to this; `turned`: strips in opposite
-    directions; `large_scale`: standard deviation of the scene's large forms.
+    `gammas`: exponents of the images' characteristic curves differ by up to this; `curves`: names of characteristic
+    curves, see `CURVES`, which the images take in turn; `printed`: these act before fall-off and haze;
+    `turned`: strips in opposite directions; `large_scale`: standard deviation of the scene's large forms.
     """
     rng = np.random.default_rng(seed)
     step = WIDTH * (1 - forward), HEIGHT * (1 - side)
@@ -166,11 +211,15 @@ def simulate(
     images = []
     for k, ((col, row), turn) in enumerate(zip(centres, headings)):
         light = map_coordinates(scene, [row + y * turn, col + x * turn], order=1, mode="nearest")
+        if curves and printed:
+            light = CURVES[curves[k % len(curves)]](light)
         angle, size = rng.uniform(0, 2 * np.pi), rng.uniform(0, haze)
         gradient = 1 + size * (x / WIDTH * np.cos(angle) + y / HEIGHT * np.sin(angle)) + shared_haze * x * turn / WIDTH
         value = light * cosine**fall_off * gradient * (1 + rng.uniform(-steps, steps)) * walk[k]
         if gammas:
             value = 255 * (np.clip(value, 0, None) / 255) ** (1 + rng.uniform(-gammas, gammas))
+        if curves and not printed:
+            value = CURVES[curves[k % len(curves)]](value)
         image = np.clip(np.rint(value + rng.normal(0, noise, value.shape)), 0, 255)
         images.append(image)
         profile = {"driver": "GTiff", "width": WIDTH, "height": HEIGHT, "count": 1, "dtype": "uint8"}

@@ -42,7 +42,11 @@ _SHOWN = 10
 @click.option("--tin-points", is_flag=True, help="Vertices of a LandXML triangulation as points, if it has no others.")
 @click.option("--nodata", type=float, help="Height that means none.")
 @click.option("--crs", help="CRS of files that state none.")
-@click.option("--height-field", metavar="NAME", help="Attribute of vector files that holds heights, as of contours.")
+@click.option(
+    "--height-field",
+    metavar="NAME",
+    help="Attribute of vector files that holds heights, as of contours; of drawings that of blocks, or Text.",
+)
 @click.option("--unit", help="Unit of drawings whose header states none or a wrong one [as $INSUNITS states].")
 @click.option("--height-system", help="Height system of files that state none: ellipsoidal or EPSG:nnnn.")
 @beyond_area_option

@@ -40,6 +40,7 @@ class ArrayReader:
         image = values[None] if values.ndim == 2 else values
         bad = np.asarray(np.ma.getmaskarray(image).any(axis=0), bool)
         plain = np.ma.getdata(image)
+        plain = plain.astype(plain.dtype.newbyteorder("="), copy=False)  # files of other machines
         if plain.dtype.kind == "f":
             bad |= ~np.isfinite(plain).all(axis=0)
         return cls(plain, ~bad if bad.any() else None)

@@ -11,11 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
-from pyproj.aoi import AreaOfInterest
-from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import ProjError
 
-from photoplan.geometry.crs import crs_label, nearest_turn, parse_crs, utm_codes
+from photoplan.geometry.crs import crs_label, fitting_utm, nearest_turn, parse_crs, utm_codes
 from photoplan.geometry.rotation import ANGLE_UNITS
 
 #: Map coordinates beyond this lie on no map of the earth, metres.
@@ -71,9 +69,10 @@ def beyond_area(crs: str, XY: ArrayLike) -> NDArray[np.float64]:
     wide = (east - west) % 360.0 or 360.0
     # From the middle of the area, whichever way round the earth is shorter.
     from_middle = np.abs(nearest_turn(lon, west + wide / 2, 360.0) - (west + wide / 2))
-    beside = (from_middle - wide / 2) * np.cos(np.radians(lat))
-    beyond = np.maximum.reduce([beside, south - lat, lat - north, np.zeros(len(XY))]) * _KM_PER_DEGREE
-    return np.asarray(np.where(np.isfinite(lon + lat), beyond, np.inf))
+    with np.errstate(invalid="ignore"):  # infinite where the CRS does not have the place
+        beside = (from_middle - wide / 2) * np.cos(np.radians(lat))
+        beyond = np.maximum.reduce([beside, south - lat, lat - north, np.zeros(len(XY))]) * _KM_PER_DEGREE
+        return np.asarray(np.where(np.isfinite(lon + lat), beyond, np.inf))
 
 
 def _geographic(crs: CRS, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -126,26 +125,23 @@ def _told(crs: str, XY: ArrayLike, names: Sequence[str], most: float, asks: str)
     area = parsed.area_of_use
     of = f"{crs_label(crs)} ({area.name[:60]})" if area is not None else crs_label(crs)
     lon, lat = (float(v[0]) for v in _geographic(parsed, XY[worst : worst + 1]))
+    readings = [("are X and Y exchanged? Exchanged they lie inside", XY[known][:, ::-1])]
+    zone = (parsed.utm_zone or "")[:-1]
+    if zone and (XY[known, 0] // 1e6 == int(zone)).all():
+        begins = f"does X begin with {zone}, the number of the zone? Without it they lie inside"
+        readings.append((begins, XY[known] % (1e6, np.inf)))
+    if np.abs(XY[known]).max() >= 1e7:
+        readings.append(("are they millimetres? In metres they lie inside", XY[known] / 1e3))
+    likely = next((text for text, meant in readings if not (beyond_area(crs, meant) > _NOTED).any()), None)
     if not np.isfinite(lon + lat):
-        return f"{what} has no place in {of}{asks}"
+        return f"{what} has no place in {of}{asks if likely is None else f'; {likely}'}"
     fits = f"; {fitting_utm(crs, lat, lon)} fits there"
-    if not (beyond_area(crs, XY[known][:, ::-1]) > _NOTED).any():
-        fits, asks = "; are X and Y exchanged? Exchanged they lie inside", ""
+    if likely is not None:
+        fits, asks = f"; {likely}", ""
     return (
         f"{what} lies {beyond.max():.0f} km outside the area of {of}, at latitude {lat:.4f}°, longitude {lon:.4f}°"
         f"{fits}{asks}"
     )
-
-
-def fitting_utm(crs: str, latitude: float, longitude: float) -> str:
-    """Code of the UTM zone at a place (degrees), on the datum of a CRS if that has zones there, else on WGS 84."""
-    geographic = parse_crs(crs).geodetic_crs
-    here = AreaOfInterest(longitude, latitude, longitude, latitude)
-    known = [] if geographic is None else query_utm_crs_info(datum_name=geographic.name, area_of_interest=here)
-    zone = utm_codes(latitude, longitude)[0]
-    same = [f"{found.auth_name}:{found.code}" for found in known if found.name.endswith(f"zone {int(zone[-2:])}"
-            f"{'N' if latitude >= 0 else 'S'}")]  # fmt: skip
-    return same[0] if same else zone
 
 
 def is_no_fix(latitude: float, longitude: float) -> bool:

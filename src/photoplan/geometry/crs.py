@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
@@ -52,12 +53,17 @@ def parse_crs(text: str, where: str = "CRS") -> CRS:
 _SCALES = 0.1, 10.0
 #: The inverse of a projection undoes it to this, metres (PROJ's LAEA on the earth: tenths of a millimetre).
 INVERTED = 1e-3
+#: Units of angles, radians: from milliarcseconds to full turns.
+_ANGLES = 1e-9, 7.0
 #: Radii of bodies that ellipsoids describe, from Phobos to Jupiter, metres; those of planets in kilometres are not.
 _RADII = 1e4, 1e8
 
 
 def _unusable(crs: CRS) -> str:
     """Why a projected CRS describes no map, though it is well formed: numbers may have any size in WKT; else empty."""
+    angles = [] if crs.geodetic_crs is None or crs.geodetic_crs.is_geocentric else crs.geodetic_crs.axis_info[:1]
+    if not all(_ANGLES[0] < axis.unit_conversion_factor < _ANGLES[1] for axis in angles):
+        return f"a unit of angles of {angles[0].unit_conversion_factor:g} rad"
     if not crs.is_projected:
         return ""
     radius = 6378137.0 if crs.ellipsoid is None else crs.ellipsoid.semi_major_metre
@@ -203,8 +209,8 @@ def require_projected_metres(text: str, where: str = "CRS") -> CRS:
     if crs.is_compound:
         horizontal, vertical = split_compound(text)
         raise InputError(
-            f"{where}: {crs.name!r} joins a horizontal and a vertical CRS; give crs = {crs_label(horizontal)!r} and "
-            f"state heights as height_system = {vertical!r}"
+            f"{where}: {crs.name!r} joins a horizontal and a vertical CRS; give crs = "
+            f"{crs_label(horizontal or '')!r} and state heights as height_system = {vertical!r}"
         )
     kind = "geographic" if crs.is_geographic else "geocentric" if crs.is_geocentric else "not projected"
     if not crs.is_projected:
@@ -240,13 +246,23 @@ def _east_north_of(crs: CRS) -> str:
     return f" ({twin or utm_codes((area.south + area.north) / 2, middle)[0]})"
 
 
-def split_compound(text: str) -> tuple[str, str | None]:
+def split_compound(text: str, where: str = "CRS") -> tuple[str | None, str | None]:
     """Horizontal CRS as a string, and the height system that the text states.
 
     The second is a vertical CRS's string for a compound CRS, ``"ellipsoidal"`` for a three-dimensional one (its own
-    string if its heights are not metres upwards), and None where nothing is said of heights.
+    string if its heights are not metres upwards), and None where nothing is said of heights. A local (engineering) CRS
+    in metres, or an undefined one of GeoPackage, names no place: both are None, as if nothing was stated.
+
+    Raises
+    ------
+    InputError
+        The text is not a CRS.
     """
-    crs = parse_crs(text)
+    crs = parse_crs(text, where)
+    if crs.name.casefold().startswith("undefined") or (
+        crs.type_name == "Engineering CRS" and all(axis.unit_conversion_factor == 1.0 for axis in crs.axis_info[:2])
+    ):
+        return None, None
     if crs.is_compound:
         parts = crs.sub_crs_list
         return canonical_crs(parts[0].to_wkt()), canonical_crs(parts[1].to_wkt())
@@ -264,14 +280,21 @@ def canonical_crs(text: str) -> str:
     code = crs.to_authority(min_confidence=100)
     if code is not None and code[0] == "EPSG" and CRS.from_authority(*code) == crs:
         return ":".join(code)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        proj = crs.to_proj4()
-    if proj and not crs.is_vertical:
-        proj = proj.removesuffix(" +type=crs")
-        if CRS.from_user_input(proj) == crs and len(proj) < 300:
+    if crs.is_projected or crs.is_geographic:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            proj = crs.to_proj4().removesuffix(" +type=crs")
+        # A PROJ string has no place for most datums, and PROJ calls a CRS without one equal to any with its ellipsoid.
+        found = CRS.from_user_input(proj) if proj and len(proj) < 300 else None
+        if found is not None and found == crs and _datum_name(found) == _datum_name(crs):
             return str(proj)
     return str(crs.to_wkt())
+
+
+def _datum_name(crs: CRS) -> str:
+    """Name of the datum, or of the ensemble of its realizations; `unknown` if only its ellipsoid is stated."""
+    name = "unknown" if crs.datum is None else crs.datum.name.removesuffix(" ensemble")
+    return "unknown" if name.casefold().startswith("unknown") else name
 
 
 def crs_label(text: str) -> str:
@@ -385,9 +408,10 @@ def crs_step(
     if not group.transformers or not group.best_available:
         missing = missing_grids(group)
         what = f"the grid {missing[0]} is missing" if missing else "there is none without an inexact fallback"
+        own = "" if area is None else _own_utm(source, target, area)
         raise InputError(
             f"no exact transformation from {crs_label(source)} to {crs_label(target)}: {what}; "
-            "give the inputs in one CRS" + (", or install the grid" if missing else "")
+            f"give the inputs in one CRS{own}" + (", or install the grid" if missing else "")
         )
     best = group.transformers[0]
     accuracy = best.accuracy if best.accuracy is not None and best.accuracy >= 0 else None
@@ -412,6 +436,25 @@ def utm_codes(latitude: float, longitude: float) -> list[str]:
     """The UTM zone of WGS 84 at a place (degrees), then the zones beside it, as EPSG codes."""
     zone = int((longitude + 180) // 6) % 60
     return [f"EPSG:{326 if latitude >= 0 else 327}{(zone + shift) % 60 + 1:02d}" for shift in (0, -1, 1)]
+
+
+def fitting_utm(crs: str, latitude: float, longitude: float) -> str:
+    """Code of the UTM zone at a place (degrees), on the datum of a CRS if that has zones there, else on WGS 84."""
+    geographic = parse_crs(crs).geodetic_crs
+    here = AreaOfInterest(longitude, latitude, longitude, latitude)
+    known = [] if geographic is None else query_utm_crs_info(datum_name=geographic.name, area_of_interest=here)
+    zone = utm_codes(latitude, longitude)[0]
+    same = [f"{found.auth_name}:{found.code}" for found in known if found.name.endswith(f"zone {int(zone[-2:])}"
+            f"{'N' if latitude >= 0 else 'S'}")]  # fmt: skip
+    return same[0] if same else zone
+
+
+def _own_utm(source: str, target: str, area: Any) -> str:
+    """What to choose instead of a target on another datum: the UTM zone on the source's datum; empty: there is none."""
+    middle = area.west_lon_degree + (area.east_lon_degree - area.west_lon_degree) % 360.0 / 2
+    code = fitting_utm(source, (area.south_lat_degree + area.north_lat_degree) / 2, middle)
+    same = parse_crs(code).datum == parse_crs(source).datum and not same_crs(code, target)
+    return f", choose a CRS on the datum of the first, such as {code}" if same else ""
 
 
 def missing_grids(group: TransformerGroup) -> list[str]:

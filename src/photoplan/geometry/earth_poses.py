@@ -10,8 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 from pyproj import Transformer
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import crs_label, crs_step, parse_crs, require_projected_metres, topocentric_poses
+from photoplan.geometry.crs import (
+    crs_label,
+    crs_step,
+    parse_crs,
+    require_projected_metres,
+    split_compound,
+    topocentric_poses,
+)
 from photoplan.geometry.local import LocalFrame
+from photoplan.geometry.units import metric_system
 
 _Floats = NDArray[np.float64]
 
@@ -179,9 +187,19 @@ def topocentric_of_map(origin: tuple[float, float, float], crs: str, XYZ: ArrayL
     return enu, topocentric_poses(origin, crs, enu)[1]
 
 
-def is_local_crs(text: str) -> bool:
-    """Whether a text is the WKT of a local system, one without any relation to the earth."""
-    return text.strip().upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"))
+def is_local_crs(text: str, where: str) -> bool:
+    """Whether a text is the WKT of a local system, one without any relation to the earth.
+
+    Raises
+    ------
+    InputError
+        It is one, and not in metres.
+    """
+    if not text.strip().upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
+        return False
+    if split_compound(text, where)[0] is not None:
+        metric_system(text, where)
+    return True
 
 
 def is_wgs84_geographic(text: str, where: str) -> bool:

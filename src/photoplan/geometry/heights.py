@@ -246,6 +246,37 @@ def height_step(
     )
 
 
+def heights_in(
+    XYZ: NDArray[np.float64], crs: str, own: str | None, wanted: str | None, where: str
+) -> NDArray[np.float64]:
+    """Points (n, 3) of a file that states its height system, with heights in the wanted one; NaN stays NaN.
+
+    Raises
+    ------
+    HeightSystemError
+        The two differ and no exact operation joins them, or a height without X and Y would have to be converted.
+    """
+    if own in (None, "same") or wanted in (None, "same") or not np.isfinite(XYZ[:, 2]).any():
+        return XYZ
+    assert own is not None and wanted is not None
+    pair = [metric_heights(check_height_system(system, where))[0] for system in (own, wanted)]
+    if pair[0] == pair[1]:
+        return XYZ
+    known = np.isfinite(XYZ).all(axis=1)
+    try:
+        if (np.isfinite(XYZ[:, 2]) & ~known).any():
+            raise HeightSystemError("a height without X and Y cannot be converted")
+        XY = XYZ[known, :2]
+        low, high = XY.min(axis=0), XY.max(axis=0)
+        step = height_step(pair[0], pair[1], crs, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+        out = XYZ.copy()
+        out[known, 2] = step(XYZ[known])
+    except HeightSystemError as error:
+        systems = f"the file states heights {height_label(pair[0])}, the project {height_label(pair[1])}"
+        raise HeightSystemError(f"{where}: {systems}: {error}") from None
+    return out
+
+
 def crs_with_heights(crs: str, system: str | None) -> str:
     """A horizontal CRS together with a height system, as WKT: what a raster of heights states.
 

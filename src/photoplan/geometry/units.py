@@ -102,7 +102,7 @@ _ACCEPTED = "m, dm, cm, mm, km, ft, US survey foot, yd, in, mi, nautical mile, f
 def _plain(name: str) -> str:
     """A unit's name in small letters, with one hyphen between its words."""
     text = re.sub(r"['’]s(?![a-z])", "", name.strip().casefold()).replace("[", "").replace("]", "")
-    return re.sub(r"[\s_.\-/()]+", "-", text).strip("-") or text
+    return re.sub(r"^u-s-(?!survey)", "us-", re.sub(r"[\s_.\-/()]+", "-", text).strip("-")) or text
 
 
 @lru_cache(maxsize=1)
@@ -273,6 +273,12 @@ def metric_system(text: str, where: str = "CRS") -> MetricSystem:
         The text is not a CRS, or its axes have several units.
     """
     crs = parse_crs(text, where)
+    if crs.type_name == "Engineering CRS":
+        units = " and ".join(dict.fromkeys(axis.unit_name for axis in crs.axis_info[:2]))
+        raise InputError(
+            f"{where}: {crs.name!r} is a local system in {units}; a projected or geographic CRS is needed, or a local "
+            "system in metres: convert the coordinates, or state the CRS in which they are"
+        )
     heights, rise = None, None
     horizontal = crs
     if crs.is_compound:

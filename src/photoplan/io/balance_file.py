@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -29,13 +30,22 @@ class BalanceBand(Entry):
     sigma: tuple[NotNegative, ...] = ()
     """Standard deviations; only information."""
     trend: Annotated[tuple[tuple[_Power, _Power, Number], ...], Field(max_length=60)] = ()
-    """Terms i, j, c of 1 + Σ c (uⁱ vʲ − mean), by which grey values are divided before the table."""
+    """Terms i, j, c of 1 + Σ c (uⁱ vʲ − mean), by which grey values, or their light, are divided before the table."""
+    curve_grey: _Numbers | tuple[()] = ()
+    """Grey values of the image's characteristic curve, rising; none: grey values are light."""
+    curve_light: _Numbers | tuple[()] = ()
+    """The light that gives them, never falling; it is divided by the trend, and `grey` are values of it."""
 
     @model_validator(mode="after")
     def _as_many(self) -> Self:
         if len(self.grey) != len(self.becomes):
             raise ValueError(
                 f"{len(self.grey)} entries of grey, but {len(self.becomes)} of becomes; give as many of both"
+            )
+        if len(self.curve_grey) != len(self.curve_light):
+            raise ValueError(
+                f"{len(self.curve_grey)} entries of curve_grey, but {len(self.curve_light)} of curve_light; give as "
+                "many of both, or none"
             )
         return self
 
@@ -64,7 +74,8 @@ def read_balance_file(path: Path) -> BalanceFile:
 def write_balance_file(path: Path, size: tuple[int, int], description: str, bands: Sequence[BalanceBand]) -> None:
     """Write a balance file; the name holds the old or the whole new file."""
     lines = [
-        "# What becomes of grey values: table(grey / trend). Between entries the table is linear, it may not fall.",
+        "# What becomes of grey values: table(light / trend), light by curve_grey and curve_light; without these light",
+        "# is grey. Between entries tables are linear, they may not fall.",
         "# A term [i, j, c] adds c (u^i v^j - its mean) to a trend of 1; u, v are columns and rows from the image's",
         "# middle, in half diagonals.",
         'format = "photoplan balance 1"',
@@ -73,9 +84,11 @@ def write_balance_file(path: Path, size: tuple[int, int], description: str, band
     ]
     for band in bands:
         lines += ["", "[[bands]]"]
-        for name in ("grey", "becomes", "sigma"):
+        span = max(abs(value) for value in (*band.grey, *band.becomes))
+        places = max(2, 5 - math.ceil(math.log10(max(span, 1e-9))))
+        for name in ("curve_grey", "curve_light", "grey", "becomes", "sigma"):
             if values := getattr(band, name):
-                lines.append(f"{name} = [{', '.join(f'{value:.2f}' for value in values)}]")
+                lines.append(f"{name} = [{', '.join(f'{value:.{places}f}' for value in values)}]")
         if band.trend:
             lines.append(f"trend = [{', '.join(f'[{i}, {j}, {c:.6f}]' for i, j, c in band.trend)}]")
     write_atomically(path, ("\n".join(lines) + "\n").encode())

@@ -6,15 +6,52 @@ import errno
 import os
 import shutil
 import stat
+import sys
 import tempfile
+from functools import cache
 from pathlib import Path
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
 
 #: Bytes that must be free where a library says no more than that it cannot write.
 _TRIAL = 1 << 20
+#: Bytes of a user's secret.
+_SECRET = 32
 _RECEIVED: set[Path] = set()
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM}
+
+
+def cache_folder() -> Path:
+    """Return where only time is saved: PHOTOPLAN_CACHE_DIR, or photoplan in the user's cache folder."""
+    if stated := os.environ.get("PHOTOPLAN_CACHE_DIR"):
+        return Path(stated)
+    if sys.platform == "win32":
+        above = Path(os.environ.get("LOCALAPPDATA") or "~/AppData/Local")
+    elif sys.platform == "darwin":
+        above = Path("~/Library/Caches")
+    else:
+        above = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
+    return above.expanduser() / "photoplan"
+
+
+@cache
+def own_secret(folder: Path) -> bytes:
+    """Return random bytes of this user, kept in the cache folder; none if it cannot be written.
+
+    Logs of finished work begin with a digest that needs them: a log that somebody else has prepared is not continued.
+    """
+    path = folder / "own"
+    try:
+        if not path.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            descriptor, made = tempfile.mkstemp(dir=folder)
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(os.urandom(_SECRET))
+            Path(made).replace(path)
+        found = path.read_bytes()
+    except OSError:
+        return b""
+    return found if len(found) == _SECRET else b""
 
 
 def disk_error(path: Path, error: OSError, doing: str = "written") -> PhotoplanError:
@@ -25,6 +62,8 @@ def disk_error(path: Path, error: OSError, doing: str = "written") -> PhotoplanE
             f"{path}: cannot be {doing} ({reason}; {free_megabytes(path)} MB are free there); free some space and "
             "run the same command again; if it makes tiles, finished tiles are kept"
         )
+    if error.errno == errno.ENOENT and not path.parent.is_dir():
+        return UsageError(f"{path.parent}: no such folder; make it first")
     return UsageError(f"{path}: cannot be {doing} ({reason}); choose a folder that can be written")
 
 

@@ -12,7 +12,7 @@ import io
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from photoplan.geometry.units import DRAWING_UNITS
 MAX_BYTES = 2 << 30
 #: Entities that unfolded blocks may have in all, and levels of blocks in blocks.
 MOST_ENTITIES, MOST_LEVELS = 2_000_000, 32
+#: Attributes of blocks that are kept.
+MOST_TAGS = 100
 #: Vertices that one curve may have, and how far its chords may lie from it, as a part of its extent.
 MOST_VERTICES, _FLATNESS = 100_000, 1e-4
 #: Key of the entities of all block references together; no block is called so.
@@ -54,6 +56,8 @@ class DrawingFile:
     """Text of each entity, shape (n,); None if it is no text."""
     unit: int
     """$INSUNITS; 0: not stated."""
+    attributes: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Texts of the attributes of block references that are points, by tag, shape (n,); None: it has none."""
     notes: tuple[str, ...] = ()
 
 
@@ -65,6 +69,8 @@ class _Found:
     layers: list[str] = field(default_factory=list)
     handles: list[str] = field(default_factory=list)
     texts: list[str | None] = field(default_factory=list)
+    attributes: dict[str, dict[int, str]] = field(default_factory=dict)
+    """By tag, the texts of shapes by their number."""
     left_out: Counter[str] = field(default_factory=Counter)
     unreadable: Counter[str] = field(default_factory=Counter)
     first: str = ""
@@ -109,7 +115,7 @@ def read_drawing(path: Path) -> DrawingFile:
     notes: list[str] = []
     try:
         try:
-            document = ezdxf.readfile(path)
+            document = _repaired(path, None, notes) if _has_old_elevations(path) else ezdxf.readfile(path)
         except (ezdxf.DXFError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
             document = _repaired(path, error, notes)
         entities = list(document.modelspace())
@@ -142,12 +148,20 @@ def read_drawing(path: Path) -> DrawingFile:
                      f"(first {found.first})")  # fmt: skip
     shapes = np.empty(len(found.shapes), object)
     shapes[:] = found.shapes
+    attributes = {tag: np.full(len(shapes), None, object) for tag in found.attributes}
+    for tag, values in found.attributes.items():
+        attributes[tag][list(values)] = list(values.values())
+    if attributes:
+        notes.append(
+            f"{path.name}: blocks have attributes: {', '.join(attributes)[:200]}; `height_field` takes heights of one"
+        )
     return DrawingFile(
         shapes=shapes,
         layers=np.array(found.layers, object),
         handles=np.array(found.handles, object),
         texts=np.array(found.texts, object),
         unit=unit if isinstance(unit, int) else -1,
+        attributes=attributes,
         notes=tuple(notes),
     )
 
@@ -159,12 +173,28 @@ _SUBCLASSES = {"LWPOLYLINE": "AcDbPolyline", "SPLINE": "AcDbSpline", "ELLIPSE": 
                "MESH": "AcDbSubDMesh", "HATCH": "AcDbHatch", "HELIX": "AcDbSpline"}  # fmt: skip
 
 
-def _repaired(path: Path, error: Exception, notes: list[str]) -> Any:
-    """The drawing without entities that cannot be read, and with the marks of subclasses that programs leave out."""
+#: Versions of drawings in which group 38 may state the elevation of any entity (before release 11; 12 keeps some).
+_OLD = (b"AC1.", b"AC2.", b"AC1001", b"AC1002", b"AC1003", b"AC1004", b"AC1006", b"AC1009")
+
+
+def _has_old_elevations(path: Path) -> bool:
+    """Whether a drawing is of an old version, or states none, and has groups 38."""
+    with path.open("rb") as file:
+        head = file.read(10_000)
+    version = re.search(rb"\$ACADVER\s+1\s+(\S+)", head)
+    old = version is None or version[1].startswith(_OLD)
+    if not old or head.startswith(b"AutoCAD Binary DXF"):
+        return False
+    return re.search(rb"[\r\n] *38\r?\n", path.read_bytes()) is not None
+
+
+def _repaired(path: Path, error: Exception | None, notes: list[str]) -> Any:
+    """The drawing without entities that cannot be read, with the marks of subclasses that programs leave out, and with
+    elevations of old entities as Z; without an error the text is that of a drawing that can be read."""
     import ezdxf.recover  # noqa: PLC0415
 
     raw = path.read_bytes()
-    if raw.startswith(b"AutoCAD Binary DXF") or b"SECTION" not in raw[:100_000]:
+    if error is not None and (raw.startswith(b"AutoCAD Binary DXF") or b"SECTION" not in raw[:100_000]):
         raise error
     lines = raw.decode("utf-8", errors="surrogateescape").replace("\r\n", "\n").replace("\r", "\n").split("\n")
     out: list[str] = []
@@ -180,6 +210,12 @@ def _repaired(path: Path, error: Exception, notes: list[str]) -> Any:
                 lost += 1
                 continue
             codes = [code.strip() for code in tags[::2]]
+            if kind in _POINTS_ONCE and "38" in codes and "30" not in codes:
+                height = tags[2 * codes.index("38") + 1]
+                if "10" not in codes:  # polylines whose vertices alone have places
+                    tags, codes = [*tags, "10", "0", "20", "0"], [*codes, "10", "20"]
+                tags += [line for code in codes if re.fullmatch("1[0-3]", code) for line in (f"3{code[1]}", height)]
+                codes = [code.strip() for code in tags[::2]]
             if kind in _POINTS_ONCE:
                 # X, Y and Z of a point follow each other.
                 key = [(int(c) % 10, int(c)) if c.isdigit() and 10 <= int(c) <= 39 else (-1, 0) for c in codes]
@@ -233,6 +269,10 @@ def _take(entity: Any, found: _Found, sizes: dict[str, float]) -> None:
             parts, unfolded = _block(entity, sizes, found)
             found.unfolded += unfolded
             found.symbols += not unfolded
+            for attribute in () if unfolded else entity.attribs:
+                tag = str(attribute.dxf.tag)
+                if tag in found.attributes or len(found.attributes) < MOST_TAGS:
+                    found.attributes.setdefault(tag, {})[len(found.shapes)] = str(attribute.dxf.text).strip()
         else:
             parts = [(layer, *item) for item in _geometry(entity, kind)]
     except (MemoryError, KeyboardInterrupt):

@@ -71,7 +71,7 @@ def read_drawn_features(path: Path, layer: str | None) -> DrawnFeatures:
     if not len(XYZ) or not np.isfinite(XYZ[:, :2]).all():
         raise InputError(f"{path}: layer {name}: holds nothing that can be drawn, or a coordinate that is no number")
     stated = found.crs if drawing or states_crs(path) else None
-    crs, heights = (None, None) if stated is None else split_compound(stated)
+    crs, heights = (None, None) if stated is None else split_compound(stated, f"{path}: CRS")
     is_point = shapely.get_type_id(parts) == _POINT
     return DrawnFeatures(
         path=path,

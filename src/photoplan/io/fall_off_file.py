@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict
 
-from photoplan.io.camera.model import Entry, Number, Positive
+from photoplan.io.camera.model import Entry, NotNegative, Number, Positive
 from photoplan.io.plain_files import read_entries
 from photoplan.io.project.write import toml_value
 
@@ -25,7 +25,7 @@ class TermEntry(Entry):
     m: _Degree
     """Multiple of the angle: cosine, where negative the sine of its amount; 0: the same all around."""
     coefficient: Number
-    sigma: Annotated[float, Strict(), Field(ge=0)] | None = None
+    sigma: NotNegative | None = None
     """Standard deviation; only information."""
 
 

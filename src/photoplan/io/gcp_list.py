@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.cameras.observed import GroundPoints, ImagePoints
-from photoplan.errors import InputError
+from photoplan.errors import InputError, named_by
 from photoplan.geometry.crs import crs_label, crs_step, parse_crs, same_crs
+from photoplan.geometry.heights import heights_in
 from photoplan.geometry.units import metric_system
 from photoplan.io.names import same_images
 from photoplan.io.plain_files import read_text
@@ -50,13 +51,15 @@ class _Line:
     name: str | None
 
 
-def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
+def read_gcp_list(path: Path, crs: str | None = None, height_system: str | None = None) -> GcpList:
     """Control and its measurements.
 
     Parameters
     ----------
     crs : str, optional
         Projected CRS that the points are wanted in; that of the file otherwise.
+    height_system : str, optional
+        The height system that heights are wanted in; they are converted if the file states another one.
 
     Raises
     ------
@@ -91,8 +94,10 @@ def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
                 "one of the measurements"
             )
     XYZ = system.to_metres(np.array([row.XYZ for row in places.values()], float), f"{path}: heights")
+    XYZ = heights_in(XYZ, own, system.heights, height_system, str(path))
     if crs is not None and not same_crs(own, crs):
-        XYZ[:, :2] = crs_step(own, crs)(XYZ[:, :2])
+        with named_by(path):
+            XYZ[:, :2] = crs_step(own, crs)(XYZ[:, :2])
         own = crs
     elif parse_crs(own).is_geographic:
         raise InputError(
@@ -159,4 +164,4 @@ def is_gcp_list(path: Path) -> bool:
             first = file.read(1000).decode("utf-8-sig", errors="replace").lstrip().split("\n")[0].strip()
     except OSError:
         return False
-    return bool(_UTM.fullmatch(first) or re.match(r"EPSG:\d+$|\+proj=", first, re.I))
+    return bool(_UTM.fullmatch(first) or re.match(r"EPSG:\d+(\+\d+)?$|\+proj=", first, re.I))

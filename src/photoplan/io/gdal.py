@@ -102,8 +102,8 @@ def first_cause(error: BaseException) -> str:
     return all_causes(error)[0]
 
 
-def open_raster(path: Path, driver: str | None, overview: int | None = None) -> Any:
-    """Open a raster, or one of its overviews (from 0), for reading with one driver (None: any).
+def open_raster(path: Path, driver: str | None, overview: int | None = None, **options: Any) -> Any:
+    """Open a raster, or one of its overviews (from 0), for reading with one driver (None: any) and its options.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def open_raster(path: Path, driver: str | None, overview: int | None = None) -> 
     """
     try:
         with not_georeferenced(), gdal_settings():
-            options = {} if overview is None else {"OVERVIEW_LEVEL": overview}
+            options |= {} if overview is None else {"OVERVIEW_LEVEL": overview}
             return rasterio.open(path, driver=driver, sharing=False, **options)
     except (*GDAL_ERRORS, OSError, ValueError) as error:
         raise InputError(

@@ -20,6 +20,7 @@ from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import odd_place
 from photoplan.geometry.crs import crs_label, same_crs
+from photoplan.geometry.heights import heights_in
 from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.checks import check_plain_file
 from photoplan.io.plain_files import crs_beside
@@ -44,7 +45,12 @@ _CHECK = {"": False, "control": False, "gcp": False, "check": True, "checkpoint"
 
 
 def read_ground_points(
-    path: Path, *, crs: str | None = None, columns: str | None = None, decimal_comma: bool = False
+    path: Path,
+    *,
+    crs: str | None = None,
+    height_system: str | None = None,
+    columns: str | None = None,
+    decimal_comma: bool = False,
 ) -> GroundPoints:
     """Ground points of a table or of the first layer of a GeoPackage with points.
 
@@ -53,6 +59,8 @@ def read_ground_points(
     crs : str, optional
         The CRS that the points must be in, where the file (or a ``.prj`` beside it) states one. Coordinates that it
         states in feet or another unit are converted to metres; standard deviations are in metres always.
+    height_system : str, optional
+        The height system that heights are wanted in; they are converted if the file states another one.
     columns : str, optional
         Columns of a table in their order where it does not name them; ``-`` for one that is not used.
     decimal_comma : bool
@@ -70,11 +78,12 @@ def read_ground_points(
     """
     path = Path(path)
     if path.suffix.lower() == ".gpkg":
-        return _from_layer(path, crs)
+        return _from_layer(path, crs, height_system)
     beside = crs_beside(path)
     table = read_table(path, Columns(roles=_ROLES, needed=_NEEDED), Dialect(columns, decimal_comma=decimal_comma))
     names = table.names("name")
-    XYZ = _in_metres(path, table.numbers("x", "y", "z", empty=True), None if beside is None else beside.system, crs)
+    stated = table.numbers("x", "y", "z", empty=True)
+    XYZ = _in_metres(path, stated, None if beside is None else beside.system, crs, height_system)
     return _points(names, XYZ, lambda role: table.numbers(role, empty=True), table.texts("role"), table.where)
 
 
@@ -124,19 +133,19 @@ def _first(*columns: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _in_metres(
-    path: Path, XYZ: NDArray[np.float64], own: MetricSystem | None, wanted: str | None
+    path: Path, XYZ: NDArray[np.float64], own: MetricSystem | None, wanted: str | None, heights: str | None
 ) -> NDArray[np.float64]:
-    """Coordinates in metres; a CRS other than the wanted one is refused."""
+    """Coordinates in metres, heights in the wanted system; a CRS other than the wanted one is refused."""
     if own is None:
         return XYZ
     if wanted is not None and not same_crs(own.crs, wanted):
         raise InputError(
             f"{path}: ground points in {crs_label(own.crs)}, the project is in {crs_label(wanted)}; transform them"
         )
-    return own.to_metres(XYZ, f"{path}: heights")
+    return heights_in(own.to_metres(XYZ, f"{path}: heights"), own.crs, own.heights, heights, str(path))
 
 
-def _from_layer(path: Path, crs: str | None) -> GroundPoints:
+def _from_layer(path: Path, crs: str | None, heights: str | None) -> GroundPoints:
     path = check_plain_file(path, "ground points")
     found = read_layer(path)
     shapes = found.shapes
@@ -158,7 +167,8 @@ def _from_layer(path: Path, crs: str | None) -> GroundPoints:
     if not all(names):
         raise InputError(f"{where(names.index(''))} has no name; give it one")
     XYZ = np.stack([shapely.get_x(shapes), shapely.get_y(shapes), shapely.get_z(shapes)], axis=1)
-    XYZ = _in_metres(path, XYZ, None if found.crs is None else metric_system(found.crs, f"{path}: CRS"), crs)
+    own_system = None if found.crs is None else metric_system(found.crs, f"{path}: CRS")
+    XYZ = _in_metres(path, XYZ, own_system, crs, heights)
 
     def numbers(role: str) -> NDArray[np.float64]:
         column = next((fields[n] for n in _ROLES[role] if n in fields), None)

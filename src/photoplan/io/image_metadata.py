@@ -28,6 +28,7 @@ from xml.etree.ElementTree import Element
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import is_no_fix
 from photoplan.io.markup_files import NotWellFormed, parse_xml
+from photoplan.io.plain_files import whole_number
 
 _DJI = "dji.com/drone-dji"
 _CAMERA = "pix4d.com/camera"
@@ -183,7 +184,7 @@ def _degrees(exif: dict[str, ExifValue], name: str, negative: str) -> float | No
         return None
     degrees = sum(v / 60.0**k for k, v in enumerate(value[:3]))
     sign = _text(exif, f"{name}Ref") or ""
-    return -degrees if sign.upper().startswith(negative) else degrees
+    return -abs(degrees) if sign.upper().startswith(negative) else degrees
 
 
 def _sigma(
@@ -229,7 +230,7 @@ def _time(exif: dict[str, ExifValue]) -> float | None:
     except ValueError:
         return None
     fraction = _text(exif, "SubSecTimeOriginal") or ""
-    return moment.timestamp() + (float(f"0.{fraction}") if fraction.isdigit() else 0.0)
+    return moment.timestamp() + (float(f"0.{fraction}") if whole_number(fraction) is not None else 0.0)
 
 
 ExifValue = str | tuple[float, ...]

@@ -10,7 +10,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag, model_validator
 
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+#: No length, angle or coefficient of a project is larger; products of several still are finite numbers.
+LARGEST = 1e15
+Number = Annotated[float, Strict(), Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Length = Annotated[float, Strict(), Field(gt=0, le=1000, allow_inf_nan=False)]
 Zero = Annotated[float, Strict(), Field(ge=0, le=1000, allow_inf_nan=False)]
 Angle = Annotated[float, Strict(), Field(gt=0, lt=90)]

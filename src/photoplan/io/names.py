@@ -110,7 +110,13 @@ def shortest_paths(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
         groups: dict[tuple[str, ...], list[str]] = {}
         for name, count in short.items():
             groups.setdefault(tuple(p.casefold() for p in parts[name][-count:]), []).append(name)
-        longer = [n for group in groups.values() if len(group) > 1 for n in group if short[n] < len(parts[n])]
+        longer = [
+            n
+            for group in groups.values()
+            if len({tuple(p.casefold() for p in parts[name]) for name in group}) > 1
+            for n in group
+            if short[n] < len(parts[n])
+        ]
         if not longer:
             return {name: parts[name][-count:] for name, count in short.items()}
         for name in longer:

@@ -20,6 +20,7 @@ from photoplan.cameras.observed import ObservedAttitudes, ObservedPositions
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.crs import crs_label, same_crs
+from photoplan.geometry.heights import heights_in
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.names import same_images
 from photoplan.io.orientation.exif import map_positions, read_folder
@@ -101,7 +102,12 @@ class PositionTable:
 
 
 def read_observed_positions(
-    path: Path, form: TableFormat | None = None, *, crs: str | None = None, columns: str | None = None
+    path: Path,
+    form: TableFormat | None = None,
+    *,
+    crs: str | None = None,
+    height_system: str | None = None,
+    columns: str | None = None,
 ) -> PositionTable:
     """Observed positions of a file.
 
@@ -113,6 +119,8 @@ def read_observed_positions(
         Unit and order of the angles, decimal sign.
     crs : str, optional
         The CRS that positions must be in, where the file states one.
+    height_system : str, optional
+        The height system that heights are wanted in; they are converted if the file states another one.
     columns : str, optional
         Columns of a table in their order where it does not name them; ``-`` for one that is not used.
 
@@ -125,7 +133,7 @@ def read_observed_positions(
     if path.is_dir() and crs is not None and not (path / "images.txt").is_file():
         return _from_images(path, crs)
     if path.suffix.lower() not in _TEXTS:
-        return _from_orientation(path, form, crs)
+        return _from_orientation(path, form, crs, height_system)
     beside = None if crs is None else crs_beside(path)
     if beside is not None and crs is not None:
         _same(path, beside.system.crs, crs)
@@ -143,7 +151,10 @@ def read_observed_positions(
             )
     XYZ = table.numbers("x", "y", "z")
     if beside is not None:
-        XYZ = beside.system.to_metres(XYZ, f"{path}: heights")
+        system = beside.system
+        XYZ = heights_in(
+            system.to_metres(XYZ, f"{path}: heights"), system.crs, system.heights, height_system, str(path)
+        )
     for k, place in enumerate(XYZ.tolist()):
         odd = odd_place(place, camera=True)
         if odd is not None:
@@ -240,17 +251,20 @@ def _from_images(path: Path, crs: str) -> PositionTable:
     )
 
 
-def _from_orientation(path: Path, form: TableFormat, crs: str | None) -> PositionTable:
+def _from_orientation(path: Path, form: TableFormat, crs: str | None, heights: str | None) -> PositionTable:
     table = read_orientation(path, form).heights_in_metres(None)
     if table.origin is not None:
         raise InputError(f"{path}: positions refer to a local system; `photoplan convert` brings them into the CRS")
     if table.crs is not None and crs is not None:
         _same(path, table.crs, crs)
+    centers = table.centers
+    if table.crs is not None:
+        centers = heights_in(centers, table.crs, table.height_system, heights, str(path))
     n = len(table.images)
     return PositionTable(
         path=path,
         images=tuple(image.name for image in table.images),
-        XYZ=table.centers,
+        XYZ=centers,
         sigma=np.full((n, 3), np.nan),
         R_ground_camera=table.rotations,
         sigma_angle=np.full(n, np.nan),

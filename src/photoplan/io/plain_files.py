@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import parse_crs, split_compound
+from photoplan.geometry.crs import split_compound
 from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.appearance import looks_like
 from photoplan.io.project.errors import explain
@@ -227,9 +228,14 @@ def finite(value: Any, where: str, count: int | None = None) -> Any:
         if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
             raise InputError(f"{where}: {value!r} given; {count} numbers are needed")
         return tuple(finite(v, where) for v in value)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: {value!r} given; a finite number is needed")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
+        raise InputError(f"{where}: {repr(value)[:80]} given; a finite number is needed")
     return float(value)
+
+
+def whole_number(word: str) -> int | None:
+    """Whole number of up to 18 ASCII digits; None if a word is anything else, such as a superscript."""
+    return int(word) if word.isascii() and word.isdecimal() and len(word) <= 18 else None
 
 
 _MAX_BYTES = 100_000
@@ -260,8 +266,8 @@ def crs_beside(path: Path) -> StatedCrs | None:
     if side is None:
         return None
     text = read_text(side, _MAX_BYTES).strip()
-    parse_crs(text, str(side))
-    return StatedCrs(side, *split_compound(text), metric_system(text, str(side)))
+    crs, heights = split_compound(text, str(side))
+    return None if crs is None else StatedCrs(side, crs, heights, metric_system(text, str(side)))
 
 
 #: A project of 100,000 images stays far below; anything larger is not a project file.

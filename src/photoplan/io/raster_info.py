@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import split_compound
+from photoplan.geometry.crs import crs_label, same_crs, split_compound
 from photoplan.geometry.units import known_metres, metric_heights
 from photoplan.io.checks import (
     IMAGE_LIMITS,
@@ -21,6 +22,7 @@ from photoplan.io.checks import (
     raster_driver,
 )
 from photoplan.io.gdal import GDAL_ERRORS, first_cause, gdal_settings, open_raster, warnings_of_gdal
+from photoplan.io.plain_files import crs_beside
 from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout
 
 
@@ -91,6 +93,8 @@ class RasterInfo:
     """Grey values are stored inverted (TIFF photometric interpretation 0)."""
     colour_despite_tag: tuple[int, ...] = field(default=(), kw_only=True)
     """Numbers (from 1) of the bands that are tagged as alpha and hold a picture: they count as colour bands."""
+    contradiction: str | None = field(default=None, kw_only=True)
+    """What the tags and a file beside them state differently of the raster's place; None: nothing."""
     orientation: int
     """Orientation of EXIF or TIFF, 1 to 8. Pixels are used as they are stored, whatever it says: the camera's
     geometry refers to the sensor."""
@@ -128,6 +132,8 @@ class RasterInfo:
             )
         if self.white_is_zero:
             found.append(f"{self.path.name}: white is stored as zero; grey values are used as stored")
+        if self.contradiction is not None:
+            found.append(f"{self.path.name}: {self.contradiction}")
         for band in self.colour_despite_tag:
             found.append(
                 f"{self.path.name}: band {band} is tagged as alpha but holds a picture, so it is used as a colour "
@@ -223,6 +229,8 @@ def _facts(path: Path, dataset: Any, layout: TiffLayout | None) -> RasterInfo:
     colours = tuple(c.name for c in dataset.colorinterp)
     alpha = tuple(i + 1 for i, name in enumerate(colours) if name == "alpha")
     wkt = dataset.crs.to_wkt() if dataset.crs else None
+    if wkt is not None and split_compound(wkt, f"{path}: CRS")[0] is None:
+        wkt = None
     orientation = dataset.tags().get("EXIF_Orientation") or dataset.tags(ns="EXIF").get("EXIF_Orientation")
     bits = dataset.tags(1, ns="IMAGE_STRUCTURE").get("NBITS")
     return RasterInfo(
@@ -241,6 +249,7 @@ def _facts(path: Path, dataset: Any, layout: TiffLayout | None) -> RasterInfo:
         block=dataset.block_shapes[0][::-1],
         overviews=tuple(dataset.overviews(1)),
         crs=wkt,
+        contradiction=_contradiction(path, dataset, wkt),
         to_map=_centre_transform(dataset),
         band_unit=next((u.strip() for u in dataset.units if u and u.strip()), None),
         scales=tuple(dataset.scales),
@@ -272,6 +281,48 @@ def _has_mask(dataset: Any) -> bool:
         if not names or ("per_dataset" in names and "alpha" not in names):
             return True
     return False
+
+
+#: Places that differ by less than this, pixels, are printed with different digits.
+_SAME_PLACE = 0.1
+
+
+def _contradiction(path: Path, dataset: Any, crs: str | None) -> str | None:
+    """What a world file, `.prj` or `.aux.xml` beside a TIFF states otherwise than its tags; GDAL takes one of them."""
+    names = {"WORLDFILE": [path.with_suffix(s) for s in (".tfw", ".TFW", ".tifw", ".wld", ".tiffw")],
+             "PAM": [path.with_name(f"{path.name}.aux.xml")], "PRJ": [path.with_suffix(s) for s in (".prj", ".PRJ")],
+             "INTERNAL": [path]}  # fmt: skip
+    beside = {source: next((f for f in files if f.is_file()), None) for source, files in names.items()}
+    if dataset.driver != "GTiff" or sum(file is not None for file in beside.values()) < 2:
+        return None
+    width, height = dataset.width, dataset.height
+    places: list[tuple[Path, str, Any]] = []
+    systems: list[tuple[Path, str]] = []
+    for source, file in beside.items():
+        if file is None:
+            continue
+        if source == "PRJ":
+            with suppress(InputError):  # a file of another program, which GDAL does not read either
+                stated = None if crs is None else crs_beside(path)
+                systems += [] if stated is None else [(stated.file, stated.crs)]
+            continue
+        with open_raster(path, "GTiff", GEOREF_SOURCES=source) as alone:
+            t = alone.transform
+            if not t.is_identity:
+                said = f"the first pixel's corner at X {t.c:.10g}, Y {t.f:.10g} and pixels of {t.a:.6g} × {t.e:.6g}"
+                places.append((file, said, t))
+            wkt = alone.crs.to_wkt() if alone.crs and source != "WORLDFILE" else None
+            horizontal = None if wkt is None else split_compound(wkt, f"{file}: CRS")[0]
+            systems += [] if horizontal is None else [(file, horizontal)]
+    for file, said, t in places[1:]:
+        corners = [(~places[0][2] @ t) @ corner for corner in ((0, 0), (width, 0), (0, height), (width, height))]
+        if np.abs(np.array(corners) - [(0, 0), (width, 0), (0, height), (width, height)]).max() > _SAME_PLACE:
+            return f"{places[0][0].name} states {places[0][1]}, {file.name} states {said}; remove what is wrong"
+    for file, system in systems[1:]:
+        if not same_crs(systems[0][1], system):
+            labels = [f"{name.name} states {crs_label(text)}" for name, text in (systems[0], (file, system))]
+            return f"{', '.join(labels)}; remove what is wrong"
+    return None
 
 
 def _centre_transform(dataset: Any) -> tuple[float, float, float, float, float, float] | None:

@@ -8,7 +8,7 @@ again.
 
 from __future__ import annotations
 
-import hashlib
+import hmac
 import json
 import os
 import struct
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from photoplan.errors import PhotoplanError, UsageError
-from photoplan.io.disk import disk_error, open_own, write_all
+from photoplan.io.disk import cache_folder, disk_error, open_own, own_secret, write_all
 
 _OURS = b"PPTILES"
 _MAGIC = _OURS + b"3"
@@ -66,7 +66,8 @@ class TileLog:
     path
         The file; made when absent.
     key
-        What makes a run itself: a digest of inputs, parameters and version. A log with another key is started afresh.
+        What makes a run itself: a digest of inputs, parameters and version. A log with another key, or one that
+        another user has begun, is started afresh.
 
     Raises
     ------
@@ -82,7 +83,7 @@ class TileLog:
         self.path = path
         self._lock = threading.Lock()
         self._places: dict[int, _Place] = {}
-        start = _MAGIC, hashlib.sha256(key.encode()).digest()
+        start = _MAGIC, hmac.digest(own_secret(cache_folder()), key.encode(), "sha256")
         self._start = _START.pack(*start, zlib.crc32(start[0] + start[1]))
         try:
             self._descriptor = open_own(path)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
 
 from photoplan.errors import InputError
+from photoplan.geometry.crs import split_compound
 from photoplan.io.drawing import drawing_metres, read_drawing
 
 VECTOR_ERRORS = (
@@ -71,7 +72,8 @@ def read_layer(path: Path, name: str | None = None) -> FeatureLayer:
     """
     if name == ENTITIES:
         drawn = read_drawing(path)
-        fields = {"Layer": drawn.layers, "EntityHandle": drawn.handles, "Text": drawn.texts}
+        own = {"Layer": drawn.layers, "EntityHandle": drawn.handles, "Text": drawn.texts}
+        fields = {**drawn.attributes, **own}
         return FeatureLayer(drawn.shapes, fields, None, drawing_metres(path, drawn.unit), drawn.notes)
     if name is None:
         names = layers_of(path)
@@ -90,7 +92,10 @@ def read_layer(path: Path, name: str | None = None) -> FeatureLayer:
         raise InputError(f"{path}: layer {name}: damaged geometry ({_one_line(error)})") from None
     if not finite:
         raise InputError(f"{path}: layer {name}: a coordinate is not a finite number; repair or remove the feature")
-    return FeatureLayer(shapes, dict(zip((str(field) for field in meta["fields"]), values)), meta["crs"])
+    crs = meta["crs"]
+    if crs is not None and split_compound(crs, f"{path}: CRS")[0] is None:
+        crs = None
+    return FeatureLayer(shapes, dict(zip((str(field) for field in meta["fields"]), values)), crs)
 
 
 def read_columns(

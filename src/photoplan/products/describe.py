@@ -128,7 +128,10 @@ def describe(path: Path) -> dict[str, Any]:
     try:
         raster_driver(path)
     except InputError as not_a_raster:
-        found = _first(path, _READERS.get(kind, _TEXTS))
+        readers = _READERS.get("".join(path.suffixes[-2:]).lower()) or _READERS.get(kind, _TEXTS)
+        if len(readers) == 1:
+            return readers[0](path)
+        found = _first(path, readers)
         if found is None and kind == ".json":
             raise InputError(
                 f"{path}: JSON of no kind that is known: neither a run record of photoplan nor orientations, cameras, "
@@ -607,6 +610,8 @@ _READERS: dict[str, Sequence[Callable[[Path], dict[str, Any]]]] = {
     ".ply": (_objects,),
     ".las": (_measured,),
     ".laz": (_measured,),
+    ".jsonl": (_objects,),
+    ".city.json": (_objects,),
     ".geojson": (_vectors,),
     ".shp": (_vectors,),
     ".dxf": (_vectors,),

@@ -300,8 +300,10 @@ def _of_xarray(source: Any) -> NDArray[Any]:
     if not {"y", "x"} <= set(source.dims) or source.ndim > 3:
         raise UsageError(f"source: DataArray with dimensions {source.dims}; needed are (band, y, x) or (y, x)")
     values = np.asarray(source.transpose(..., "y", "x").values)
-    nodata = source.attrs.get("_FillValue", source.attrs.get("nodata", source.encoding.get("_FillValue")))
-    return values if nodata is None else np.ma.masked_equal(values, nodata)
+    names = [(source.attrs, name) for name in ("_FillValue", "missing_value", "nodata", "nodatavals")]
+    names += [(source.encoding, name) for name in ("_FillValue", "missing_value")]
+    nodata = next((stated[name] for stated, name in names if stated.get(name) is not None), None)
+    return values if nodata is None else np.ma.masked_where(np.isin(values, np.ravel(nodata)), values)
 
 
 def _owners(owner: ArrayLike, count: int, size: tuple[int, int]) -> NDArray[np.uint16]:
@@ -329,7 +331,7 @@ def _surface(surface: Any, target: Target) -> Surface:
             "from a file, one height, or a surface such as photoplan.RasterSurface"
         )
     crs = target.placement.crs
-    terrain = open_terrain(Path(file), crs)
+    terrain = open_terrain(Path(file), default_crs=crs)
     if crs is None or not isinstance(target, MapTarget):
         return (terrain if crs is None else terrain.in_crs(crs)[0]).surface
     own = terrain.crs

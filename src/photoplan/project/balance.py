@@ -57,7 +57,7 @@ def load_balance(path: Path) -> BalanceStep:
     tones = []
     for number, band in enumerate(entry.bands, 1):
         try:
-            tones.append(Tone(band.grey, band.becomes, band.trend))
+            tones.append(Tone(band.grey, band.becomes, band.trend, (band.curve_grey, band.curve_light)))
         except InputError as error:
             raise InputError(f"{path}: band {number}: {error}") from None
     return BalanceStep(path, entry.size, tuple(tones))

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import HeightSystemError, InputError
+from photoplan.errors import HeightSystemError, InputError, named_by
 from photoplan.geometry.bounds import MOST_HEIGHT
 from photoplan.geometry.crs import CrsStep, crs_label, crs_step, require_projected_metres, same_crs
-from photoplan.geometry.heights import OPTIONS, HeightStep, check_height_system, height_step
-from photoplan.geometry.units import agreed_metres, metric_system
+from photoplan.geometry.heights import OPTIONS, HeightStep, check_height_system, height_label, height_step
+from photoplan.geometry.units import agreed_metres, metric_heights, metric_system
 from photoplan.io.objects.file import read_objects
 from photoplan.io.objects.model import ObjectFile
 from photoplan.io.project.model import Objects
@@ -96,6 +96,12 @@ def _placed(path: Path, own: ObjectFile, stated: Objects, place: Place) -> tuple
         )
     if own.crs is not None and stated.crs is not None and not same_crs(own.crs, stated.crs):
         raise InputError(f"{path}: is in {crs_label(own.crs)}; [[objects]] states {crs_label(stated.crs)}: remove that")
+    pair = own.height_system, stated.height_system
+    if None not in pair and "same" not in pair:
+        metric_pair = [metric_heights(check_height_system(name or "", str(path)))[0] for name in pair]
+        if metric_pair[0] != metric_pair[1]:
+            given = [height_label(name) for name in pair]
+            raise HeightSystemError(f"{path}: states heights {given[0]}; [[objects]] states {given[1]}: remove that")
     system = own.height_system or stated.height_system
     if system is None:
         raise HeightSystemError(
@@ -118,8 +124,9 @@ def _placed(path: Path, own: ObjectFile, stated: Objects, place: Place) -> tuple
     if not same_crs(crs, place.crs):
         require_projected_metres(crs, f"{path}: CRS")
         low, high = corners[..., :2].min(axis=(0, 1)), corners[..., :2].max(axis=(0, 1))
-        step = crs_step(crs, place.crs, (*low.tolist(), *high.tolist()))
-        corners = np.concatenate([step(corners[..., :2]), corners[..., 2:]], axis=-1)
+        with named_by(path):
+            step = crs_step(crs, place.crs, (*low.tolist(), *high.tolist()))
+            corners = np.concatenate([step(corners[..., :2]), corners[..., 2:]], axis=-1)
         steps.append(step)
     if not np.isfinite(corners).all():
         raise InputError(f"{path}: coordinates that {crs_label(crs)} does not reach; is the CRS right?")

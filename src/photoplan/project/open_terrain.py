@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.errors import GeometryError, InputError, UsageError, named_by
 from photoplan.geometry.bounds import bounds_fault
 from photoplan.geometry.crs import (
     CrsStep,
@@ -18,6 +18,7 @@ from photoplan.geometry.crs import (
     parse_crs,
     require_projected_metres,
     same_crs,
+    split_compound,
     turn_of,
 )
 from photoplan.geometry.heights import require_metric_heights
@@ -81,7 +82,8 @@ class OpenTerrain:
         """
         if same_crs(self.crs, crs):
             return self, ()
-        back = crs_step(self.crs, crs, self.bounds)
+        with named_by(self.path):
+            back = crs_step(self.crs, crs, self.bounds)
         t = np.linspace(0, 1, 17)
         xmin, ymin, xmax, ymax = self.bounds
         x, y = xmin + t * (xmax - xmin), ymin + t * (ymax - ymin)
@@ -92,7 +94,8 @@ class OpenTerrain:
             raise InputError(f"{self.path}: nothing of its area has coordinates in {crs_label(crs)}; is the CRS right?")
         low, high = corners.min(axis=0), corners.max(axis=0)
         bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        step = crs_step(crs, self.crs, bounds, self._about(crs))
+        with named_by(self.path):
+            step = crs_step(crs, self.crs, bounds, self._about(crs))
         surface: RasterSurface | HybridSurface
         if isinstance(self.surface, RasterSurface):
             surface = replace(self.surface, to_grid_crs=step)
@@ -114,7 +117,12 @@ class OpenTerrain:
 
 
 def open_terrain(
-    path: Path, crs: str | None = None, option: str = "with `crs` EPSG:nnnn", height_system: str | None = None
+    path: Path,
+    crs: str | None = None,
+    option: str = "with `crs` EPSG:nnnn",
+    height_system: str | None = None,
+    *,
+    default_crs: str | None = None,
 ) -> OpenTerrain:
     """Open a terrain model.
 
@@ -123,12 +131,14 @@ def open_terrain(
     path : Path
         A model of `photoplan dtm build`, or a GeoTIFF of heights.
     crs : str, optional
-        CRS of a file that does not state its own.
+        Declared CRS of a file that does not state its own; a file that states another one is refused.
     option : str, optional
         How a user states it, for the message.
     height_system : str, optional
         Declared height system; its unit is that of a raster's heights. All heights and coordinates are returned in
         metres, whatever the units of the file are.
+    default_crs : str, optional
+        CRS of a file that does not state its own if none is declared; a file may state another one.
 
     Raises
     ------
@@ -140,6 +150,7 @@ def open_terrain(
         reader = ModelReader(path)
         header = reader.header
         require_projected_metres(header.crs, f"{path}: CRS")
+        _refuse_other(path, header.crs, crs)
         if height_system is not None:
             require_metric_heights(height_system, f"{path}: a terrain model is in metres; declared height system")
         return OpenTerrain(
@@ -151,11 +162,21 @@ def open_terrain(
             resolution=reader.finest,
             model=reader,
         )
-    return _open_raster(path, crs, option, height_system)
+    raster = TerrainReader(path, crs or default_crs, height_system)
+    _refuse_other(path, raster.info.crs, crs)
+    return _of_raster(path, raster, option)
 
 
-def _open_raster(path: Path, crs: str | None, option: str, height_system: str | None) -> OpenTerrain:
-    reader = TerrainReader(path, crs, height_system)
+def _refuse_other(path: Path, stated: str | None, declared: str | None) -> None:
+    """Refuse a declared CRS that is not the one which the file states."""
+    if stated is not None and declared is not None and not same_crs(stated, declared):
+        raise InputError(
+            f"{path}: states {crs_label(split_compound(stated)[0] or stated)}, declared is {crs_label(declared)}; "
+            "leave the declaration out, or correct the file (`gdal_edit.py -a_srs`)"
+        )
+
+
+def _of_raster(path: Path, reader: TerrainReader, option: str) -> OpenTerrain:
     info = reader.info
     assert info.to_map is not None
     target = target_of(info.path, info.driver)

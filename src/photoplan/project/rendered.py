@@ -57,6 +57,8 @@ class DrapedTexture:
         reader = RasterReader(path)
         if reader.info.to_map is None or reader.info.crs is None:
             raise InputError(f"{path}: a texture needs a place on the map; georeference it (`gdal_edit.py -a_srs`)")
+        if reader.info.contradiction is not None:
+            raise InputError(f"{path}: {reader.info.contradiction}")
         if not same_crs(reader.info.crs, crs):
             raise InputError(
                 f"{path}: is in {crs_label(reader.info.crs)}, the project in {crs_label(crs)}; warp one of them"

@@ -213,7 +213,7 @@ def known_height_errors(project: Project) -> HeightErrors | None:
     else what the terrain model holds; None: nothing is known."""
     terrain = project.ground
     if isinstance(terrain.sigma, str):
-        beside, _ = open_terrain(project.resolve(terrain.sigma), terrain.crs).in_crs(project.crs)
+        beside, _ = open_terrain(project.resolve(terrain.sigma), default_crs=terrain.crs).in_crs(project.crs)
         return RasterHeightErrors(beside.surface)
     if terrain.sigma is not None:
         return StatedHeightErrors(terrain.sigma)

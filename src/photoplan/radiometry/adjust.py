@@ -8,6 +8,7 @@ less by a robust weight.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ _HALF = 2.385
 _LEAST_SLOPE = 0.05
 #: What a table that may not fall weighs beside the observations; their least standard deviation, part of the range.
 _HARD, _FLOOR = 1e4, 0.001
+#: Parts of the ground that are darker than the two grey values at which the mean of all curves is held.
+_HELD = (0.1, 0.9)
 _ROUNDS, _CONVERGED = 30, 1e-3
 #: Observations that err together by what the model leaves out; each counts as this part of one.
 _CORRELATED = 16.0
@@ -52,8 +55,6 @@ class AdjustedBand:
     """Result for one band."""
 
     state: BandState
-    sigmas: BandState
-    """Standard deviations of tables and trends, beside the gauge; of the ground none."""
     sigma: float
     """Standard deviation of a quantile of an image in a cell, grey values."""
     rounds: int
@@ -65,6 +66,21 @@ class AdjustedBand:
     """Errors of all unknowns, (unknowns, k): their sum of squares over k is the variance."""
     prior_errors: _Floats
     """The same if there were no observations, (unknowns, k)."""
+    curve_last: bool = True
+    """Whether curves act after trends."""
+    relative: bool = False
+    """Whether only departures of the tables from their mean matter, since light becomes grey again by that mean."""
+
+    @cached_property
+    def sigmas(self) -> BandState:
+        """Standard deviations of tables and trends, beside the gauge; of the ground none."""
+        errors, parts, (images, nodes) = self.errors.copy(), self.prior.parts, self.state.tables.shape
+        if self.relative:
+            tables = errors[: images * self.state.width].reshape(images, self.state.width, -1)[:, :nodes]
+            for part in np.unique(parts):
+                tables[parts == part] -= tables[parts == part].mean(axis=0)
+        blank = replace(self.state, ground=np.full(len(self.state.ground), np.nan))
+        return blank.with_vector(np.sqrt(np.square(errors).sum(axis=1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +110,7 @@ class _Normals:
     """What that loses with theirs, (groups, unknowns)."""
 
 
-def adjust(band: Band, gauge: Gauge, prior: Prior) -> AdjustedBand:
+def adjust(band: Band, gauge: Gauge, prior: Prior, *, judged: bool = True) -> AdjustedBand:
     """Tables and trends of one band.
 
     Parameters
@@ -104,6 +120,8 @@ def adjust(band: Band, gauge: Gauge, prior: Prior) -> AdjustedBand:
     gauge : Gauge
     prior : Prior
         Its variance components are initial values.
+    judged : bool
+        Whether errors are estimated; else there are none.
     """
     images = len(gauge.parts)
     state, span = band.start(images, prior.common), float(np.ptp(band.nodes))
@@ -131,18 +149,21 @@ def adjust(band: Band, gauge: Gauge, prior: Prior) -> AdjustedBand:
         if rounds <= _COMPONENTS:
             prior = _with_components(prior, solved, P, wanted, component, state.vector)
     weights = _weigh(band, state, robust, gauge.fixed is None)
-    drawn = P.T @ np.random.default_rng(0).normal(size=(P.shape[0], _DRAWS)) / np.sqrt(_DRAWS)
-    errors = np.concatenate([_without_parts(band, state, weights, solved, N), solved.step(drawn, 0.0)], axis=1)
-    blank = replace(state, ground=np.full(len(state.ground), np.nan))
+    errors, before = np.zeros((2, state.vector.size, 0))
+    if judged:
+        drawn = P.T @ np.random.default_rng(0).normal(size=(P.shape[0], _DRAWS)) / np.sqrt(_DRAWS)
+        errors = np.concatenate([_without_parts(band, state, weights, solved, N), solved.step(drawn, 0.0)], axis=1)
+        before = Solved.of(csr_array(P.T @ P), H).step(drawn, 0.0)
     return AdjustedBand(
         state=state,
-        sigmas=blank.with_vector(np.sqrt(np.square(errors).sum(axis=1))),
         sigma=weights.sigma,
         rounds=rounds,
         down=float((robust < 0.5).mean()),
         prior=prior,
         errors=errors,
-        prior_errors=Solved.of(csr_array(P.T @ P), H).step(drawn, 0.0),
+        prior_errors=before,
+        curve_last=band.curve_last,
+        relative=band.curve_last and gauge.fixed is None and not band.referred,
     )
 
 
@@ -246,11 +267,14 @@ def _gauge(band: Band, state: BandState, gauge: Gauge) -> tuple[_Floats, _Floats
         if band.referred and not len(fixed):
             continue
         used = fixed if len(fixed) else members
-        for k in range(nodes):
+        # Where curves act last, fall-off is multiplied in light: overlaps determine the mean curve but for two values.
+        few = band.curve_last and not len(fixed)
+        k = np.clip(np.searchsorted(band.nodes, np.quantile(band.own, _HELD)), 1, nodes - 2)
+        for node in np.unique(k).tolist() if few else range(nodes):
             row = np.zeros(state.vector.size)
-            row[used * width + k] = 1 / len(used)
+            row[used * width + node] = 1 / len(used)
             rows.append(row)
-            held.append(float(band.nodes[k]))
+            held.append(float(band.nodes[node]))
     return np.array(rows).reshape(-1, state.vector.size), np.array(held)
 
 

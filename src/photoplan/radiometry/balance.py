@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from photoplan.radiometry.adjust import AdjustedBand, Gauge, adjust
 from photoplan.radiometry.cells import Cells, neighbours
 from photoplan.radiometry.equations import Band
-from photoplan.radiometry.priors import Basis, Prior, placed
+from photoplan.radiometry.priors import COUNTS, Basis, Prior, placed
 from photoplan.radiometry.ratio import factors
 from photoplan.radiometry.tone import Tone, powers_of, surface
 
@@ -30,6 +31,10 @@ _SHOULDER, _BEYOND = 0.12, 0.0005
 _CHUNK = 50_000
 #: Degree of the polynomial by which a trend is written, and places along both sides of an image from which it is found.
 _FITTED, _ALONG = 6, 33
+#: Part by which the misfit of curves before the fall-off must be less, so that they are taken to act before it.
+_LESS = 0.02
+#: Places along both sides of an image at which slopes and bends of the whole block are found.
+_PLACES = 8
 #: An image whose grey values differ by less than this part of the range is all of one colour.
 _EVEN = 0.01
 
@@ -45,6 +50,8 @@ class BlockMode:
     """Standard deviation of what the balanced images still have of it."""
     prior: float
     """Standard deviation before overlaps were compared."""
+    order: float
+    """What it differs, contained in `sigma`, if curves and fall-off act in the other order."""
 
     @property
     def held(self) -> bool:
@@ -148,7 +155,9 @@ def balanced(
     parts = parts_of(inner, len(images))
     place = None if fixed is None else int(np.flatnonzero(images == fixed)[0])
     inner = _thinned(inner)
-    nodes, found = np.linspace(*limits, NODES), []
+    nodes = np.linspace(*limits, NODES)
+    found: list[tuple[AdjustedBand, AdjustedBand]] = []
+    bands: list[AdjustedBand] = []
     modes: tuple[BlockMode, ...] = ()
     if factor:
         ends = np.array(limits)
@@ -162,13 +171,21 @@ def balanced(
             np.zeros(len(images), np.int64) if cameras is None else np.unique(cameras[images], return_inverse=True)[1]
         )
         turns, middles = placed(inner, sizes[images], len(images))
-        for band in range(cells.bands):
-            equations = Band.of(inner, band, sizes[images], basis, nodes)
+
+        def fitted(band: int, last: bool, judged: bool) -> AdjustedBand:
+            equations = replace(Band.of(inner, band, sizes[images], basis, nodes), curve_last=last)
             prior = Prior(basis, nodes, _level(equations), kinds.reshape(-1), parts, turns)
-            found.append(adjust(equations, Gauge(parts, place), prior))
+            return adjust(equations, Gauge(parts, place), prior, judged=judged)
+
+        for band in range(cells.bands):
+            found.append((fitted(band, False, False), fitted(band, True, True)))
             done()
+        misfits = np.log([[each.sigma for each in both] for both in found]).mean(axis=0)
+        if misfits[0] < misfits[1] - _LESS:
+            found = [(last, fitted(band, False, True)) for band, (_, last) in enumerate(found)]
+        bands = [chosen for _, chosen in found]
         made = [
-            [_tone(nodes, each, k, degree, (int(size[0]), int(size[1]))) for each in found]
+            [_tone(nodes, each, k, parts, degree, (int(size[0]), int(size[1]))) for each in bands]
             for k, size in enumerate(sizes[images])
         ]
         raw = [[tone for tone, _ in each] for each in made]
@@ -191,7 +208,7 @@ def balanced(
         bent = [[_mapped(_entered(tone), partial(shoulder, limits=limits)) for tone in each] for each in moved]
         moved = [each if k == place else bent[k] for k, each in enumerate(moved)]
     sigmas = tuple(
-        tuple(_sigmas(nodes, each, k, raw[k][b], moved[k][b]) for b, each in enumerate(found)) or ((),) * cells.bands
+        tuple(_sigmas(nodes, each, k, raw[k][b], moved[k][b]) for b, each in enumerate(bands)) or ((),) * cells.bands
         for k in range(len(images))
     )
     return Balanced(
@@ -199,7 +216,7 @@ def balanced(
         tones=tuple(map(tuple, moved)),
         sigmas=sigmas,
         parts=parts,
-        bands=tuple(found),
+        bands=tuple(bands),
         contrast=contrast,
         modes=modes,
         shoulder=beyond,
@@ -258,32 +275,41 @@ def pairs_of(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.i
     )
 
 
-def _modes(found: Sequence[AdjustedBand], middles: _Floats, sizes: NDArray[np.int64]) -> tuple[BlockMode, ...]:
-    """Slopes and bends over the block, from the exposures and trends of its images beside the camera's fall-off."""
+def _modes(
+    found: Sequence[tuple[AdjustedBand, AdjustedBand]], middles: _Floats, sizes: NDArray[np.int64]
+) -> tuple[BlockMode, ...]:
+    """Slopes and bends over the block, from the exposures and trends of its images where they are nearest."""
     names = ("slope east", "slope north", "bend east", "twist", "bend north")
-    side = np.linspace(-0.5, 0.5, 3)
-    uv = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    side = (np.arange(_PLACES) + 0.5) / _PLACES - 0.5
+    part, nearest = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2), cKDTree(middles)
+    uv = part * (sizes / np.hypot(*sizes.T)[:, None])[:, None]
+    places = middles[:, None] + np.einsum("kni,kij->knj", uv, found[0][1].prior.turns)
+    shown = nearest.query(places)[1] == np.arange(len(middles))[:, None]
+    low, high = places[shown].min(axis=0), places[shown].max(axis=0)
+    X, Y = ((places[shown] - (low + high) / 2) / np.maximum((high - low) / 2, 1e-9)).T
+    share = np.linalg.pinv(np.stack([np.ones_like(X), X, Y, X**2, X * Y, Y**2], axis=1), rcond=1e-6)[1:]
     every: list[list[BlockMode]] = []
-    for band in found:
-        prior, width, x = band.prior, band.state.width, band.state.vector
-        terms, nodes, images = len(prior.basis.kinds), len(prior.nodes), len(middles)
-        rows = np.zeros((images * len(uv), len(x)))
-        places = np.concatenate([middle + uv @ turn for middle, turn in zip(middles, prior.turns)])
+    for other, band in found:
+        prior, width, x, at = band.prior, band.state.width, band.state.vector, 0
+        terms, nodes = len(prior.basis.kinds), len(prior.nodes)
+        M, camera = np.zeros((2, len(names), len(x)))
         for k, size in enumerate(sizes):
-            at = slice(k * len(uv), (k + 1) * len(uv))
-            half = np.hypot(*size) / 2
-            x_, y_ = (uv * half + (size - 1) / 2).T
+            x_, y_ = (part[shown[k]] * size + (size - 1) / 2).T
             shapes = prior.basis.at(x_, y_, (int(size[0]), int(size[1])))
-            camera = images * width + prior.cameras[k] * terms
-            rows[at, k * width : k * width + nodes] = prior.level
-            rows[at, k * width + nodes : (k + 1) * width] = shapes
-            rows[at, camera : camera + terms] = -shapes
-        X, Y = ((places - places.mean(axis=0)) / np.maximum(np.ptp(places, axis=0) / 2, 1e-9)).T
-        M = np.linalg.pinv(np.stack([np.ones_like(X), X, Y, X**2, X * Y, Y**2], axis=1), rcond=1e-6)[1:] @ rows
-        start = np.tile(np.r_[prior.nodes, np.zeros(terms)], images)
-        value = M[:, : len(start)] @ (x[: len(start)] - start)
-        sigma, before = (np.sqrt(np.square(M @ each).sum(axis=1)) for each in (band.errors, band.prior_errors))
-        every.append([BlockMode(*each) for each in zip(names, value.tolist(), sigma.tolist(), before.tolist())])
+            mine = share[:, at : at + len(shapes)]
+            at += len(shapes)
+            M[:, k * width : k * width + nodes] = mine.sum(axis=1)[:, None] * prior.level
+            M[:, k * width + nodes : (k + 1) * width] = mine @ shapes
+            first = len(middles) * width + prior.cameras[k] * terms
+            camera[:, first : first + terms] += mine @ shapes
+        start = np.tile(np.r_[prior.nodes, np.zeros(terms)], len(middles))
+        value = (M - camera) @ (x - np.r_[start, np.zeros(len(x) - len(start))])
+        order = np.abs(M @ (x - other.state.vector))
+        # Variance components come from few images: errors have the distribution of Student, not of Gauss.
+        freedom = COUNTS + max(len(middles) - 3, 0)
+        sigma = np.sqrt(np.square(M @ band.errors).sum(axis=1) * freedom / (freedom - 2) + order**2)
+        before = np.sqrt(np.square((M - camera) @ band.prior_errors).sum(axis=1))
+        every.append([BlockMode(*each) for each in zip(names, *np.stack([value, sigma, before, order]).tolist())])
     return tuple(max(same, key=lambda mode: mode.sigma) for same in zip(*every))
 
 
@@ -296,7 +322,9 @@ def _level(band: Band) -> _Floats:
     return np.asarray(weight / max(float(weight @ np.abs(band.nodes)), 1e-12))
 
 
-def _tone(nodes: _Floats, found: AdjustedBand, image: int, degree: int, size: tuple[int, int]) -> tuple[Tone, float]:
+def _tone(
+    nodes: _Floats, found: AdjustedBand, image: int, parts: NDArray[np.int64], degree: int, size: tuple[int, int]
+) -> tuple[Tone, float]:
     """The tone of an image: its table the other way, with equal steps of grey between entries; and its trend's mean."""
     prior, basis, own = found.prior, found.prior.basis, found.state.trends[image]
     x, y = (each.ravel() for each in np.meshgrid(*((np.arange(_ALONG) + 0.5) * side / _ALONG - 0.5 for side in size)))
@@ -310,8 +338,16 @@ def _tone(nodes: _Floats, found: AdjustedBand, image: int, degree: int, size: tu
         powers = powers_of(_FITTED)
         fit = np.linalg.lstsq(surface(x, y, size, powers), trend / trend.mean() - 1, rcond=None)[0]
         terms = tuple((i, j, float(c)) for (i, j), c in zip(powers, fit))
-    table = Tone(tuple((found.state.tables[image] * mean).tolist()), tuple(nodes.tolist()))
     grey = np.linspace(nodes[0], nodes[-1], ENTRIES)
+    if found.curve_last:
+        # Light becomes grey again by the mean curve of the images.
+        curve = tuple(found.state.tables[image].tolist()), tuple((nodes / mean).tolist())
+        becomes = np.interp(
+            grey, nodes, found.state.tables[parts == parts[image]].mean(axis=0) if found.relative else nodes
+        )
+        tone = Tone(tuple(grey.tolist()), tuple(becomes.tolist()), terms, curve)
+        return (tone if terms else tone.at_mean_trend(ENTRIES)), mean
+    table = Tone(tuple((found.state.tables[image] * mean).tolist()), tuple(nodes.tolist()))
     return Tone(tuple(grey.tolist()), tuple(table.table(grey).tolist()), terms), mean
 
 
@@ -348,8 +384,7 @@ def _toned(
         rows = order[starts[image] : starts[image + 1]]
         (x, y), size = np.moveaxis(places[rows], -1, 0), (int(sizes[image][0]), int(sizes[image][1]))
         for band, each in enumerate(tone):
-            trend = each.trend(x, y, size) if each.terms else 1.0
-            out[rows, band] = each.table(out[rows, band] / trend)
+            out[rows, band] = each.of(out[rows, band], x, y, size)
     return out
 
 
@@ -382,5 +417,9 @@ def _beyond(
 
 def _sigmas(nodes: _Floats, found: AdjustedBand, image: int, before: Tone, after: Tone) -> tuple[float, ...]:
     """Standard deviations of a table's entries, scaled by what came after the adjustment."""
-    shown = np.interp(before.becomes, nodes, found.sigmas.tables[image])
-    return tuple((shown * np.gradient(np.asarray(after.becomes), np.asarray(after.grey))).tolist())
+    light, becomes = np.asarray(before.becomes), np.asarray(after.becomes)
+    shown = np.interp(light, nodes, found.sigmas.tables[image])
+    if any(after.curve):
+        # Errors of the curve are those of grey values; its entries are light.
+        shown = shown / np.interp(light, nodes, np.gradient(found.state.tables[image], nodes))
+    return tuple((shown * np.gradient(becomes, np.asarray(after.grey))).tolist())

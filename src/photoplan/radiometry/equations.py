@@ -1,11 +1,11 @@
 """Equations of one band: the same ground has its grey value in every image, quantile by quantile.
 
-An image shows ground of grey value G as grey = F(G) · v. F is a table, the image's own; v, near 1, changes slowly over
-the image: fall-off, haze, the angles of sun and view. Its logarithm is a polynomial, so that the product of two such
-causes is one again. A quantile of an image in a cell is an observation of that;
-all images of a cell have the G of their quantiles in common, which is an unknown as well, and is taken out of the
-equations before they are solved. Errors are those of the grey values that images have: if tables were asked to make
-images equal, they would do so by taking their contrast away.
+An image shows ground of grey value G as grey = F(G · v), or F(G) · v if its curve acts before the fall-off, as in a
+print that was scanned unevenly. F is a table, the image's own; v, near 1, changes slowly over the image: fall-off,
+haze, the angles of sun and view. Its logarithm is a polynomial, so that the product of two such causes is one again.
+A quantile of an image in a cell is an observation of that; all images of a cell have the G of their quantiles in
+common, which is an unknown as well, and is taken out of the equations before they are solved. Errors are those of the
+grey values that images have: if tables were asked to make images equal, they would do so by taking their contrast away.
 """
 
 from __future__ import annotations
@@ -77,6 +77,8 @@ class Band:
     """Grey values G of the tables, at equal steps."""
     reference: _Floats
     """Mean G of each group's cell as a reference has it, (groups,); NaN where there is none."""
+    curve_last: bool = True
+    """Whether F acts after v."""
 
     @classmethod
     def of(cls, cells: Cells, band: int, sizes: NDArray[np.int64], basis: Basis, nodes: _Floats) -> Band:
@@ -135,12 +137,14 @@ class Band:
         """What the images show (n,), and its derivatives by G (n,)."""
         v, k, part = self._at(state)
         low, high = state.tables[self.image, k], state.tables[self.image, k + 1]
-        return (low + part * (high - low)) * v, (high - low) / self.step * v
+        shown = low + part * (high - low)
+        return shown if self.curve_last else shown * v, (high - low) / self.step * v
 
     def _at(self, state: BandState) -> tuple[_Floats, NDArray[np.int64], _Floats]:
         """Trends, and where tables are asked: number of the node before, and part of the way to the next."""
         v = np.exp(np.clip((self.surfaces * state.trends[self.image]).sum(axis=1), -_MOST, _MOST))
-        at = (state.ground[self.group] - self.nodes[0]) / self.step
+        ground = state.ground[self.group]
+        at = ((ground * v if self.curve_last else ground) - self.nodes[0]) / self.step
         k = np.clip(np.floor(at), 0, len(self.nodes) - 2).astype(np.int64)
         return v, k, at - k
 
@@ -148,8 +152,11 @@ class Band:
         """Derivatives of what the images show by their unknowns, (n, unknowns)."""
         v, k, part = self._at(state)
         low, high = state.tables[self.image, k], state.tables[self.image, k + 1]
-        table = low + part * (high - low)
-        values = np.column_stack([(1 - part) * v, part * v, (table * v)[:, None] * self.surfaces])
+        if self.curve_last:
+            by_trend, v = (high - low) / self.step * state.ground[self.group] * v, np.ones_like(v)
+        else:
+            by_trend = (low + part * (high - low)) * v
+        values = np.column_stack([(1 - part) * v, part * v, by_trend[:, None] * self.surfaces])
         first = self.image * state.width
         terms = len(self.nodes) + np.arange(self.surfaces.shape[1])
         columns = np.column_stack([first + k, first + k + 1, first[:, None] + terms]).astype(np.int32)

@@ -29,7 +29,7 @@ _Floats = NDArray[np.float64]
 _BEND, _SLOPE = 0.02, 1.0
 #: Initial standard deviations of the variance components: exposure, an image's own terms of degree 1 to 4; parts of the
 #: brightness, terms at the corner of the image. They count as so many observations.
-_FIRST, _COUNTS = (0.10, 0.03, 0.02, 0.01, 0.01), 4.0
+_FIRST, COUNTS = (0.10, 0.03, 0.02, 0.01, 0.01), 4.0
 _BOUNDS = ((0.01, 1.0), (0.002, 0.3), (0.002, 0.3), (0.002, 0.2), (0.002, 0.2))
 #: Standard deviations of the fall-off's radial terms r², r⁴, r⁶, of its other terms of degree 1 to 4, of the slope over
 #: the ground that all images have, and of an image's departure from radial terms above its own degree.
@@ -161,7 +161,7 @@ class Prior:
         """Return standard deviations from the expected squares of the rows of each component."""
         found = []
         for sigma, first, bounds, square, count in zip(self.sigmas, _FIRST, _BOUNDS, squares, counts):
-            variance = (_COUNTS * first**2 + square * sigma**2) / (_COUNTS + count)
+            variance = (COUNTS * first**2 + square * sigma**2) / (COUNTS + count)
             found.append(float(np.clip(np.sqrt(variance), *bounds)))
         return tuple(found)
 

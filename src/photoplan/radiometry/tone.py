@@ -1,4 +1,4 @@
-"""What becomes of grey values: a trend over the image is taken out, then a monotone table follows."""
+"""What becomes of grey values: light by the image's curve, without the trend over the image, then a monotone table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LEAST = 0.2
 
 @dataclass(frozen=True)
 class Tone:
-    """The table and the trend of one band of one image: out = table(grey / trend(x, y))."""
+    """The tables and the trend of one band of one image: out = table(light(grey) / trend(x, y))."""
 
     grey: tuple[float, ...]
     """Grey values of the table, rising."""
@@ -29,9 +29,20 @@ class Tone:
     """What they become, never falling; between them it is linear, beyond them the first or last interval goes on."""
     terms: tuple[tuple[int, int, float], ...] = ()
     """(i, j, c) of the trend 1 + Σ c (uⁱ vʲ − m); see `surface`."""
+    curve: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    """Grey values of the image, and the light that gives them: a characteristic curve that acts after the trend.
+
+    `grey` are values of light then. Without it light is grey.
+    """
 
     def __post_init__(self) -> None:
-        grey, becomes = np.asarray(self.grey), np.asarray(self.becomes)
+        self._check(self.grey, self.becomes)
+        if any(self.curve):
+            self._check(*self.curve)
+
+    @staticmethod
+    def _check(of: Sequence[float], to: Sequence[float]) -> None:
+        grey, becomes = np.asarray(of), np.asarray(to)
         if len(grey) != len(becomes) or len(grey) < 2:
             raise InputError(f"{len(grey)} grey values that become {len(becomes)}; as many are needed, two at least")
         if not (np.isfinite(grey).all() and np.isfinite(becomes).all()):
@@ -47,22 +58,41 @@ class Tone:
                 "a table may not fall"
             )
 
-    def table(self, grey: ArrayLike) -> _Floats:
-        """What grey values become without the trend."""
-        x, y = np.asarray(self.grey), np.asarray(self.becomes)
-        value = np.asarray(grey, float)
-        out = np.interp(value, x, y)
-        low, high = value < x[0], value > x[-1]
-        if low.any():
-            out = np.where(low, y[0] + (value - x[0]) * (y[1] - y[0]) / (x[1] - x[0]), out)
-        if high.any():
-            out = np.where(high, y[-1] + (value - x[-1]) * (y[-1] - y[-2]) / (x[-1] - x[-2]), out)
-        return np.asarray(out, float)
+    def table(self, light: ArrayLike) -> _Floats:
+        """Return what light without the trend becomes."""
+        return _looked_up(light, self.grey, self.becomes)
+
+    def light(self, grey: ArrayLike) -> _Floats:
+        """Return the light of grey values of the image."""
+        return _looked_up(grey, *self.curve) if any(self.curve) else np.asarray(grey, float)
+
+    def of(self, grey: ArrayLike, x: ArrayLike, y: ArrayLike, size: tuple[int, int]) -> _Floats:
+        """Return what grey values at pixels of an image become; `size`: of the image."""
+        light = self.light(grey)
+        return self.table(light / self.trend(x, y, size) if self.terms else light)
+
+    def at_mean_trend(self, entries: int) -> Tone:
+        """Return curve and table as one table of so many entries, without the trend."""
+        of = self.curve[0] if any(self.curve) else self.grey
+        grey = np.linspace(of[0], of[-1], entries)
+        return Tone(tuple(grey.tolist()), tuple(self.table(self.light(grey)).tolist()))
 
     def trend(self, x: ArrayLike, y: ArrayLike, size: tuple[int, int]) -> _Floats:
         """How bright the image is at pixels, beside its mean; `size`: of the image."""
         surfaces = surface(x, y, size, tuple((i, j) for i, j, _ in self.terms))
         return np.asarray(np.maximum(1.0 + surfaces @ np.array([c for _, _, c in self.terms]), LEAST))
+
+
+def _looked_up(value: ArrayLike, of: Sequence[float], to: Sequence[float]) -> _Floats:
+    """A table between its entries; beyond them the first or last interval goes on."""
+    x, y, at = np.asarray(of), np.asarray(to), np.asarray(value, float)
+    out = np.interp(at, x, y)
+    low, high = at < x[0], at > x[-1]
+    if low.any():
+        out = np.where(low, y[0] + (at - x[0]) * (y[1] - y[0]) / (x[1] - x[0]), out)
+    if high.any():
+        out = np.where(high, y[-1] + (at - x[-1]) * (y[-1] - y[-2]) / (x[-1] - x[-2]), out)
+    return np.asarray(out, float)
 
 
 def powers_of(degree: int) -> tuple[tuple[int, int], ...]:
@@ -106,13 +136,18 @@ def toned(pixels: NDArray[Any], window: Window, size: tuple[int, int], tones: Se
         One for each band.
     """
     out = np.empty_like(pixels)
+    short = pixels.dtype.kind in "ui" and pixels.dtype.itemsize <= 2
     for band, tone in enumerate(tones):
-        if not tone.terms and pixels.dtype.kind in "ui" and pixels.dtype.itemsize <= 2:
+        if short:
             limits = np.iinfo(pixels.dtype)
-            table = fitted(tone.table(np.arange(limits.min, limits.max + 1)), pixels.dtype)
-            out[band] = table[pixels[band].astype(np.int64) - limits.min]
+            light = tone.light(np.arange(limits.min, limits.max + 1))
+            table = light if tone.terms else fitted(tone.table(light), pixels.dtype)
+            grey = table[pixels[band].astype(np.int64) - limits.min]
+        else:
+            grey = tone.light(pixels[band].astype(np.float64))
+        if short and not tone.terms:
+            out[band] = grey
             continue
-        grey = pixels[band].astype(np.float64)
         corner, factors = (window.col, window.row), _factors(tone.terms, size)
         tone_pixels(grey, corner, size, factors, LEAST, np.array(tone.grey), np.array(tone.becomes))
         out[band] = fitted(grey, pixels.dtype)

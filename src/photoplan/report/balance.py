@@ -67,12 +67,12 @@ def _tables(axes: Any, found: Balanced, band: int) -> None:
     ends = [every[0].grey[0], every[0].grey[-1]]
     axes.plot(ends, ends, color=SOFT, linewidth=0.8, linestyle=":")
     for tone, sigmas in zip(every, (each[band] for each in found.sigmas)):
-        becomes = np.array(tone.becomes)
+        becomes, grey = np.array(tone.becomes), np.array(tone.grey)
+        if any(tone.curve):
+            grey = np.interp(grey, tone.curve[1], tone.curve[0])
         if len(every) <= 8 and sigmas:
-            axes.fill_between(
-                tone.grey, becomes - sigmas, becomes + sigmas, color=_BANDS[band], alpha=0.12, linewidth=0
-            )
-        axes.plot(tone.grey, becomes, color=_BANDS[band], linewidth=1.0, alpha=max(0.15, 1.0 / np.sqrt(len(every))))
+            axes.fill_between(grey, becomes - sigmas, becomes + sigmas, color=_BANDS[band], alpha=0.12, linewidth=0)
+        axes.plot(grey, becomes, color=_BANDS[band], linewidth=1.0, alpha=max(0.15, 1.0 / np.sqrt(len(every))))
     axes.set(xlabel="grey value", title=f"Tables, band {band + 1}")
     if band == 0:
         axes.set_ylabel("becomes (band: one σ)" if len(every) <= 8 and found.sigmas[0][0] else "becomes")

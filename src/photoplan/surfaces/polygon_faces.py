@@ -123,7 +123,9 @@ def _flattened(rings: Rings) -> tuple[_Base | None, Any, str]:
         mended = shapely.make_valid(plane)
         if abs(mended.area - plane.area) > ROUNDING * plane.length:
             return None, None, f"crosses itself ({reason})"
-        plane = shapely.MultiPolygon([part for part in shapely.get_parts(mended) if part.geom_type == "Polygon"])
+        # A collection holds polygons of several parts beside lines.
+        parts = shapely.get_parts(shapely.get_parts(mended))
+        plane = shapely.MultiPolygon([part for part in parts if part.geom_type == "Polygon"])
     return _Base(np.concatenate(clean), np.concatenate(planes), middle, axes), plane, ""
 
 

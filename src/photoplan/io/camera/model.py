@@ -23,17 +23,20 @@ from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.cameras.lenses.radial_table import RadialTable
 from photoplan.cameras.lenses.reversed import Reversed
 from photoplan.errors import InputError
-from photoplan.io.mark_model import Marks
+from photoplan.io.mark_model import LARGEST, Marks, Number
 from photoplan.io.names import check_input_name
 
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
+Positive = Annotated[float, Strict(), Field(gt=0, le=LARGEST, allow_inf_nan=False)]
+NotNegative = Annotated[float, Strict(), Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 Pixels = Annotated[int, Strict(), Field(gt=0, le=10_000_000)]
 Pair = tuple[Number, Number]
 Triple = tuple[Number, Number, Number]
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Fiducials = dict[Name, Pair]
+
+
+class UnusableCamera(InputError):
+    """A camera of a model that has no form here; only its images suffer."""
 
 
 class Entry(BaseModel):

@@ -15,7 +15,7 @@ from typing import Any
 from photoplan.errors import InputError
 from photoplan.io.appearance import looks_like
 from photoplan.io.camera.frame import frame_in_pixels
-from photoplan.io.camera.model import CameraEntry, InPixels
+from photoplan.io.camera.model import CameraEntry, InPixels, UnusableCamera
 from photoplan.io.plain_files import finite, read_json
 
 _COEFFICIENTS = {
@@ -42,8 +42,13 @@ def read(path: Path) -> dict[str, CameraEntry]:
     return cameras_of(contents, path)
 
 
-def cameras_of(reconstructions: Any, path: Path) -> dict[str, CameraEntry]:
-    """Cameras of the parsed contents of a ``reconstruction.json``."""
+def cameras_of(
+    reconstructions: Any, path: Path, faults: dict[str, UnusableCamera] | None = None
+) -> dict[str, CameraEntry]:
+    """Cameras of the parsed contents of a ``reconstruction.json``.
+
+    Those of a projection that has no form here are entered into `faults`; None: they are errors.
+    """
     if not isinstance(reconstructions, list) or not all(
         isinstance(r, dict) and isinstance(r.get("cameras"), dict) for r in reconstructions
     ):
@@ -53,7 +58,13 @@ def cameras_of(reconstructions: Any, path: Path) -> dict[str, CameraEntry]:
     cameras: dict[str, CameraEntry] = {}
     for reconstruction in reconstructions:
         for name, values in reconstruction["cameras"].items():
-            camera = _camera(values, f"{path}: camera {name!r}")
+            try:
+                camera = _camera(values, f"{path}: camera {name!r}")
+            except UnusableCamera as error:
+                if faults is None:
+                    raise
+                faults[name] = error
+                continue
             if cameras.setdefault(name, camera) != camera:
                 raise InputError(f"{path}: camera {name!r} differs between the reconstructions; keep one of them")
     return cameras
@@ -68,7 +79,9 @@ def _camera(values: Any, where: str) -> CameraEntry:
         raise InputError(f"{where}: projection_type is missing")
     kind = values["projection_type"]
     if not isinstance(kind, str) or kind not in _COEFFICIENTS:
-        raise InputError(f"{where}: projection_type {kind!r} is not supported; allowed are {', '.join(_COEFFICIENTS)}")
+        raise UnusableCamera(
+            f"{where}: projection_type {kind!r} is not supported; must be one of {', '.join(_COEFFICIENTS)}"
+        )
     size = finite([values.get("width"), values.get("height")], f"{where}: width and height", 2)
     w, h = int(size[0]), int(size[1])
     side = max(w, h)

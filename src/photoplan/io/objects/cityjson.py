@@ -160,5 +160,6 @@ def _ring(places: list[int], vertices: NDArray[np.float64]) -> NDArray[np.float6
 
 def _crs(path: Path, data: dict[str, Any]) -> str | None:
     stated = members(data.get("metadata"), f"{path}: metadata").get("referenceSystem")
-    found = re.search(r"EPSG(?:::|/\d{1,8}/|/[\d.]{1,12}/|:)(\d{1,8})$", str(stated))
-    return f"EPSG:{found[1]}" if found else None
+    # Two codes are those of a compound CRS.
+    found = re.findall(r"EPSG(?:::|/\d{1,8}/|/[\d.]{1,12}/|:)(\d{1,8})(?!\d)", str(stated))
+    return f"EPSG:{'+'.join(found)}" if len(found) in (1, 2) else None

@@ -67,7 +67,7 @@ def from_polygons(
     corners, polygon, faults = filled(polygons, [names[k] for k in objects])
     if not len(corners) and not faults:
         raise InputError(f"{where}: holds no face of an object; give a file or a layer that does")
-    horizontal, heights = (None, None) if crs is None else split_compound(crs)
+    horizontal, heights = (None, None) if crs is None else split_compound(crs, f"{where}: CRS")
     owner = np.array(objects, np.int32)[polygon]
     said = tuple(roles or [None] * len(names))
     return ObjectFile(

@@ -16,10 +16,34 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation
-from photoplan.io.camera.model import CameraEntry, IdealLens
+from photoplan.io.camera.model import CameraEntry, IdealLens, UnusableCamera
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
 
 LossKind = Literal["lens", "camera", "film", "crs", "height_system", "other"]
+
+
+def without_unusable(table: OrientationTable, faults: Mapping[str, UnusableCamera]) -> OrientationTable:
+    """The table without images of cameras that cannot be used, with a note; `faults` is by the camera's name.
+
+    Raises
+    ------
+    InputError
+        No image is left.
+    """
+    lost = [image for image in table.images if image.camera in faults]
+    if not lost:
+        return table
+    first = faults[lost[0].camera or ""]
+    keep = [k for k, image in enumerate(table.images) if image.camera not in faults]
+    if not keep:
+        raise first
+    count = "1 image is" if len(lost) == 1 else f"{len(lost)} images are"
+    return replace(
+        table,
+        images=tuple(table.images[k] for k in keep),
+        positions=None if table.positions is None else table.positions[keep],
+        notes=(*table.notes, f"warning: {count} left out, whose camera cannot be used ({lost[0].name} …): {first}"),
+    )
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,10 @@ rig-from-world. COLMAP itself uses these and ignores the poses of ``images``; he
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,12 +24,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import CameraEntry
+from photoplan.io.camera.model import CameraEntry, UnusableCamera
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
-from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras
+from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras, without_unusable
 from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
 from photoplan.io.orientation.text import numbers
-from photoplan.io.plain_files import finite, read_text
+from photoplan.io.plain_files import finite, read_text, whole_number
 
 MAX_BYTES = 2 << 30
 #: Parameters of every camera model, in the order of COLMAP's model numbers (0, 1, 2, …).
@@ -92,6 +94,8 @@ class _Model:
     cameras: dict[str, CameraEntry] = field(default_factory=dict)
     images: dict[int, tuple[str, str, _Rigid, int | None]] = field(default_factory=dict)
     """Name, camera, pose and line of the file."""
+    faults: dict[str, UnusableCamera] = field(default_factory=dict)
+    """Cameras that have no form here."""
     rigs: dict[int, dict[int, _Rigid | None]] = field(default_factory=dict)
     """Sensor-from-rig of every camera; None: not stated."""
     frames: dict[int, tuple[int, _Rigid, list[tuple[int, int]]]] = field(default_factory=dict)
@@ -137,9 +141,10 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         posed(name, pose.center, pose.R.T @ FLIP, camera, line) for name, camera, pose, line in model.images.values()
     )
     notes.append("a COLMAP model states no CRS; unless it was georeferenced, position, scale and axes are its own")
-    used = {i.camera for i in images}
+    table = without_unusable(OrientationTable(file, images, notes=tuple(notes)), model.faults)
+    used = {i.camera for i in table.images}
     cameras = {name: c for name, c in model.cameras.items() if name in used}
-    return OrientationBlock(OrientationTable(file, images, notes=tuple(notes)), cameras)
+    return OrientationBlock(table, cameras)
 
 
 def _contradiction(stated: dict[str, _Rigid], others: dict[str, _Rigid]) -> str | None:
@@ -191,8 +196,10 @@ def _check_rigs(model: _Model, folder: Path, suffix: str) -> list[str]:
     return notes
 
 
-def read_cameras(path: Path) -> dict[str, CameraEntry]:
+def read_cameras(path: Path, faults: dict[str, UnusableCamera] | None = None) -> dict[str, CameraEntry]:
     """Cameras of a ``cameras.txt`` or ``cameras.bin`` by their number, as text.
+
+    Those that have no form here are entered into `faults`; None: they are errors.
 
     Raises
     ------
@@ -200,24 +207,38 @@ def read_cameras(path: Path) -> dict[str, CameraEntry]:
         A line is not of the format, or the model is not supported.
     """
     if path.suffix.lower() == ".bin":
-        return _Binary(path).cameras()
+        return _Binary(path).cameras(faults)
     cameras: dict[str, CameraEntry] = {}
     for number, line in _lines(path):
         words = line.split()
         where = f"{path}:{number}"
         if len(words) < 4:
             raise InputError(f"{where}: {line[:50]!r}; CAMERA_ID, MODEL, WIDTH, HEIGHT and parameters are needed")
-        model = _model_name(words[1], where)
-        values = numbers(words[2:], where, f"camera model {model}", 2 + len(_MODELS[model]))
-        _add_camera(cameras, words[0], model, values, where)
+        with _unusable(words[0], faults):
+            model = _model_name(words[1], where)
+            values = numbers(words[2:], where, f"camera model {model}", 2 + len(_MODELS[model]))
+            _add_camera(cameras, words[0], model, values, where)
     return cameras
+
+
+@contextmanager
+def _unusable(key: str, faults: dict[str, UnusableCamera] | None) -> Iterator[None]:
+    """Enter a camera that has no form here into `faults`."""
+    try:
+        yield
+    except UnusableCamera as error:
+        if faults is None:
+            raise
+        faults[key] = error
 
 
 def _model_name(given: str, where: str) -> str:
     """Name of a camera model that is given by name or number."""
-    name = _NUMBERED[int(given)] if given.isdecimal() and int(given) < len(_NUMBERED) else given
+    number = whole_number(given)
+    name = given if number is None or number >= len(_NUMBERED) else _NUMBERED[number]
     if name not in _MODELS:
-        raise InputError(f"{where}: camera model {given!r} is not supported; it must be one of {', '.join(_MODELS)}")
+        accepted = ", ".join(_MODELS)
+        raise UnusableCamera(f"{where}: camera model {given[:40]!r} is not supported; accepted are {accepted}")
     return name
 
 
@@ -227,7 +248,7 @@ def _add_camera(cameras: dict[str, CameraEntry], key: str, model: str, values: I
     odd = [f"{name} = {v[name]:g}" for name in _ZERO.get(model, ()) if v[name] != 0]
     if odd or "cx" not in v:
         terms = f" with {', '.join(odd)}" if odd else ""
-        raise InputError(
+        raise UnusableCamera(
             f"{where}: camera model {model}{terms} has no form here; undistort the images with "
             "`colmap image_undistorter`, or calibrate with OPENCV, FULL_OPENCV or OPENCV_FISHEYE"
         )
@@ -259,7 +280,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 def _read_model(folder: Path, suffix: str) -> _Model:
     """All files of one form; rigs and frames only where both are there."""
     rigged = all((folder / f"{name}.{suffix}").is_file() for name in ("rigs", "frames"))
-    model = _Model(read_cameras(folder / f"cameras.{suffix}"))
+    faults: dict[str, UnusableCamera] = {}
+    model = _Model(read_cameras(folder / f"cameras.{suffix}", faults), faults=faults)
     if suffix == "bin":
         model.images = _Binary(folder / "images.bin").images()
         if rigged:
@@ -291,7 +313,13 @@ def _text_images(path: Path, model: _Model) -> None:
         if key in model.images:
             raise InputError(f"{where}: image number {key} is given twice ({model.images[key][0]!r} and {name!r})")
         model.images[key] = (name, words[8], pose, number)
-        next(lines, None)
+        _, points = next(lines, (0, ""))
+        fields = points.split()
+        if len(fields) % 3 or (fields and not re.fullmatch(r"-?\d+", fields[-1])):
+            raise InputError(
+                f"{path}:{number + 1}: {points[:40]!r} after image {name!r}; an empty line, or X, Y, POINT3D_ID of its "
+                "points, must follow every image"
+            )
 
 
 def _text_rigs(folder: Path, model: _Model) -> None:
@@ -314,9 +342,10 @@ def _text_rigs(folder: Path, model: _Model) -> None:
 
 
 def _whole(word: str, where: str) -> int:
-    if not word.isdecimal() or len(word) > 20:
+    number = whole_number(word)
+    if number is None:
         raise InputError(f"{where}: {word[:40]!r} is not a whole number")
-    return int(word)
+    return number
 
 
 class _Words:
@@ -365,8 +394,8 @@ class _Binary:
         where = f"{self._path}: {what}"
         return _rigid(finite(self._take("7d"), where, 7), where)
 
-    def cameras(self) -> dict[str, CameraEntry]:
-        """Return the cameras of ``cameras.bin``."""
+    def cameras(self, faults: dict[str, UnusableCamera] | None) -> dict[str, CameraEntry]:
+        """Return the cameras of ``cameras.bin``; `faults` is as in `read_cameras`."""
         cameras: dict[str, CameraEntry] = {}
         for _ in range(self._take("Q")[0]):
             key, number, width, height = self._take("IiQQ")
@@ -375,7 +404,8 @@ class _Binary:
             if max(width, height) > 1 << 31:
                 raise InputError(f"{where}: {width} × {height} pixels; the file is damaged")
             values = finite(self._take(f"{len(_MODELS[model])}d"), where, len(_MODELS[model]))
-            _add_camera(cameras, str(key), model, (width, height, *values), where)
+            with _unusable(str(key), faults):
+                _add_camera(cameras, str(key), model, (width, height, *values), where)
         return cameras
 
     def images(self) -> dict[int, tuple[str, str, _Rigid, int | None]]:

@@ -88,9 +88,12 @@ def read_folder(path: Path) -> Folder:
     unfixed = tuple(m.file.name for m in found if m.no_fix)
     damaged = tuple(f"{m.file.name}: {fault}" for m in found for fault in m.faults)
     lost = sum(m.position is None and not m.no_fix and not m.faults for m in found)
+    elsewhere = {m.file: m.datum for m in found if m.position is not None and m.datum and not _is_wgs84(m.datum)}
+    of_other = tuple(f"{file.name}: datum {datum}" for file, datum in elsewhere.items())
     for many, what in (
         (unread, "cannot be used and are left out"),
         (damaged, "have damaged metadata, which are left out"),
+        (of_other, "refer to another datum than WGS 84 and are left out"),
     ):
         if many:
             notes.append(f"{path.name}: {len(many)} of {len(files)} images {what}: {listed(many)}")
@@ -98,16 +101,16 @@ def read_folder(path: Path) -> Folder:
         notes.append(f"{path.name}: {without_fix(unfixed)}; left out")
     if lost:
         notes.append(f"{path.name}: {lost} images state no position; left out")
-    stated = tuple(m for m in found if m.position is not None)
+    stated = tuple(m for m in found if m.position is not None and m.file not in elsewhere)
     if not stated:
         raise InputError(
             "; ".join([f"{path}: no image states a GPS position (latitude, longitude and altitude)", *notes])
         )
-    datums = {m.datum.upper().replace(" ", "").replace("-", "") for m in stated if m.datum}
-    other = sorted(d for d in datums if not d.startswith("WGS84"))
-    if other:
-        raise InputError(f"{path}: positions refer to the datum {other[0]}; only WGS 84 is read from EXIF")
     return Folder(stated, len(files), tuple(notes))
+
+
+def _is_wgs84(datum: str) -> bool:
+    return datum.upper().replace(" ", "").replace("-", "").startswith("WGS84")
 
 
 def listed(texts: Sequence[str]) -> str:

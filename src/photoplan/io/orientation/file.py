@@ -8,10 +8,11 @@ from pathlib import Path
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import disk_error, make_parents
-from photoplan.io.naming import write_atomically
+from photoplan.io.naming import together, write_atomically
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import OrientationTable, TableFormat
 from photoplan.io.plain_files import read_head
+from photoplan.io.product import check_output
 
 #: Module of every format, by name; each defines `FORMAT` (see `photoplan.io.orientation.block`).
 FORMATS: dict[str, str] = {
@@ -62,6 +63,8 @@ def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
         return orientation_format("csv")
     head = "" if path.is_dir() else read_head(path)
     claiming = [f for f in map(orientation_format, FORMATS) if f.sniff(path, head)]
+    if path.is_dir() and not claiming:
+        raise InputError(f"{path}: a folder without photographs (JPEG, TIFF) or a COLMAP model; give one, or a file")
     if len(claiming) > 1:
         kinds = ", ".join(f"{f.name} ({f.title})" for f in claiming)
         raise InputError(f"{path}: its content does not tell which format it is: {kinds}; say it with `format`")
@@ -128,15 +131,15 @@ def write_orientation(block: OrientationBlock, path: str | Path, format: str, *,
     if render is None:
         raise UsageError(f"orientation format {format} is read only; written are {', '.join(written_formats())}")
     texts = render(block, Path(path))
-    present = [str(file) for file in texts if file.exists()]
-    if present and not overwrite:
-        raise UsageError(f"{', '.join(present)}: exists already; choose another output or say `overwrite`")
-    for file, text in texts.items():
-        try:
-            make_parents(file.parent)
-        except OSError as error:
-            raise disk_error(file.parent, error) from None
-        write_atomically(file, text.encode())
+    for file in texts:
+        check_output(file, overwrite=overwrite)
+    with together():
+        for file, text in texts.items():
+            try:
+                make_parents(file.parent)
+            except OSError as error:
+                raise disk_error(file.parent, error) from None
+            write_atomically(file, text.encode())
     return list(texts)
 
 

@@ -24,7 +24,7 @@ from xml.etree.ElementTree import Element, tostring
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.errors import InputError
+from photoplan.errors import InputError, named_by
 from photoplan.geometry.crs import crs_step, parse_crs
 from photoplan.geometry.earth_poses import (
     enu_axes,
@@ -37,7 +37,7 @@ from photoplan.geometry.earth_poses import (
     map_poses,
 )
 from photoplan.geometry.units import metric_system
-from photoplan.io.camera.model import CameraEntry
+from photoplan.io.camera.model import CameraEntry, UnusableCamera
 from photoplan.io.lens_forms import AgisoftForm, agisoft_form, frame_camera
 from photoplan.io.markup_files import numbers, read_xml
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
@@ -100,6 +100,20 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     kept = [c for c, p in zip(oriented, placed) if p is not None or not georeferenced]
     if len(kept) < len(oriented):
         notes.append(f"{path.name}: {len(oriented) - len(kept)} cameras of a component without position; left out")
+    described: dict[str, tuple[str, CameraEntry]] = {}
+    faults: dict[str, UnusableCamera] = {}
+    for s in dict.fromkeys(c.get("sensor_id", "") for c in kept):
+        try:
+            described[s] = _sensor(sensors.get(s), s, path)
+        except UnusableCamera as error:
+            faults[s] = error
+    if faults:
+        if not described:
+            raise next(iter(faults.values()))
+        usable = [c for c in kept if c.get("sensor_id", "") in described]
+        lost, first = len(kept) - len(usable), next(iter(faults.values()))
+        notes.append(f"warning: {lost} of {len(kept)} images are left out, whose camera cannot be used: {first}")
+        kept = usable
     for camera in kept:
         world = by_component.get(camera.get("component_id", ""), shared) or _Similarity()
         R, t = poses[camera]
@@ -110,7 +124,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         centers.append(world.scale * world.R @ t + world.t)
         rotations.append(world.R @ R @ FLIP)
         references.append(_reference(camera))
-    cameras = _named(chunk, {s: _sensor(sensors.get(s), s, path) for s in dict.fromkeys(s for _, s in names)})
+    cameras = _named(chunk, described)
     placing = _place(chunk, np.array(centers), np.array(rotations), georeferenced, path)
     images = tuple(
         posed(name, at, R, cameras[s][0]) for (name, s), at, R in zip(names, placing.centers, placing.rotations)
@@ -218,7 +232,7 @@ def _geodetic(references: _Floats, chunk: Element, path: Path) -> _Floats | None
     """Latitude, longitude and height (n, 3) of receivers' positions; None: none, or in no CRS that leads there."""
     crs = (chunk.findtext("./reference") or "").strip()
     there = np.isfinite(references[:, :2]).all(axis=1) & (references[:, :2] != 0).any(axis=1)
-    if not there.any() or not crs or is_local_crs(crs):
+    if not there.any() or not crs or is_local_crs(crs, f"{path}: reference"):
         return None
     try:
         system = metric_system(crs, f"{path}: reference")
@@ -244,12 +258,12 @@ def _sensor(sensor: Element | None, key: str, path: Path) -> tuple[str, CameraEn
     calibration = next((c for c in given if c.get("class") == "adjusted"), given[-1])
     kind = calibration.get("type") or sensor.get("type") or "frame"
     if kind not in ("frame", "fisheye"):
-        raise InputError(f"{where}: type {kind!r} is not supported; allowed are frame and fisheye")
+        raise UnusableCamera(f"{where}: type {kind!r} is not supported; allowed are frame and fisheye")
     v = {c: numbers(calibration.find(c), f"{where}: {c}", 1)[0] for c in _COEFFICIENTS if _has(calibration, c)}
     if "f" not in v:
         raise InputError(f"{where}: its calibration states no focal length f")
     if v.get("p3") or v.get("p4"):
-        raise InputError(f"{where}: p3 and p4 are not supported; fix them to 0, align and export again")
+        raise UnusableCamera(f"{where}: p3 and p4 are not supported; fix them to 0, align and export again")
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     sides = ("width", "height")
@@ -312,7 +326,7 @@ def _place(chunk: Element, centers: _Floats, rotations: _Floats, georeferenced: 
     if not georeferenced:
         note = f"{path.name}: the chunk has no position, scale and rotation; coordinates are the program's own"
         return _Placed(centers, rotations, notes=(note,))
-    if not stated or is_local_crs(stated):
+    if not stated or is_local_crs(stated, f"{path}: reference"):
         return _Placed(centers, rotations, notes=(f"{path.name}: coordinates are in a local system",))
     where = f"{path}: reference"
     crs = parse_crs(stated, where)
@@ -328,10 +342,8 @@ def _place(chunk: Element, centers: _Floats, rotations: _Floats, georeferenced: 
             f"{where}: {crs.name!r} is geographic on another datum than WGS 84; choose a projected CRS in Metashape "
             "(Reference, Convert) and export again"
         )
-    try:
+    with named_by(path):
         XYZ, axes = map_poses(horizontal, centers)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
     return _Placed(XYZ, np.swapaxes(axes, 1, 2) @ rotations, crs=horizontal)
 
 

@@ -28,15 +28,23 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
 from photoplan.geometry.agreement import agreement, misfit
+from photoplan.geometry.bounds import is_no_fix
 from photoplan.geometry.crs import crs_label, crs_step, topocentric_poses, utm_codes
 from photoplan.geometry.earth_poses import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
 from photoplan.io.appearance import looks_like
-from photoplan.io.camera.model import CameraEntry
+from photoplan.io.camera.model import CameraEntry, UnusableCamera
 from photoplan.io.camera.opensfm import cameras_of
 from photoplan.io.lens_forms import opencv_form, opencv_losses
-from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
+from photoplan.io.orientation.block import (
+    Loss,
+    OrientationBlock,
+    OrientationFormat,
+    height_losses,
+    require_cameras,
+    without_unusable,
+)
 from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
-from photoplan.io.plain_files import finite, read_json
+from photoplan.io.plain_files import elements, finite, members, read_json
 
 _Floats = NDArray[np.float64]
 
@@ -138,25 +146,26 @@ def _votes_of_files(path: Path, shots: Shots) -> dict[str, bool]:
     if topocentric:
         votes["its name says topocentric"] = False
     elif beside.is_file():
-        own = {name: shot for r in read_json(beside) for name, shot in r.get("shots", {}).items()}
-        same = _equal(shots, {name: shot.get("rotation") for name, shot in own.items()})
+        own = {name: members(shot, f"{beside}: {name!r}") for name, shot in _stated(_reconstructions(beside))}
+        same = _equal(shots, {name: shot.get("rotation") for name, shot in own.items()}, beside)
         if same is not None:
             votes[f"{beside.name} has {'the same' if same else 'other'} rotations"] = not same
     for folder in (path.parent, path.parent / "odm_report", path.parent.parent / "odm_report"):
         report = folder / "shots.geojson"
         if report.is_file():
-            stated = [f.get("properties", {}) for f in read_json(report).get("features", [])]
-            same = _equal(shots, {str(p.get("filename")): p.get("rotation") for p in stated})
+            features = elements(members(read_json(report), str(report)).get("features"), f"{report}: features")
+            stated = [members(members(f, str(report)).get("properties"), f"{report}: properties") for f in features]
+            same = _equal(shots, {str(p.get("filename")): p.get("rotation") for p in stated}, report)
             if same is not None:
                 votes[f"shots.geojson has {'the same' if same else 'other'} rotations"] = same
             break
     return votes
 
 
-def _equal(shots: Shots, rotations: dict[str, object]) -> bool | None:
+def _equal(shots: Shots, rotations: dict[str, object], file: Path) -> bool | None:
     """Whether shots have the rotation vectors of another file, digit for digit; None: no image is in both."""
     apart = [
-        float(np.abs(vector - np.asarray(rotations[name], float)).max())
+        float(np.abs(np.subtract(vector, finite(rotations[name], f"{file}: rotation of {name!r}", 3))).max())
         for name, vector in zip(shots.names, shots.vectors)
         if isinstance(rotations.get(name), list)
     ]
@@ -284,16 +293,12 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         The file is no such JSON, it is not georeferenced, its poses are in no known world, or a camera's model is not
         supported.
     """
-    contents = read_json(path)
-    if not isinstance(contents, list) or not all(isinstance(r, dict) and "shots" in r for r in contents):
-        raise InputError(
-            f"{path}: not a reconstruction.json of OpenSfM (a list of reconstructions with `shots`){looks_like(path)}"
-        )
+    contents = _reconstructions(path)
     origins = {_origin(r, path) for r in contents}
     if len(origins) != 1:
         raise InputError(f"{path}: the reconstructions have {len(origins)} different origins; keep one reconstruction")
     origin = origins.pop()
-    stated = [(name, shot) for r in contents for name, shot in r["shots"].items()]
+    stated = _stated(contents)
     if not stated:
         raise InputError(f"{path}: a reconstruction.json without shots; reconstruct again")
     shots = _shots(stated, path)
@@ -317,8 +322,26 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         positions=geodetic_of_enu(origin, shots.gps) if known else None,
         notes=tuple(notes),
     )
+    faults: dict[str, UnusableCamera] = {}
     described = all(isinstance(r.get("cameras"), dict) for r in contents)
-    return OrientationBlock(table, cameras_of(contents, path) if described else {})
+    cameras = cameras_of(contents, path, faults) if described else {}
+    return OrientationBlock(without_unusable(table, faults), cameras)
+
+
+def _reconstructions(path: Path) -> list[dict[str, Any]]:
+    """Reconstructions of a file, with their shots."""
+    contents = read_json(path)
+    if not isinstance(contents, list) or not all(
+        isinstance(each, dict) and isinstance(each.get("shots"), dict) for each in contents
+    ):
+        raise InputError(
+            f"{path}: not a reconstruction.json of OpenSfM (a list of reconstructions with `shots`){looks_like(path)}"
+        )
+    return contents
+
+
+def _stated(reconstructions: list[dict[str, Any]]) -> list[tuple[str, Any]]:
+    return [(name, shot) for each in reconstructions for name, shot in each["shots"].items()]
 
 
 def _origin(reconstruction: dict[str, Any], path: Path) -> tuple[float, float, float]:
@@ -331,6 +354,11 @@ def _origin(reconstruction: dict[str, Any], path: Path) -> tuple[float, float, f
     lat, lon, alt = (finite(lla.get(k), f"{path}: reference_lla.{k}") for k in ("latitude", "longitude", "altitude"))
     if abs(lat) > 90 or abs(lon) > 360:
         raise InputError(f"{path}: reference_lla latitude {lat}, longitude {lon} are not on the earth")
+    if is_no_fix(lat, lon):
+        raise InputError(
+            f"{path}: reference_lla is latitude 0, longitude 0: OpenSfM writes so if no image states a position; the "
+            "reconstruction is not georeferenced"
+        )
     return lat, lon, alt
 
 

@@ -56,7 +56,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     if crs is not None:
         metric = metric_system(crs, f"{path}: CoordinateSystem")
         crs, height_system = split_compound(crs)
-        if is_wgs84_geographic(crs, f"{path}: CoordinateSystem"):
+        if crs is not None and is_wgs84_geographic(crs, f"{path}: CoordinateSystem"):
             rise = metric.height_scale or 1.0
             images = [replace(i, center=(*i.center[:2], i.center[2] * rise)) for i in images]
             return OrientationBlock(_in_tangential_system(OrientationTable(path, tuple(images), notes=tuple(notes))))
@@ -86,7 +86,7 @@ def _in_tangential_system(table: OrientationTable) -> OrientationTable:
 
 def _system(text: str, where: str) -> tuple[str | None, bool]:
     """CRS of a header line, and whether it is a local one."""
-    if is_local_crs(text):
+    if is_local_crs(text, where):
         return None, True
     parse_crs(text, where)
     return text, False

@@ -26,7 +26,7 @@ from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, openc
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
 from photoplan.io.orientation.text import checked_rotation, numbers
-from photoplan.io.plain_files import read_text
+from photoplan.io.plain_files import read_text, whole_number
 
 MAX_BYTES = 1 << 30
 _EXTERNAL = re.compile(r"\s*#?\s*imageName\s+X\s+Y\s+Z\s+Omega\s+Phi\s+Kappa\b", re.I)
@@ -73,7 +73,7 @@ def _block(
     crs = heights = None
     if side.is_file():
         text = read_text(side, 100_000).strip()
-        if is_local_crs(text):
+        if is_local_crs(text, str(side)):
             notes.append(f"{side.name}: coordinates are in a local system")
         else:
             parse_crs(text, str(side))
@@ -148,7 +148,8 @@ def _ten_lines(
     """Name, camera, position and R_camera_world of an image."""
     where = f"{path}:{rows[0][0]}"
     words = rows[0][1].rsplit(maxsplit=2)
-    if len(words) != 3 or not (words[1].isdigit() and words[2].isdigit()):
+    width, height = (whole_number(word) for word in words[1:]) if len(words) == 3 else (None, None)
+    if width is None or height is None:
         raise InputError(f"{where}: {rows[0][1][:80]!r}: file name, width and height are needed")
     lengths = (3, 3, 3, 3, 2, 3, 3, 3, 3)
     values = [numbers(row.split(), f"{path}:{n}", "line", count) for (n, row), count in zip(rows[1:], lengths)]
@@ -157,7 +158,7 @@ def _ten_lines(
     if K[0, 1] != 0 or K[1, 0] != 0:
         raise InputError(f"{path}:{rows[1][0]}: image {words[0]!r}: a sheared camera matrix is not supported")
     form = OpenCVForm(
-        size=(int(words[1]), int(words[2])),
+        size=(width, height),
         focal=(float(K[0, 0]), float(K[1, 1])),
         point=(float(K[0, 2]) - 0.5, float(K[1, 2]) - 0.5),
         fisheye=False,

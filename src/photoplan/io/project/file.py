@@ -48,11 +48,12 @@ def _with_sizes(data: dict[str, Any], folder: Path) -> dict[str, Any]:
         return data
     sized = []
     for image in images:
-        camera = cameras.get(image.get("camera")) if isinstance(image, dict) else None
+        name, file = (image.get("camera"), image.get("file")) if isinstance(image, dict) else (None, None)
+        camera = cameras.get(name) if isinstance(name, str) and isinstance(file, str) else None
         if isinstance(camera, dict) and image.get("fiducials") and "size" not in {**camera, **image}:
             # What is wrong with the file is said where it is opened.
-            with suppress(InputError, TypeError):
-                image = {**image, "size": [*read_info(resolve_input(folder, image["file"])).size]}
+            with suppress(InputError):
+                image = {**image, "size": [*read_info(resolve_input(folder, str(file))).size]}
         sized.append(image)
     return {**data, "images": sized}
 

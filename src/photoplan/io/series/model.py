@@ -32,7 +32,7 @@ CONDITIONS = {
     "time_s": "s",
 }
 
-NotNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Strict(), Field(ge=0, le=1e15, allow_inf_nan=False)]
 Count = Annotated[int, Strict(), Field(ge=0, le=10_000_000)]
 Side = Annotated[int, Strict(), Field(gt=0, le=10_000_000)]
 Roi = tuple[Count, Count, Side, Side]

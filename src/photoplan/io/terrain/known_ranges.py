@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sys
 import tempfile
 import zlib
 from contextlib import suppress
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.io.disk import cache_folder
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.terrain.reader import TerrainReader
 
@@ -30,19 +30,6 @@ WORTH_KEEPING = 1 << 25
 #: Terrains whose ranges are kept (16 MB each at most); those used longest ago go.
 MOST_FILES = 32
 _MAGIC = b"PPRANGE1"
-
-
-def cache_folder() -> Path:
-    """Where things are kept that are only a matter of time: PHOTOPLAN_CACHE_DIR, or photoplan in the user's cache."""
-    if stated := os.environ.get("PHOTOPLAN_CACHE_DIR"):
-        return Path(stated)
-    if sys.platform == "win32":
-        above = Path(os.environ.get("LOCALAPPDATA") or "~/AppData/Local")
-    elif sys.platform == "darwin":
-        above = Path("~/Library/Caches")
-    else:
-        above = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
-    return above.expanduser() / "photoplan"
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
 from photoplan.geometry.units import FOOT, metres_in
+from photoplan.io.plain_files import whole_number
 from photoplan.io.terrain.options import OTHER, CodeClass, ReadOptions
 from photoplan.surfaces.measured import LINE_KINDS, LineKind, MeasuredLine, MeasuredTerrain, PointGroup, Tin
 
@@ -114,6 +115,8 @@ class _Reader:
 
     def _units(self, element: Element, tag: str) -> None:
         linear = element.get("linearUnit") or ("meter" if tag == "Metric" else "foot")
+        if self.unit is not None:
+            raise InputError(f"{self.path}: states its units twice; keep one of Metric and Imperial")
         self.unit = metres_in(linear, f"{self.path}: linearUnit")
         heights = element.get("elevationUnit")
         foot = abs(self.unit - FOOT) < 1e-5
@@ -182,12 +185,13 @@ class _Reader:
     def vertex(self, element: Element, surface: _LandXmlSurface) -> None:
         where = f"{self.path}: {surface.name}: point {element.get('id')!r} of the triangulation"
         text = element.get("id", "")
-        if not text.strip().isdigit() or len(text) > 18:
+        number = whole_number(text.strip())
+        if number is None:
             raise InputError(f"{where}: its id is not a number")
         xyz = _numbers(element, 3, where)
-        if len(xyz) != 1 or int(text) in surface.numbers:
+        if len(xyz) != 1 or number in surface.numbers:
             raise InputError(f"{where}: {'given twice' if len(xyz) == 1 else 'three numbers are needed'}")
-        surface.numbers[int(text)] = len(surface.vertices)
+        surface.numbers[number] = len(surface.vertices)
         surface.vertices.append(xyz[0, [1, 0, 2]])
 
     def face(self, element: Element, surface: _LandXmlSurface) -> None:

@@ -46,6 +46,9 @@ _RECORD_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 # GeoTIFF keys (OGC 19-008r4): model, geographic CRS, projected CRS, linear unit, vertical CRS, vertical unit.
 _GEOGRAPHIC, _PROJECTED, _UNIT, _VERTICAL, _VERTICAL_UNIT = 2048, 3072, 3076, 4096, 4099
 _USER_DEFINED = 32767
+#: Vertical codes of GeoTIFF 1.0 (section 6.3.4.2), which EPSG does not know, as codes of EPSG in metres; they state no
+#: unit of their own. Those from 5001 to 5033 are heights above ellipsoids.
+_OLD_VERTICAL = {5101: 5701, 5102: 7968, 5103: 5703, 5104: 5736, 5105: 5705, 5106: 5706}
 
 
 def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
@@ -215,7 +218,7 @@ def _points(path: Path, file: Any, options: ReadOptions) -> tuple[NDArray[np.flo
         if classified:
             use &= np.isin(classes, (GROUND,) if wanted is None else wanted)
         at = np.flatnonzero(use)
-        kept.append((np.stack([chunk.x[at], chunk.y[at], chunk.z[at]], axis=1), at + done + 1))
+        kept.append((np.stack([np.asarray(v)[at] for v in (chunk.x, chunk.y, chunk.z)], axis=1), at + done + 1))
         done += len(classes)
     if done != file.header.point_count:
         raise InputError(f"{path}: holds {done} of {file.header.point_count} promised points; it is cut off")
@@ -244,8 +247,7 @@ def _crs(path: Path, header: Any) -> tuple[str | None, str | None, _Units]:
     for vlr in vlrs:
         text = getattr(vlr, "string", None)
         if vlr.user_id.strip("\0 ") == "LASF_Projection" and vlr.record_id == 2112 and text and text.strip("\0 "):
-            parse_crs(text.strip("\0 "), f"{path}: CRS")
-            return *split_compound(text.strip("\0 ")), (None, None)
+            return *split_compound(text.strip("\0 "), f"{path}: CRS"), (None, None)
     for vlr in vlrs:
         entries = getattr(vlr, "geo_keys", None)
         if vlr.user_id.strip("\0 ") == "LASF_Projection" and entries:
@@ -265,7 +267,11 @@ def _of_geokeys(path: Path, keys: dict[int, int]) -> tuple[str | None, str | Non
         parse_crs(f"EPSG:{code}", f"{path}: CRS")
     crs = canonical_crs(f"EPSG:{code}") if code and code != _USER_DEFINED else None
     heights = None
-    if 1024 <= vertical < _USER_DEFINED and parse_crs(f"EPSG:{vertical}", f"{path}: heights").is_vertical:
+    if 5001 <= vertical <= 5033:
+        heights = "ellipsoidal"
+    elif vertical in _OLD_VERTICAL:
+        heights = canonical_crs(f"EPSG:{_OLD_VERTICAL[vertical]}")
+    elif 1024 <= vertical < _USER_DEFINED and parse_crs(f"EPSG:{vertical}", f"{path}: heights").is_vertical:
         heights = canonical_crs(f"EPSG:{vertical}")
         agreed_metres(up, metric_heights(heights)[1], f"{path}: heights", in_one_file=True)
     return crs, heights, (plan, up)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.io.plain_files import whole_number
 from photoplan.io.table_lines import DELIMITERS, Line, decimal, line_blocks, number, split_line
 from photoplan.io.tables import Dialect, TableLayout, wrong_width
 
@@ -112,7 +113,7 @@ class PointTable:
         found = [i for i, name in enumerate(lower) if name == wanted.casefold()]
         if len(found) == 1:
             return found[0]
-        if wanted.isdigit() and 1 <= int(wanted) <= len(self.names):
+        if 1 <= (whole_number(wanted) or 0) <= len(self.names):
             return int(wanted) - 1
         raise InputError(
             f"{self.path}:{line}: {len(found) or 'no'} columns {wanted!r} for {axis.upper()}; "

@@ -90,6 +90,8 @@ class TerrainReader:
             )
         if info.to_map is None:
             raise InputError(f"{info.path}: the grid is not georeferenced; give it a world file or a geotransform")
+        if info.contradiction is not None:
+            raise InputError(f"{info.path}: {info.contradiction}")
         if not (info.scales[0] != 0 and np.isfinite([info.scales[0], info.offsets[0]]).all()):
             raise InputError(f"{info.path}: scale {info.scales[0]} and offset {info.offsets[0]} make no heights")
         object.__setattr__(self, "path", info.path)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.units import metres_in, unit_label
+from photoplan.io.table_lines import NUMBER
 from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_line, make_groups
 from photoplan.io.terrain.options import CodeClass, ReadOptions
 from photoplan.io.vector_layer import ENTITIES, is_drawing, layers_of, read_layer, views_of
@@ -142,6 +143,12 @@ def _layer(
         parts, again = shapely.get_parts(parts, return_index=True)
         whose = whose[again]
     if not len(parts):
+        spots = sum(v is not None and bool(NUMBER.fullmatch(v.strip())) for v in fields["text"]) if drawing else 0
+        if spots:
+            raise InputError(
+                f"{path}: no point and no line; {spots} of its texts are numbers; `height_field` Text takes them for "
+                "heights"
+            )
         return None, None, unit
     row = at[whose]
     if options.height_field is not None:
@@ -193,11 +200,17 @@ def _raised(
     if wanted.casefold() not in fields:
         raise InputError(f"{path}: layer {layer}: no attribute {wanted!r}; it has {', '.join(fields) or 'none'}")
     values = fields[wanted.casefold()]
-    try:
-        heights = np.array([np.nan if v is None or v == "" else v for v in values], np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: layer {layer}: not all values of {wanted} are numbers; heights are needed") from None
-    lost = int((~np.isfinite(heights[np.unique(row)])).sum())
+    used = np.unique(row)
+    heights = np.full(len(values), np.nan)
+    for k, value in zip(used.tolist(), values[used]):
+        try:
+            heights[k] = np.nan if value is None or value == "" else float(value)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"{path}: layer {layer}, feature {k + 1}: {str(value)[:40]!r} in {wanted} is not a number; heights are "
+                "needed, with a decimal point"
+            ) from None
+    lost = int((~np.isfinite(heights[used])).sum())
     if lost:
         notes.append(f"{path.name}: layer {layer}: {lost} features state no height in {wanted}")
     out = parts.copy()
@@ -211,8 +224,11 @@ def _raised(
 def _drawn(
     path: Path, geometry: NDArray[Any], fields: dict[str, Any], options: ReadOptions, notes: list[str]
 ) -> NDArray[np.bool_]:
-    """Which entities of a drawing are measured points and lines: no texts, no faces and hatches."""
-    text = np.array([v is not None for v in fields.get("text", [None] * len(geometry))], bool)
+    """Which entities of a drawing are measured points and lines: no faces and hatches, and no texts but those of
+    numbers that `height_field` takes for heights."""
+    spot = (options.height_field or "").casefold() == "text"
+    stated = fields.get("text", [None] * len(geometry))
+    text = np.array([v is not None and not (spot and NUMBER.fullmatch(v.strip())) for v in stated], bool)
     faces = shapely.get_type_id(geometry) == _POLYGON
     use = np.ones(len(geometry), bool)
     if options.layers is not None:
@@ -376,11 +392,9 @@ def _reference(path: Path, text: str | None, layer: _Layer, notes: list[str]) ->
     if text is None:
         return None, None
     crs = parse_crs(text, f"{path}: CRS")
-    if crs.name.casefold().startswith("undefined"):
-        return None, None
     bounds = shapely.total_bounds(layer.geometry[:1000])
     if path.suffix.casefold() in (".geojson", ".json") and crs.is_geographic and np.abs(bounds).max() > 360:
         # GeoJSON without a CRS is WGS 84 by its standard; coordinates that are no degrees say otherwise.
         notes.append(f"{path.name}: states no CRS, and its coordinates are no degrees")
         return None, None
-    return split_compound(text)
+    return split_compound(text, f"{path}: CRS")

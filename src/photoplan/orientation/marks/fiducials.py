@@ -27,12 +27,12 @@ DEFORMED_MM = 0.1
 """Residuals in millimetres from which a mark may be a false one: office scanners leave 0.07."""
 RIVALS = 4
 """Look-alikes that are named."""
-OTHER_SIZES = (0.8, 0.9, 1.12, 1.25)
+#: Sizes of the marks relative to the description that are tried if those as described are not found.
+OTHER_SIZES = (0.7, 0.8, 0.9, 1.12, 1.25, 1.4)
 #: Directions of crosses, degrees, that are tried where none is found as described; the usual one first.
 OTHER_DIRECTIONS = (45.0, 22.5, 67.5)
 #: Mean correlation below which other directions are tried although marks are found, and by which these must fit better.
 _SURE, _BETTER = 0.9, 0.05
-"""Sizes of the marks against the description that are tried where the described one is not found."""
 STATED_TOLERANCE = 0.03
 """Part by which the resolution that a file states may be wrong."""
 

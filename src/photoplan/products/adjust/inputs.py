@@ -147,12 +147,20 @@ def _control(
         path = project.resolve(file)
         files.append(path)
         if is_gcp_list(path):
-            gcps = read_gcp_list(path, project.crs)
+            gcps = read_gcp_list(path, project.crs, project.orientation.height_system)
             grounds.append(gcps.ground)
             points.append((path, gcps.points))
         else:
             columns, comma = project.observations.control_columns, bool(project.observations.decimal_comma)
-            grounds.append(read_ground_points(path, crs=project.crs, columns=columns, decimal_comma=comma))
+            grounds.append(
+                read_ground_points(
+                    path,
+                    crs=project.crs,
+                    height_system=project.orientation.height_system,
+                    columns=columns,
+                    decimal_comma=comma,
+                )
+            )
         _judge_places(project, path, "control point", grounds[-1].names, grounds[-1].XYZ, notes)
     return grounds, points, files
 
@@ -291,7 +299,9 @@ def _positions(project: Project, names: Sequence[str], notes: list[str]) -> Posi
         return None
     orientation = project.orientation
     form = TableFormat(angle_unit=orientation.angle_unit, rotation=orientation.rotation)
-    table = read_observed_positions(project.resolve(project.observations.positions), form, crs=project.crs)
+    table = read_observed_positions(
+        project.resolve(project.observations.positions), form, crs=project.crs, height_system=orientation.height_system
+    )
     notes += table.notes
     _judge_places(project, table.path, "position of", table.images, table.XYZ, notes)
     try:

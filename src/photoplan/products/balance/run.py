@@ -33,6 +33,9 @@ from photoplan.project.scene import Attempts, input_files
 from photoplan.radiometry.balance import Balanced, Pairs, balanced, even_images, pairs_of
 from photoplan.radiometry.cells import SIDE, Cells
 
+#: What the order of curve and fall-off may change over the block without a note, part of the brightness.
+_DOUBTFUL = 0.02
+
 
 @dataclass(frozen=True)
 class BalanceRequest:
@@ -118,9 +121,16 @@ class BalanceReport:
             "contrast": found.contrast,
             "shoulder": found.shoulder,
             "block_modes": {
-                mode.name: {"value": mode.value, "sigma": mode.sigma, "prior_sigma": mode.prior, "held": mode.held}
+                mode.name: {
+                    "value": mode.value,
+                    "sigma": mode.sigma,
+                    "prior_sigma": mode.prior,
+                    "held": mode.held,
+                    "order": mode.order,
+                }
                 for mode in found.modes
             },
+            "curve_last": bool(found.bands) and found.bands[0].curve_last,
             "sigma": [each.sigma for each in found.bands],
             "weighted_down": [each.down for each in found.bands],
             "files": {self.named(int(k)): path for k, path in zip(found.images, self.files)},
@@ -318,6 +328,13 @@ def _note(made: Balanced, found: Survey, even: NDArray[np.bool_], notes: list[st
     if len(parts) > 1:
         sizes = ", ".join(map(str, sorted(counts.tolist(), reverse=True)))
         notes.append(f"the images hang together in {len(parts)} parts ({sizes} images), each is balanced by itself")
+    modes = [mode for mode in made.modes if mode.order > max(_DOUBTFUL, mode.sigma / 2)]
+    doubtful = ", ".join(f"{mode.name} {100 * mode.order:.0f} %" for mode in modes)
+    if doubtful:
+        notes.append(
+            f"the images have different tone curves; whether these act before or after the fall-off changes the mosaic "
+            f"from its middle to its edge ({doubtful}); give --reference if that is too much"
+        )
 
 
 def _write(request: BalanceRequest, project: Project, report: BalanceReport) -> None:
@@ -331,7 +348,14 @@ def _write(request: BalanceRequest, project: Project, report: BalanceReport) -> 
     entries: dict[str, dict[str, str | None]] = {}
     for k, path, tones, sigmas in zip(found.images.tolist(), report.files, found.tones, found.sigmas):
         bands = [
-            BalanceBand(grey=tone.grey, becomes=tone.becomes, sigma=sigma, trend=tone.terms)
+            BalanceBand(
+                grey=tone.grey,
+                becomes=tone.becomes,
+                sigma=sigma,
+                trend=tone.terms,
+                curve_grey=tone.curve[0],
+                curve_light=tone.curve[1],
+            )
             for tone, sigma in zip(tones, sigmas)
         ]
         width, height = report.survey.sizes[k].tolist()

@@ -215,6 +215,8 @@ def _open_ortho(request: ControlRequest, project: Project) -> Ortho:
         info = reader.info
         if info.to_map is None or info.crs is None:
             raise InputError(f"{path}: an orthophoto with its place on the map and its CRS is needed")
+        if info.contradiction is not None:
+            raise InputError(f"{path}: {info.contradiction}")
         if not same_crs(info.crs, project.crs):
             raise InputError(
                 f"{path}: in {crs_label(info.crs)}, the project is in {crs_label(project.crs)}; transform it with "

@@ -17,9 +17,9 @@ from photoplan.engine.steps import Steps, steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Result
-from photoplan.geometry.crs import split_compound
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.local import earth_radius
+from photoplan.geometry.units import metric_system
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
@@ -116,7 +116,7 @@ def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleRepo
     check_output(request.output, inputs, overwrite=request.overwrite)
     terrain = open_terrain(request.model, request.crs)
     places = _places(request, terrain)
-    radius = earth_radius(split_compound(terrain.crs)[0], (places[0][1], places[0][2]))
+    radius = earth_radius(metric_system(terrain.crs).crs, (places[0][1], places[0][2]))
     sight = SightSettings(
         target_height=request.height_target,
         radius=request.radius,

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import HeightSystemError, InputError, UsageError
+from photoplan.errors import HeightSystemError, InputError, UsageError, named_by
 from photoplan.geometry.crs import (
     canonical_crs,
     crs_label,
@@ -219,7 +219,8 @@ def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDAr
         The positions are in a CRS to whose axes angles cannot refer.
     """
     if table.origin is not None:
-        centers, axes = topocentric_poses(table.origin, crs, table.centers)
+        with named_by(table.file):
+            centers, axes = topocentric_poses(table.origin, crs, table.centers)
         return centers, degrees_of(axes @ table.rotations)
     if table.crs is None or same_crs(table.crs, crs):
         return table.centers, table.opk_degrees()
@@ -231,11 +232,9 @@ def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDAr
         )
     XY = table.centers[:, :2]
     bounds = (XY[:, 0].min(), XY[:, 1].min(), XY[:, 0].max(), XY[:, 1].max())
-    try:
+    with named_by(table.file):
         step = crs_step(table.crs, crs, bounds)
         centers = np.column_stack([step(XY), table.centers[:, 2]])
-    except InputError as error:
-        raise InputError(f"{table.file}: {error}") from None
     return centers, degrees_of(grid_rotation(step, XY) @ table.rotations)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
+from photoplan.io.plain_files import whole_number
 from photoplan.io.raster import RasterReader
 from photoplan.quality.clipping import piled_ends
 from photoplan.quality.edges.candidates import range_of
@@ -80,7 +81,7 @@ class LightImage:
             return (LUMINANCE,) if bands >= 3 or bands == 1 else (1,)
         if band == "all":
             return (LUMINANCE, *range(1, bands + 1)) if bands >= 3 else tuple(range(1, bands + 1))
-        if not band.isdecimal() or not 1 <= int(band) <= bands:
+        if not 1 <= (whole_number(band) or 0) <= bands:
             raise UsageError(f"{self.reader.path}: `band` {band}; the file has bands 1 to {bands}, or say all")
         return (int(band),)
 

@@ -152,7 +152,12 @@ def _positions(project_: Project, use: bool) -> dict[str, NDArray[np.float64]]:
         return {}
     orientation = project_.orientation
     form = TableFormat(angle_unit=orientation.angle_unit, rotation=orientation.rotation)
-    table = read_observed_positions(project_.resolve(project_.observations.positions), form, crs=project_.crs)
+    table = read_observed_positions(
+        project_.resolve(project_.observations.positions),
+        form,
+        crs=project_.crs,
+        height_system=orientation.height_system,
+    )
     found = ImageNames(image.name for image in project_.images).match(table.images)
     return {name: XYZ for name, XYZ in zip(found, table.XYZ) if name is not None}
 

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import InputError, UsageError, named_by
 from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, same_crs
 from photoplan.geometry.units import MetricSystem, agreed_metres, metric_system
 from photoplan.io.drawn_features import DrawnFeatures, read_drawn_features
@@ -147,7 +147,7 @@ def _contours(request: LinesRequest, ground: ViewGround, reach: float, center: N
         if project.ground.file is None:
             raise UsageError("contours of a project whose ground has one height everywhere; leave them out")
         path, crs = project.resolve(project.ground.file), project.ground.crs or ground.crs
-    terrain = open_terrain(path, crs)
+    terrain = open_terrain(path, default_crs=crs)
     XY = center[:2]
     if not same_crs(terrain.crs, ground.crs):
         XY = crs_step(ground.crs, terrain.crs, ground.bounds)(XY)
@@ -239,7 +239,8 @@ def in_crs_of_ground(table: DrawnFeatures, options: dict[str, str], ground: View
     if crs is not None and not same_crs(crs, ground.crs):
         low, high = XYZ[:, :2].min(axis=0), XYZ[:, :2].max(axis=0)
         bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        XYZ[:, :2] = crs_step(crs, ground.crs, bounds)(XYZ[:, :2])
+        with named_by(table.path):
+            XYZ[:, :2] = crs_step(crs, ground.crs, bounds)(XYZ[:, :2])
     return XYZ
 
 
