@@ -48,8 +48,8 @@ class Lighting:
             raise UsageError(f"azimuth {self.azimuth}; degrees clockwise from north are needed")
         if not 0 < self.altitude <= 90:
             raise UsageError(f"altitude {self.altitude} of the sun; more than 0 and up to 90 degrees are needed")
-        if not (math.isfinite(self.exaggeration) and self.exaggeration > 0):
-            raise UsageError(f"exaggeration {self.exaggeration}; a positive factor is needed")
+        if not 0.01 <= self.exaggeration <= 1000:
+            raise UsageError(f"exaggeration {self.exaggeration}; a factor from 0.01 to 1000 is needed")
 
     @property
     def directions(self) -> NDArray[np.float64]:
