@@ -20,6 +20,7 @@ from photoplan.cameras.base import project
 from photoplan.cameras.rpc import RationalFunctions, RpcCamera
 from photoplan.cameras.rpc_fit import fit_rpc
 from photoplan.geometry.crs import crs_step, nearest_turn, topocentric_poses, turn_of
+from photoplan.geometry.earth_poses import geocentric_of_geodetic, geocentric_poses, map_poses
 from photoplan.geometry.geodetic import GeodeticGround
 from photoplan.io.image_metadata import ImageMetadata
 from photoplan.io.orientation.exif import map_positions
@@ -200,6 +201,12 @@ def test_images_on_both_sides_of_the_line_on_a_cylinder() -> None:
         scale = 1 / np.cos(np.radians(LATITUDE))
         np.testing.assert_allclose(np.diff(XYZ[:, 0]), np.diff(enu[:, 0]) * scale, rtol=0.01)
         np.testing.assert_allclose(axes, np.broadcast_to(np.eye(3), (4, 3, 3)), atol=1e-4)
+    earth = np.array([geocentric_of_geodetic((LATITUDE, lon, 100.0)) for lon in (179.9995, -179.9995, 179.99999)])
+    XYZ, axes = map_poses("EPSG:3857", earth)
+    assert np.ptp(XYZ[:, 0]) < 120 and np.abs(axes - axes[0]).max() < 1e-4
+    back, again = geocentric_poses("EPSG:3857", XYZ)
+    np.testing.assert_allclose(back, earth, atol=1e-6)
+    np.testing.assert_allclose(again, axes, atol=1e-9)
     states = [
         ImageMetadata(Path(f"{k}.jpg"), position=(LATITUDE, lon, 5.0)) for k, lon in enumerate((179.9995, -179.9995))
     ]
