@@ -113,9 +113,7 @@ def dtm_flow(request: FlowRequest, events: Events = SILENT) -> FlowReport:
     inputs = [request.model, *([request.outlets] if request.outlets else [])]
     for path in (request.output, request.catchments):
         if path is not None:
-            check_output(path, inputs, overwrite=request.overwrite)
-    if request.catchments is not None and request.catchments.resolve() == request.output.resolve():
-        raise UsageError(f"{request.output}: raster and catchments are the same file; give them two names")
+            check_output(path, inputs, overwrite=request.overwrite, raster=path == request.output)
     if request.catchments is not None:
         check_vectors(request.catchments)
     if not (math.isfinite(request.snap) and request.snap >= 0):
