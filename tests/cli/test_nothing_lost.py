@@ -120,6 +120,18 @@ def test_fault_03_killed_at_every_name_the_same_command_completes(name: str, tmp
         shutil.rmtree(folder)
 
 
+@pytest.mark.slow
+def test_fault_03_a_simulation_killed_at_each_name_is_completed(tmp_path: Path) -> None:
+    words = ["simulate", "edge", "--size", 64, 64, "-o"]
+    assert forked([*words, tmp_path / "quiet.tif"], tmp_path / "said").code == 0
+    for count in (1, 2):
+        made = tmp_path / f"at{count}.tif"
+        assert forked([*words, made], tmp_path / "said", Mishap(names=count)).code == -9
+        again = forked([*words, made], tmp_path / "said")
+        assert again.code == 0, again.err
+        assert content(made) == content(tmp_path / "quiet.tif")
+
+
 def test_a_folder_that_is_not_there_is_named_and_no_working_file(tmp_path: Path) -> None:
     block = write_block(tmp_path / "block")
     for words in (("shade", "-o", "s.tif"), ("contours", "--interval", 2, "-o", "c.gpkg")):

@@ -75,13 +75,13 @@ def check_output(
     refuse_foreign_record(record_path(path))
 
 
-def is_product(path: Path) -> bool:
-    """Whether a file is a raster that `ProductFile` wrote for a product with a key among its tags."""
+def is_product(path: Path, tag: str = "PHOTOPLAN_KEY") -> bool:
+    """Return whether a file is a raster that `ProductFile` wrote for a product with a key, or another tag."""
     if not path.is_file():
         return False
     try:
         with open_raster(path, "GTiff") as dataset:
-            return "PHOTOPLAN_KEY" in dataset.tags()
+            return tag in dataset.tags()
     except InputError:
         return False
 
