@@ -369,7 +369,14 @@ class CrsStep:
         x = float(self.where_defined(place)[0])
         if not np.isfinite(x):
             return self
-        return CrsStep(self.source, self.target, self.operation, self.accuracy, self.definition, x)
+        return CrsStep(
+            source=self.source,
+            target=self.target,
+            operation=self.operation,
+            accuracy=self.accuracy,
+            definition=self.definition,
+            about=x,
+        )
 
     def _transformer(self) -> Transformer:
         # A PROJ object belongs to one thread; every thread makes its own from the same definition.
