@@ -93,7 +93,7 @@ def test_two_lines_of_one_flight_show_the_same_ground(tmp_path: Path) -> None:
         ("strip.toml", lambda t: t.replace("EPSG:32633", "EPSG:4326"), "is geographic"),
         ("strip.toml", lambda t: t.replace("first = ", "first = 9"), "no line of the image is oriented"),
         ("strip.toml", lambda t: t.replace("focal_mm = 100.0", "focal_mm = -100.0"), "focal_mm"),
-        ("strip.toml", lambda t: t.replace("focal_mm = 100.0", "focal_mm = 1e300"), "detectors are .* rad apart"),
+        ("strip.toml", lambda t: t.replace("focal_mm = 100.0", "focal_mm = 1e300"), r"focal_mm: 1e\+300"),
         ("strip.toml", lambda t: t.replace("line = ", "line = 1e-300 # "), "lines of 1e-300 s"),
         ("strip.toml", lambda t: t.replace("lever_arm = [0.0", "lever_arm = [5e3"), "lever_arm"),
         ("strip.toml", lambda t: t.replace("first = ", "first = 1e300 # "), "clock.first"),

@@ -246,7 +246,7 @@ class TestExport:
             ((dem, "-o", tmp_path / "o.tif", "--sigma", tmp_path / "s.tif"), "has no standard deviations"),
             ((model, "-o", model), "by the suffix"),
             ((dem, "-o", dem, "--overwrite"), "the output is the input"),
-            ((model, "-o", tmp_path / "absent" / "o.obj"), "choose a folder that can be written"),
+            ((model, "-o", tmp_path / "absent" / "o.obj"), "no such folder; make it first"),
         ):
             said = photoplan("dtm", "export", *words)
             assert said.code == 2 and message in said.err, said

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tools.command import options_of, unfinished_in_files, unknown_options, verbs
+from tools.command import inside, options_of, unfinished_in_files, unknown_options, verbs
+from tools.small_block import write_block
 from tools.thinned import examples
 
 import photoplan
@@ -174,3 +177,30 @@ def test_fault_08_bytes_that_are_no_text_in_words_of_gdal_are_not_shown() -> Non
     )
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert "ValueError: shown" in said.stderr and "hidden" not in said.stderr, said.stderr
+
+
+@pytest.mark.parametrize(
+    "words", [("check",), ("check", "--json"), ("info",), ("budget",), ("ortho", "--images", "\x1b[2J")]
+)
+def test_names_do_not_command_the_terminal(tmp_path: Path, words: tuple[str, ...]) -> None:
+    """Titles, colours, cleared screens and turned writing: they stand there as in JSON."""
+    name = "one\x1b]0;title\x07\x1b[2J\r\x9b31m\u202e"
+    project = write_block(tmp_path / "block").project
+    project.write_text(project.read_text().replace('"one"', json.dumps(name)))
+    said = inside(words[0], project, *words[1:])
+    assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e]", said.out + said.err)
+    assert "\\u001b" in said.out + said.err
+    if "--json" in words:
+        assert any(name == each for each in strings(json.loads(said.out)))
+
+
+def strings(value: object) -> Iterator[str]:
+    """Texts of plain values, keys too."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from (key, *strings(each))
+    elif isinstance(value, list):
+        for each in value:
+            yield from strings(each)
+    elif isinstance(value, str):
+        yield value

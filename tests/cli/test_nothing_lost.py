@@ -12,7 +12,7 @@ import pytest
 from tools.command import inside
 from tools.facet_scene import GROUND, write_scene
 from tools.forked import QUIET, Mishap, Ran, content, forked
-from tools.small_block import X0, Y0, write_block
+from tools.small_block import X0, Y0, write_block, write_terrain
 
 import photoplan
 from photoplan.cli.output import talking
@@ -120,11 +120,31 @@ def test_fault_03_killed_at_every_name_the_same_command_completes(name: str, tmp
         shutil.rmtree(folder)
 
 
+@pytest.mark.slow
+def test_fault_03_a_simulation_killed_at_each_name_is_completed(tmp_path: Path) -> None:
+    words = ["simulate", "edge", "--size", 64, 64, "-o"]
+    assert forked([*words, tmp_path / "quiet.tif"], tmp_path / "said").code == 0
+    for count in (1, 2):
+        made = tmp_path / f"at{count}.tif"
+        assert forked([*words, made], tmp_path / "said", Mishap(names=count)).code == -9
+        again = forked([*words, made], tmp_path / "said")
+        assert again.code == 0, again.err
+        assert content(made) == content(tmp_path / "quiet.tif")
+
+
 def test_a_folder_that_is_not_there_is_named_and_no_working_file(tmp_path: Path) -> None:
     block = write_block(tmp_path / "block")
     for words in (("shade", "-o", "s.tif"), ("contours", "--interval", 2, "-o", "c.gpkg")):
         said = inside("dtm", words[0], block.terrain, *words[1:-1], tmp_path / "missing" / str(words[-1]))
         assert said.code == 2 and f"{tmp_path / 'missing'}: no such folder; make it first" in said.err
+
+
+@pytest.mark.parametrize("words", [("shade",), ("tint",), ("flow",), ("visible", "--from", X0, Y0)])
+@pytest.mark.parametrize("suffix", [".gpkg", ".png", ""])
+def test_no_raster_gets_the_name_of_something_else(tmp_path: Path, words: tuple[object, ...], suffix: str) -> None:
+    terrain = write_terrain(tmp_path / "dem.tif")
+    said = inside("dtm", words[0], terrain, *words[1:], "-o", tmp_path / f"a{suffix}")
+    assert said.code == 2 and "images are written as TIFF; give a name that ends in .tif" in said.err
 
 
 def test_records_say_nothing_of_the_disk(tmp_path: Path) -> None:

@@ -53,11 +53,11 @@ class TestFault03Killed:
         running.communicate()
         product = folder / "one_ortho.tif"
         assert product.read_text() == "old"
-        again = inside(*words, "-q")
+        again = inside(*words)
         assert again.code == 0, again.err
         facts = json.loads(again.out)["products"][0]
         assert 2 <= facts["resumed_tiles"] < facts["tiles"]
-        assert f"note: one_ortho: {facts['resumed_tiles']} of {facts['tiles']} tiles are finished already" in again.err
+        assert f"one_ortho: {facts['resumed_tiles']} of {facts['tiles']} tiles are finished already" in again.err
         assert product.read_bytes() == undisturbed.bytes_of("one")
         assert left_behind(folder) == set()
 

@@ -104,7 +104,7 @@ def test_a_finished_tile_is_not_made_again_and_its_figures_count() -> None:
     assert again == [3]
     assert tally.resumed == 4
     assert tally.totals == {"worst_residual": 0.4, "cells": 10, "clipped": [5, 10]}
-    assert told.talked == ["note: a: 4 of 5 tiles are finished already"]
+    assert told.talked == ["a: 4 of 5 tiles are finished already"]
     assert whole.tiles.keys() == before.keys()
 
 

@@ -57,7 +57,7 @@ def test_a_later_run_computes_what_is_missing(tmp_path: Path) -> None:
         assert list(run(counting(again), [7])) == [49]
         assert list(run(counting(again), range(5))) == [0, 1, 4, 9, 16]
     assert (first, again) == ([7, 0, 1, 2], [3, 4])
-    assert told.talked == ["note: a: 4 results of an earlier run are kept"] and told.units["squares"] == 6
+    assert told.talked == ["a: 4 results of an earlier run are kept"] and told.units["squares"] == 6
     with log(tmp_path) as store, steps("a", 1, store=store) as run:
         assert list(run.under("other tracks")(counting(again), [8])) == [64]
         assert list(run(counting(again), [1, 2], ["one", "two"])) == [1, 4]

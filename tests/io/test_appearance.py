@@ -13,6 +13,8 @@ from photoplan.io.checks import raster_driver
 from photoplan.io.plain_files import decoded_text
 
 KINDS = {
+    "bundle.out": (b"# Bundle file v0.3\n1 0\n500 0 0\n", "Bundler's bundle.out"),
+    "a.nvm": (b"NVM_V3\n\n1\na.jpg 500 1 0 0 0 0 0 0 0 0\n", "VisualSFM's NVM"),
     "a.json": (b'{"type": "FeatureCollection", "features": []}', "GeoJSON"),
     "b.json": (b'[{"a": 1}]', "JSON"),
     "a.txt": (b"LINE_OFF: 100\nSAMP_OFF: 3\n", "rational polynomials (RPC)"),

@@ -28,6 +28,27 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         step.check((30, 40), 2)
 
 
+def test_curves_and_small_numbers_are_written_and_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    curve = {"curve_grey": (0.01, 0.5), "curve_light": (0.0, 0.6)}
+    band = BalanceBand(grey=(0.0, 0.12345), becomes=(0.00123, 0.25), **curve)
+    write_balance_file(path, (40, 30), "", [band])
+    assert read_balance_file(path).bands[0].curve_light == curve["curve_light"]
+    (tone,) = load_balance(path).tones
+    np.testing.assert_allclose(tone.table([0.0, 0.12345]), [0.00123, 0.25], atol=1e-6)
+    np.testing.assert_allclose(tone.light([0.01, 0.5]), [0.0, 0.6])
+    text = path.read_text("utf-8")
+    for old, new, words in (
+        ("curve_light = [0.00000, 0.60000]", "", "curve_light"),
+        ("curve_light = [0.00000, 0.60000]", "curve_light = [0.7, 0.6]", "may not fall"),
+        ("curve_grey = [0.01000, 0.50000]", "curve_grey = [0.5, 0.5]", "must rise"),
+    ):
+        assert old in text
+        path.write_text(text.replace(old, new), "utf-8")
+        with pytest.raises(InputError, match=words):
+            load_balance(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

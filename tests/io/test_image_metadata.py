@@ -230,6 +230,14 @@ def test_without_attitudes_there_is_no_orientation(tmp_path: Path) -> None:
         read_orientation(tmp_path, format="exif")
 
 
+def test_signs_of_positions_in_unusual_forms(tmp_path: Path) -> None:
+    """References as words, and the reference of the altitude as text."""
+    for changes, place in (({1: (ASCII, "s")}, (-33.5, 70.6, 412.0)), ({3: (ASCII, "West")}, (33.5, -70.6, 412.0)),
+                           ({5: (ASCII, "1")}, (33.5, 70.6, -412.0))):  # fmt: skip
+        jpeg(tmp_path / "a.jpg", exif(MAIN, OWN, gps(33.5, 70.6, 412.0) | changes))
+        assert read_image_metadata(tmp_path / "a.jpg").position == pytest.approx(place)
+
+
 def test_an_image_of_another_datum_is_left_out_of_a_folder(tmp_path: Path) -> None:
     """One image in Tokyo's datum had refused the whole folder."""
     for name, datum in (("a", "WGS-84"), ("b", "TOKYO"), ("c", "WGS 84")):

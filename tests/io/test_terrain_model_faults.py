@@ -175,7 +175,7 @@ def test_fault_29_read_only_folder(tmp_path: Path) -> None:
 
 
 def test_fault_29_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"absent.*choose a folder that can be written"):
+    with pytest.raises(UsageError, match=r"absent.*no such folder; make it first"):
         write_small(tmp_path / "absent" / "m.gpkg")
 
 

@@ -19,8 +19,13 @@ import photoplan as pp
 from photoplan.cameras.base import project
 from photoplan.cameras.rpc import RationalFunctions, RpcCamera
 from photoplan.cameras.rpc_fit import fit_rpc
-from photoplan.geometry.crs import crs_step, nearest_turn, turn_of
+from photoplan.geometry.crs import crs_step, nearest_turn, topocentric_poses, turn_of
+from photoplan.geometry.earth_poses import geocentric_of_geodetic, geocentric_poses, map_poses
 from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.io.image_metadata import ImageMetadata
+from photoplan.io.orientation.exif import map_positions
+from photoplan.io.orientation.table import OrientationTable, OrientedImage
+from photoplan.products.init.systems import placed
 from photoplan.project.open_terrain import open_terrain
 
 #: Zones of UTM that meet at 180°, and where on the earth the image lies.
@@ -186,3 +191,30 @@ def test_one_place_wraps_longitudes() -> None:
     assert nearest_turn([-179.0, 181.0, 541.0, np.nan], 180.0, 360.0).tolist()[:3] == [181.0, 181.0, 181.0]
     assert turn_of("EPSG:4326") == pytest.approx(360.0) and turn_of("EPSG:32632") is None
     assert turn_of("EPSG:4807") == pytest.approx(400.0)
+
+
+def test_images_on_both_sides_of_the_line_on_a_cylinder() -> None:
+    """Poses within 50 m of the line had got a heading that was turned by 180°, and places a turn apart."""
+    enu = np.array([[-60.0, 0, 100], [-10, 5, 100], [3, 0, 100], [60, 0, 100]])
+    for longitude in (180.0, -180.0, 179.9999):
+        XYZ, axes = topocentric_poses((LATITUDE, longitude, 0.0), "EPSG:3857", enu)
+        scale = 1 / np.cos(np.radians(LATITUDE))
+        np.testing.assert_allclose(np.diff(XYZ[:, 0]), np.diff(enu[:, 0]) * scale, rtol=0.01)
+        np.testing.assert_allclose(axes, np.broadcast_to(np.eye(3), (4, 3, 3)), atol=1e-4)
+    earth = np.array([geocentric_of_geodetic((LATITUDE, lon, 100.0)) for lon in (179.9995, -179.9995, 179.99999)])
+    XYZ, axes = map_poses("EPSG:3857", earth)
+    assert np.ptp(XYZ[:, 0]) < 120 and np.abs(axes - axes[0]).max() < 1e-4
+    back, again = geocentric_poses("EPSG:3857", XYZ)
+    np.testing.assert_allclose(back, earth, atol=1e-6)
+    np.testing.assert_allclose(again, axes, atol=1e-9)
+    states = [
+        ImageMetadata(Path(f"{k}.jpg"), position=(LATITUDE, lon, 5.0)) for k, lon in enumerate((179.9995, -179.9995))
+    ]
+    X = map_positions(states, "EPSG:3857")[:, 0]
+    assert X[1] - X[0] == pytest.approx(np.radians(0.001) * 6378137)
+    table = OrientationTable(Path("a.csv"), tuple(
+        OrientedImage(f"{k}", (x, 8117998.0, 100.0), (0, 0, 0), None)
+        for k, x in enumerate(crs_step("EPSG:4326", "EPSG:32760")([[179.9995, LATITUDE], [-179.9999, LATITUDE]])[:, 0])
+    ), crs="EPSG:32760")  # fmt: skip
+    centers, opk = placed(table, "EPSG:3857")
+    assert abs(centers[1, 0] - centers[0, 0]) < 100 and np.ptp(opk[:, 2]) < 0.01

@@ -104,7 +104,7 @@ def test_very_different_curves_after_or_before_the_fall_off(tmp_path: Path, prin
 def test_a_note_names_slopes_that_depend_on_the_order_of_curve_and_fall_off(tmp_path: Path) -> None:
     _, _, record = balanced(tmp_path, **SLOPES["very different curves"])
     (note,) = record["notes"]
-    assert "before or after the fall-off" in note and "--reference" in note
+    assert "before or after the fall-off" in note and "reference" in note
     for name, mode in record["block_modes"].items():
         assert mode["sigma"] > mode["order"] and (name in note) == (mode["order"] > max(0.02, mode["sigma"] / 2))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from products.test_sheets import BOUNDS, regions
-from tools.command import Here
+from tools.command import Here, inside
 from tools.forked import Mishap, forked
 from tools.small_block import Block
 
@@ -145,3 +145,19 @@ def test_keys_of_tiles_know_what_decides_them(small: Block) -> None:
     for other in ({"feather": 10.0}, {"prefer": ("two",)}):
         assert not set(keys(**other)) & {each for each in usual if each}
     assert keys(name="other") == usual
+
+
+@pytest.mark.parametrize(("corner", "told"), [((0.0, 0.0), True), (BOUNDS[:2], False)])
+def test_regions_of_another_place_are_told(small: Block, corner: tuple[float, float], told: bool) -> None:
+    x, y = map(float, corner)
+    place = [[x, y], [x + 90, y], [x + 90, y + 90], [x, y + 90], [x, y]]
+    feature = {
+        "type": "Feature",
+        "properties": {"image": "one"},
+        "geometry": {"type": "Polygon", "coordinates": [place]},
+    }
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}
+    drawn = small.folder / "drawn.geojson"
+    drawn.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": [feature]}))
+    said = inside("mosaic", small.project, "--resolution", 6, "--bounds", *BOUNDS, "--seams", drawn, "--dry-run", "-q")
+    assert said.code == 0 and ("warning: " in said.err and "none of its regions lies in the mosaic" in said.err) == told

@@ -104,7 +104,7 @@ class TestContinuing:
         told = Told()
         results = execute(plan, tmp_path, Run(2, quicklook=False, events=told))
         assert [r.resumed for r in results] == [4, 0, 0]
-        assert "note: one_ortho: 4 of 6 tiles are finished already" in told.talked
+        assert "one_ortho: 4 of 6 tiles are finished already" in told.talked
         assert told.units["tiles"] == sum(len(p.plan.tiles) for p in plan.products)
         assert products(tmp_path) == serial
         # Figures of tiles that were taken over are in the record as well.

@@ -56,7 +56,7 @@ def test_a_drift_makes_it_worse_towards_the_border(tmp_path: Path) -> None:
     [
         ("", "adjust"),
         ("covariance = [1.0, 3.0, 1.0]", "covariance is none"),
-        ("covariance = [1e300, 0.0, 1e300]", "± 1e+150 px"),
+        ("covariance = [1e14, 0.0, 1e14]", "± 1e+07 px"),
     ],
     ids=["unknown", "none", "absurd"],
 )

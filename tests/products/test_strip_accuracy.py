@@ -84,7 +84,7 @@ def test_variances_of_poses_are_carried_to_the_ground(tmp_path: Path) -> None:
         ("", "says nothing of the accuracy"),
         ("[accuracy]\ntimes = [0.0, 0.0]\ncovariance = [[]]\n", "21"),
         (f"[accuracy]\ntimes = [0.0]\ncovariance = [{[1.0, 3.0, 1.0] + [0.0] * 18}]\n", "is no covariance"),
-        (f"[accuracy]\ntimes = [0.0]\ncovariance = [{[1e300] + [0.0] * 20}]\n", "is no covariance"),
+        (f"[accuracy]\ntimes = [0.0]\ncovariance = [{[1e300] + [0.0] * 20}]\n", "1e+300 given"),
     ],
 )
 def test_what_is_not_known_is_said(tmp_path: Path, entry: str, told: str) -> None:

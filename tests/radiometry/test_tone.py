@@ -65,6 +65,25 @@ def test_the_kernel_is_the_formula() -> None:
         np.testing.assert_allclose(toned(pixels, Window(0, 0, *SIZE), SIZE, [tone])[0], expected, rtol=2e-6, atol=1e-4)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("terms", [TONE.terms, ()])
+def test_a_curve_becomes_light_before_the_trend(dtype: type, terms: tuple[tuple[int, int, float], ...]) -> None:
+    curve = (5.0, 60.0, 240.0), (0.0, 110.0, 250.0)
+    tone = Tone((0.0, 100.0, 255.0), (10.0, 130.0, 200.0), terms, curve)
+    pixels = np.random.default_rng(0).integers(0, 256, (1, 30, 40)).astype(dtype)
+    y, x = np.mgrid[:30, :40]
+    grey = pixels[0].astype(float)
+    light = np.where(grey < 60, (grey - 5) * 2, 110 + (grey - 60) * 140 / 180)
+    expected = tone.table(light / tone.trend(x, y, SIZE))
+    np.testing.assert_allclose(tone.of(pixels[0], x, y, SIZE), expected, rtol=1e-12)
+    out = toned(pixels, Window(0, 0, *SIZE), SIZE, [tone])[0]
+    if dtype != np.float32:
+        expected = np.clip(np.rint(expected), 0, np.iinfo(dtype).max)
+    np.testing.assert_allclose(out, expected, rtol=2e-6)
+    without = Tone((0.0, 255.0), (0.0, 255.0), (), curve).at_mean_trend(256)
+    np.testing.assert_allclose(without.table([5, 240]), [0, 250], atol=1e-9)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.float32])
 def test_integers_are_rounded_and_kept_in_their_range(dtype: type) -> None:
     steep = Tone((0.0, 100.0), (-50.0, 450.0 if dtype == np.uint8 else 90_000.0))

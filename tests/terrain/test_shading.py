@@ -297,7 +297,9 @@ def test_rasters_of_planes_have_their_slope_up_to_the_border(
         np.testing.assert_allclose(again, slopes.gradient[inside], atol=2e-4 / resolution)
 
 
-@pytest.mark.parametrize("wrong", [{"altitude": 0}, {"altitude": 91}, {"azimuth": np.nan}, {"exaggeration": -1}])
+@pytest.mark.parametrize(
+    "wrong", [{"altitude": 0}, {"altitude": 91}, {"azimuth": np.nan}, {"exaggeration": -1}, {"exaggeration": 1e300}]
+)
 def test_lights_that_cannot_be_meant_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         shading.Lighting(**wrong)

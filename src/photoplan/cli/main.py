@@ -15,6 +15,7 @@ import click
 
 from photoplan.cli.interrupt import CODE, catch_interrupts, stop_children
 from photoplan.cli.lazy import LazyGroup
+from photoplan.cli.output import printable
 from photoplan.cli.verb import Verb
 from photoplan.errors import PhotoplanError, PhotoplanWarning, ResourceError
 
@@ -179,7 +180,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 def _say(message: str, code: int) -> int:
-    click.echo(f"photoplan: {message}", err=True)
+    click.echo(printable(f"photoplan: {message}"), err=True)
     return code
 
 
@@ -188,7 +189,7 @@ def _warning(
 ) -> str:
     """Our own warnings as messages, others as Python shows them."""
     if issubclass(category, PhotoplanWarning):
-        return f"photoplan: {message}\n"
+        return printable(f"photoplan: {message}\n")
     return f"{filename}:{lineno}: {category.__name__}: {message}\n"
 
 

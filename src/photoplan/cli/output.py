@@ -15,6 +15,8 @@ from photoplan.errors import InputError, TilesFailed
 
 _PARAMETER = re.compile(r"`([a-z][a-z0-9_]*)(=False)?`")
 _DOUBT = re.compile(r"\s*(?:warning|note):")
+#: Characters that move the cursor, colour, or turn the direction of writing: names of foreign files may hold them.
+_COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _REMARK = re.compile(r" \(`[a-z][a-z0-9_]*`[^()`]*\)")
 
 
@@ -51,6 +53,11 @@ def _named(text: str, group: click.Command | None) -> list[click.Command]:
         return []
     names = dict.fromkeys(re.findall(r"`photoplan ([a-z]+)", text))
     return [command for name in names if (command := group.get_command(click.Context(group), name))]
+
+
+def printable(text: str) -> str:
+    """Return a text in which what a terminal would obey stands as in JSON: ``\\u001b``."""
+    return _COMMANDS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def show(text: object) -> None:
@@ -97,7 +104,8 @@ def can_draw(wanted: bool, talk: Callable[[str], None], what: str = "picture") -
 
 def _spelled(text: object) -> str:
     context = click.get_current_context(silent=True)
-    return spelled(str(text), context.command, context.find_root().command) if context else str(text)
+    plain = printable(str(text))
+    return spelled(plain, context.command, context.find_root().command) if context else plain
 
 
 def end_with_failures(failed: Mapping[str, str], done: int, what: str = "images failed") -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from photoplan.cli.options import How
-from photoplan.cli.output import can_draw, show_json
+from photoplan.cli.output import can_draw, show, show_json
 from photoplan.cli.telling import Telling
 from photoplan.errors import TilesFailed
 from photoplan.events import COMPILATIONS
@@ -31,7 +31,7 @@ def telling(how: How) -> Telling:
         if isinstance(value, ProductResult) and not value.failed and not how.as_json:
             for path in (value.path, *value.others):
                 if path not in printed:
-                    click.echo(str(path))
+                    show(path)
                 printed.add(path)
 
     return Telling(how.quiet, product)

@@ -40,6 +40,8 @@ from photoplan.events import Events
 RETRIES = 2
 #: Seconds after which a wait is interrupted for a sign of life.
 PULSE = 1.0
+#: Threads or processes of one computer.
+_MOST_WORKERS = 4096
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,8 @@ def executor_factory(kind: str, workers: int) -> Callable[[], Executor]:
     UsageError
         Unknown kind, or less than one worker.
     """
-    if workers < 1:
-        raise UsageError(f"{workers} workers; at least one is needed")
+    if not 1 <= workers <= _MOST_WORKERS:
+        raise UsageError(f"{workers} workers; 1 to {_MOST_WORKERS} are accepted")
     if kind == "threads":
         # One worker is a thread as well: whoever waits for it can say so.
         return lambda: ThreadPoolExecutor(workers, "photoplan")

@@ -269,7 +269,7 @@ class Runner(Generic[T]):
                 tally.resumed += 1
                 tally.add(work.sinks[0].record(tile.index))
         if tally.resumed:
-            self._events.talk(f"note: {work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
+            self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
             self._events.kept(tally.resumed)
             self._left -= tally.resumed
         if work.count:

@@ -194,6 +194,6 @@ def steps(
         What workers of a cluster are asked before any step.
     """
     if store is not None and store.finished:
-        events.talk(f"note: {name}: {len(store.finished)} results of an earlier run are kept")
+        events.talk(f"{name}: {len(store.finished)} results of an earlier run are kept")
     with open_workers(executor, workers, question or Question(dict), events) as pool:
         yield Steps(name, pool, events, store, scratch=scratch)

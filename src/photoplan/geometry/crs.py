@@ -364,6 +364,20 @@ class CrsStep:
             out[..., 0] = nearest_turn(out[..., 0], self.about, turn)
         return out
 
+    def near(self, place: ArrayLike) -> CrsStep:
+        """Return the step with results counted about that of a place (X, Y), for maps that go round the earth."""
+        x = float(self.where_defined(place)[0])
+        if not np.isfinite(x):
+            return self
+        return CrsStep(
+            source=self.source,
+            target=self.target,
+            operation=self.operation,
+            accuracy=self.accuracy,
+            definition=self.definition,
+            about=x,
+        )
+
     def _transformer(self) -> Transformer:
         # A PROJ object belongs to one thread; every thread makes its own from the same definition.
         if not hasattr(self._own, "transformer"):
@@ -555,7 +569,7 @@ def topocentric_poses(
         f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={lon!r} +lat_0={lat!r} +h_0={h!r} "
         "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
     )
-    to_map = crs_step("EPSG:4326", target)
+    to_map = crs_step("EPSG:4326", target).near((lon, lat))
 
     def to_ground(enu: NDArray[np.float64]) -> NDArray[np.float64]:
         lon_, lat_, h_ = to_degrees.transform(enu[..., 0], enu[..., 1], enu[..., 2])

@@ -13,10 +13,12 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import (
     crs_label,
     crs_step,
+    nearest_turn,
     parse_crs,
     require_projected_metres,
     split_compound,
     topocentric_poses,
+    turn_of,
 )
 from photoplan.geometry.local import LocalFrame
 from photoplan.geometry.units import metric_system
@@ -114,7 +116,10 @@ def map_poses(crs: str, xyz: ArrayLike) -> tuple[_Floats, _Floats]:
         raise InputError(
             f"geocentric point {x:.3f}, {y:.3f}, {z:.3f} has no place in {crs_label(crs)}; is it the right CRS?"
         )
-    return XYZ, frame.R_local_earth.T @ frame.axes(XYZ)
+    axes = frame.R_local_earth.T @ frame.axes(XYZ)
+    if (turn := turn_of(crs)) is not None:  # a map on a cylinder counts X of one block without a jump
+        XYZ[:, 0] = nearest_turn(XYZ[:, 0], XYZ[:1, 0], turn)
+    return XYZ, axes
 
 
 def geocentric_poses(crs: str, XYZ: ArrayLike) -> tuple[_Floats, _Floats]:

@@ -40,6 +40,8 @@ _TEXT = (
     (r"<VRTDataset\b", "a virtual raster of GDAL"),
     (r"<html\b|<!doctype html", "a web page, perhaps of a download that failed"),
     (r"\A\s*0\s+SECTION\b", "a DXF drawing"),
+    (r"\A# Bundle file v", "Bundler's bundle.out; import it into COLMAP or OpenSfM and give that model"),
+    (r"\ANVM_V\d", "VisualSFM's NVM; import it into COLMAP and give that model"),
     (r"\A\s*(?:GEOGCS|PROJCS|GEOGCRS|PROJCRS|COMPD_CS)\s*\[", "a CRS as WKT"),
 )
 _COLMAP = ("cameras.bin", "images.bin", "points3D.bin")

@@ -163,7 +163,8 @@ def _position(exif: dict[str, ExifValue], dji: dict[str, str], path: Path) -> tu
     lat = _degrees(exif, "GPSLatitude", "S")
     lon = _degrees(exif, "GPSLongitude", "W")
     altitude = _number(exif, "GPSAltitude")
-    if altitude is not None and _number(exif, "GPSAltitudeRef") in (1.0, 3.0):
+    below = _number(exif, "GPSAltitudeRef") in (1.0, 3.0) or _text(exif, "GPSAltitudeRef") in ("1", "3")
+    if altitude is not None and below:
         altitude = -altitude  # below the reference: sea level, or (since EXIF 3.0) the ellipsoid
     # The maker's own numbers have more digits; one of DJI's names is misspelled in many drones.
     own = _float(dji.get("GpsLatitude")), _float(dji.get("GpsLongitude", dji.get("GpsLongtitude")))

@@ -50,8 +50,10 @@ class ProductFacts:
     """What the run record keeps of its tiles, see `KeptTiles`; empty if nothing is asked for."""
 
 
-def check_output(path: Path, inputs: Sequence[Path | str] = (), *, overwrite: bool = False) -> None:
-    """Refuse an output that exists, or that is one of the inputs, also by a link.
+def check_output(
+    path: Path, inputs: Sequence[Path | str] = (), *, overwrite: bool = False, raster: bool = False
+) -> None:
+    """Refuse an output that exists, or that is one of the inputs, also by a link, or a `raster` of another suffix.
 
     Raises
     ------
@@ -64,6 +66,8 @@ def check_output(path: Path, inputs: Sequence[Path | str] = (), *, overwrite: bo
             raise UsageError(f"{path}: the output is the input {source}; choose another output")
     if path.is_dir():
         raise UsageError(f"{path}: is a folder; give the name of a file")
+    if raster and path.suffix.lower() not in (".tif", ".tiff"):
+        raise UsageError(f"{path}: images are written as TIFF; give a name that ends in .tif")
     if overwrite:
         return
     if (path.exists() or path.is_symlink()) and not is_unfinished(path):
@@ -71,13 +75,13 @@ def check_output(path: Path, inputs: Sequence[Path | str] = (), *, overwrite: bo
     refuse_foreign_record(record_path(path))
 
 
-def is_product(path: Path) -> bool:
-    """Whether a file is a raster that `ProductFile` wrote for a product with a key among its tags."""
+def is_product(path: Path, tag: str = "PHOTOPLAN_KEY") -> bool:
+    """Return whether a file is a raster that `ProductFile` wrote for a product with a key, or another tag."""
     if not path.is_file():
         return False
     try:
         with open_raster(path, "GTiff") as dataset:
-            return "PHOTOPLAN_KEY" in dataset.tags()
+            return tag in dataset.tags()
     except InputError:
         return False
 

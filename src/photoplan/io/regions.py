@@ -31,6 +31,11 @@ class Regions:
     shapes: tuple[tuple[Any, int], ...]
     """Polygon, and row of its image in the table of sources, plus one; the last of those over each other counts."""
 
+    @property
+    def meet(self) -> bool:
+        """Whether a polygon lies in the grid, at least in part."""
+        return any(polygon.intersects(shapely.box(*self.grid.bounds)) for polygon, _ in self.shapes)
+
     def digest(self, margin: float) -> str:
         """Of what lies in the grid, and `margin` metres around it: the same for regions that are the same there."""
         left, bottom, right, top = self.grid.bounds

@@ -74,7 +74,9 @@ def read_layer(path: Path, name: str | None = None) -> FeatureLayer:
         drawn = read_drawing(path)
         own = {"Layer": drawn.layers, "EntityHandle": drawn.handles, "Text": drawn.texts}
         fields = {**drawn.attributes, **own}
-        return FeatureLayer(drawn.shapes, fields, None, drawing_metres(path, drawn.unit), drawn.notes)
+        return FeatureLayer(
+            shapes=drawn.shapes, fields=fields, crs=None, unit=drawing_metres(path, drawn.unit), notes=drawn.notes
+        )
     if name is None:
         names = layers_of(path)
         if not names:

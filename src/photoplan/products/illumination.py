@@ -124,7 +124,7 @@ def correct_illumination(request: IlluminationRequest, events: Events = SILENT) 
     inputs = [request.picture, request.terrain]
     LightModel(request.correct, 1.0, 0.0, ())
     if not request.dry_run:
-        check_output(request.output, inputs, overwrite=request.overwrite)
+        check_output(request.output, inputs, overwrite=request.overwrite, raster=True)
     place = _open(request)
     cos_z = place.light.level
     values, ground, part = _sample(place, events)

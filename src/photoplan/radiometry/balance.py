@@ -174,7 +174,9 @@ def balanced(
 
         def fitted(band: int, last: bool, judged: bool) -> AdjustedBand:
             equations = replace(Band.of(inner, band, sizes[images], basis, nodes), curve_last=last)
-            prior = Prior(basis, nodes, _level(equations), kinds.reshape(-1), parts, turns)
+            prior = Prior(
+                basis=basis, nodes=nodes, level=_level(equations), cameras=kinds.reshape(-1), parts=parts, turns=turns
+            )
             return adjust(equations, Gauge(parts, place), prior, judged=judged)
 
         for band in range(cells.bands):

@@ -73,7 +73,7 @@ def _tables(axes: Any, found: Balanced, band: int) -> None:
         if len(every) <= 8 and sigmas:
             axes.fill_between(grey, becomes - sigmas, becomes + sigmas, color=_BANDS[band], alpha=0.12, linewidth=0)
         axes.plot(grey, becomes, color=_BANDS[band], linewidth=1.0, alpha=max(0.15, 1.0 / np.sqrt(len(every))))
-    axes.set(xlabel="grey value", title=f"Tables, band {band + 1}")
+    axes.set(xlabel="grey value", xlim=ends, title=f"Tables, band {band + 1}")
     if band == 0:
         axes.set_ylabel("becomes (band: one σ)" if len(every) <= 8 and found.sigmas[0][0] else "becomes")
 

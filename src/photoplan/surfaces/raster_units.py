@@ -69,4 +69,11 @@ class RasterUnits:
             return None
         datum = float(np.rint(np.nanmean(Z)))
         heights = (Z - datum).astype(np.float32)
-        return Unit(left, top, layout.side, heights, np.full(heights.shape, np.nan, np.float32), datum)
+        return Unit(
+            left=left,
+            top=top,
+            side=layout.side,
+            heights=heights,
+            sigmas=np.full(heights.shape, np.nan, np.float32),
+            datum=datum,
+        )

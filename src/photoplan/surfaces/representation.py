@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 #: Weights by which squares of second differences are averaged along rows and along columns.
 _WINDOW = (0.25, 0.5, 0.25)
 #: Ratio of the mean squares of second differences at one and at two mesh widths: of smooth ground, of ground whose
-#: slopes are Brownian, and of ground without any correlation.
-_SMOOTH, _KINKED, _ROUGH = 1 / 16, 1 / 4, 1.0
+#: slopes are Brownian, of steps or Brownian ground, and of ground without any correlation.
+_SMOOTH, _KINKED, _STEPS, _ROUGH = 1 / 16, 1 / 4, 1 / 2, 1.0
+#: Part of a ratio's logarithm beside smooth ground that is left at half the distance: of waves, and from which part on
+#: the ratio is that of a power law.
+_WAVE, _LAW = 0.25, 0.79
 #: Correlation of the errors along x and along y in the middle of a mesh, on Brownian ground.
 _BROWNIAN = -0.44
 #: A vertex this close to a grid line, in meshes, lies on it.
@@ -69,12 +72,42 @@ def representation(
         # A wave's ratio falls to that of smooth ground by the fourth part of its logarithm with each halving.
         part = min(1.0, np.log(ratio / _SMOOTH) / np.log(_KINKED / _SMOOTH))
         ratio = _SMOOTH * (ratio / _SMOOTH) ** (0.25 + 0.75 * part)
-    power = float(np.clip(-np.log2(ratio), 1.0, 2.0))
+    power = _power(ratio)
     xx, yy, xy = _around(x**2), _around(y**2), _around(x * y)
     # Where nothing is known of a direction, lines are so close that they carry the surface.
     xx, yy, xy = (np.nan_to_num(values) for values in (xx, yy, xy))
     xy = (power - 1) * xy + (2 - power) * _BROWNIAN * np.sqrt(xx * yy)
     return Representation((np.stack([xx, yy, xy]) * (ratio / 4)).astype(np.float32), power)
+
+
+def between_data(heights: NDArray[np.float64], step: int) -> tuple[NDArray[np.float64], float]:
+    """Return the standard deviation of ground between data that are `step` posts apart, beside smooth ground, at posts.
+
+    Posts between data are interpolated, smoothly in most models; how smooth the ground is, only second differences at
+    the spacing of the data and its multiples say. Of a power law their ratio stays, of waves it falls to that of smooth
+    ground by the fourth part of its logarithm with each halving of the distance. Also returned is the power, as in
+    `Representation`. Zero where data are not further apart than posts.
+    """
+    Z, none = heights.astype(float), np.zeros(heights.shape)
+    if step < 2:
+        return none, 2.0
+    free = np.ones((Z.shape[0], Z.shape[1] - 1), bool)
+    both = [(_second(Z, free, k * step) ** 2, _second(Z.T, free, k * step).T ** 2) for k in (1, 2, 4)]
+    means = np.array([np.nanmean(each) if np.isfinite(each).any() else np.nan for each in both])
+    if not (means[:2] > 0).all():
+        return none, 2.0
+    seen, wide = np.log(np.clip(means[:2] / np.where(means[1:] > 0, means[1:], means[:2]), _SMOOTH, _ROUGH) / _SMOOTH)
+    wave = _SMOOTH * np.exp(_WAVE * seen)
+    ratio = _SMOOTH * np.exp(seen * np.interp(seen / max(wide, 1e-9), (_WAVE, _LAW), (_WAVE, 1.0)))
+    # The best interpolation leaves nothing of the error of linear interpolation on waves, all on steps.
+    left = np.clip(np.log(ratio / wave) / np.log(max(_STEPS / wave, 1.1)), 0.0, 1.0)
+    around = sum(np.nan_to_num(_around(square)) for square in both[0])
+    return np.sqrt(ratio * left / 4 * around), _power(ratio)
+
+
+def _power(ratio: float) -> float:
+    """The power by which variance grows between posts."""
+    return float(np.clip(-np.log2(ratio), 1.0, 2.0))
 
 
 def _uncut(vertices: NDArray[np.float64] | None, n: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

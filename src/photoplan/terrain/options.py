@@ -24,7 +24,7 @@ class Lighting(Request):
 
     azimuth: float = opt("Direction of the sun, degrees clockwise from north.", 315.0)
     altitude: float = opt("Height of the sun above the horizon, degrees.", 45.0, gt=0, le=90)
-    exaggeration: float = opt("Factor of all heights.", 1.0, gt=0)
+    exaggeration: float = opt("Factor of all heights.", 1.0, ge=0.01, le=1000)
     # At the azimuth, 45 degrees to its right, and 45 and 90 to its left, weighted by the squared cosine of the angle
     # between their azimuth and the slope's, as `gdaldem hillshade -multidirectional` has it.
     multidirectional: bool = opt("Four suns instead of one.", False)

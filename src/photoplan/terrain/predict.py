@@ -13,6 +13,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinat
 
 from photoplan.events import Map
 from photoplan.kernels.patch import predict
+from photoplan.surfaces.representation import between_data
 from photoplan.surfaces.units import LineElement, Unit
 from photoplan.terrain.calibration import Surroundings, signal_share
 from photoplan.terrain.fit import REACH, TerrainFit, choose, lines_of, unit_of
@@ -31,6 +32,8 @@ _MOST_CELLS = 30_000_000
 _ROUNDED = 1 / 3
 #: Distance from a line at which the slope beside it is taken, in spacings.
 _BESIDE = 0.2
+#: Nearness of a line, see `_beside`, from which on second differences may cross it: 1.2 spacings.
+_LINE_NEAR = 0.4
 #: Cells that are looked at for the widest gaps.
 _PLACES = 20_000
 
@@ -222,6 +225,12 @@ def predict_unit(fit: TerrainFit, unit: int, domain: Domain, meshes: int, reach:
         return None
     heights, sigmas = np.full(len(xy), np.nan), np.full(len(xy), np.nan)
     heights[inside], sigmas[inside], distance = heights_at(fit, unit, xy[inside])
+    lines = np.where(_beside(fit, xy) > _LINE_NEAR, np.nan, heights).reshape(x.shape)
+    between, power = between_data(lines, round(fit.seen.spacing / step))
+    # At data nothing is between them; half a spacing away it is all.
+    f = np.minimum(distance / fit.seen.spacing, 0.5)
+    between = between.ravel()[inside] * (4 * f * (1 - f)) ** (power / 2)
+    sigmas[inside] = np.fmax(sigmas[inside], between)
     far = np.flatnonzero(inside)[distance > reach]
     heights[far] = sigmas[far] = np.nan
     if not np.isfinite(heights).any():

@@ -134,7 +134,9 @@ def map_positions(images: Sequence[ImageMetadata], crs: str) -> NDArray[np.float
         No exact transformation from WGS 84 is available, or a position has no place in the CRS.
     """
     places = np.array([m.position for m in images], float).reshape(-1, 3)
-    return np.column_stack([crs_step("EPSG:4326", crs)(places[:, [1, 0]]), places[:, 2]])
+    step = crs_step("EPSG:4326", crs)
+    step = step.near(places[0, [1, 0]]) if len(places) else step
+    return np.column_stack([step(places[:, [1, 0]]), places[:, 2]])
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:

@@ -168,7 +168,7 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     lost = tuple((name, reasons.get(name, "no reason is known")) for name in images)
     data["not_oriented"] = [{"name": name, "reason": reason} for name, reason in lost]
     if request.dry_run:
-        return AdjustReport((), figures, 0, data, lost)
+        return AdjustReport(written=(), figures=figures, orientations=0, data=data, not_oriented=lost)
     return _write(request, project, result, figures, data, lost)
 
 
@@ -327,7 +327,13 @@ def _write(
             "rejected",
         )
         record((*written, request.project), pick(figures, *figures_of_block))
-    return AdjustReport(written, figures, len(adjusted.images) + len(adjusted.projections), data, lost)
+    return AdjustReport(
+        written=written,
+        figures=figures,
+        orientations=len(adjusted.images) + len(adjusted.projections),
+        data=data,
+        not_oriented=lost,
+    )
 
 
 def _changes(result: MapResult, lost: Sequence[tuple[str, str]]) -> ProjectChanges:

@@ -333,7 +333,7 @@ def _note(made: Balanced, found: Survey, even: NDArray[np.bool_], notes: list[st
     if doubtful:
         notes.append(
             f"the images have different tone curves; whether these act before or after the fall-off changes the mosaic "
-            f"from its middle to its edge ({doubtful}); give --reference if that is too much"
+            f"from its middle to its edge ({doubtful}); give `reference` if that is too much"
         )
 
 

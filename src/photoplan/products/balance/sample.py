@@ -101,7 +101,7 @@ def survey(project: Project, names: Sequence[str], resolution: float | None, eve
     # Images without a camera of the project, scenes of satellites for instance, are each their own.
     cameras = [getattr(project.any_image(one.name), "camera", None) or f"\n{one.name}" for one in looked]
     numbers = np.unique(cameras, return_inverse=True)[1].reshape(-1)
-    return Survey(tuple(looked), tuple(blind), grid, Tiles.shared(taken), numbers)
+    return Survey(looked=tuple(looked), blind=tuple(blind), grid=grid, tiles=Tiles.shared(taken), cameras=numbers)
 
 
 def sample(found: Survey, reference: Reference | None, workers: int, executor: str, events: Events, at: Path) -> Cells:

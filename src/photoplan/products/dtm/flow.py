@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.engine.steps import steps
-from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.errors import InputError, ResourceError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Result
 from photoplan.geometry.grid import MapGrid, Window
@@ -108,9 +108,7 @@ def dtm_flow(request: FlowRequest, events: Events = SILENT) -> FlowReport:
     inputs = [request.model, *([request.outlets] if request.outlets else [])]
     for path in (request.output, request.catchments):
         if path is not None:
-            check_output(path, inputs, overwrite=request.overwrite)
-    if request.catchments is not None and request.catchments.resolve() == request.output.resolve():
-        raise UsageError(f"{request.output}: raster and catchments are the same file; give them two names")
+            check_output(path, inputs, overwrite=request.overwrite, raster=path == request.output)
     if request.catchments is not None:
         check_vectors(request.catchments)
     terrain = open_terrain(request.model, request.crs)

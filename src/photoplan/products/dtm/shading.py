@@ -116,7 +116,7 @@ def make_picture(
         The disk is full.
     """
     inputs = [request.model]
-    check_output(request.output, inputs, overwrite=request.overwrite)
+    check_output(request.output, inputs, overwrite=request.overwrite, raster=True)
     if request.preview is not None:
         if request.preview.resolve() == request.output.resolve():
             raise UsageError(f"{request.preview}: the preview has the name of the output; choose another one")

@@ -113,7 +113,7 @@ def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleRepo
         The grid does not fit the memory.
     """
     inputs = [request.model, *([request.file] if request.file else [])]
-    check_output(request.output, inputs, overwrite=request.overwrite)
+    check_output(request.output, inputs, overwrite=request.overwrite, raster=True)
     terrain = open_terrain(request.model, request.crs)
     places = _places(request, terrain)
     radius = earth_radius(metric_system(terrain.crs).crs, (places[0][1], places[0][2]))

@@ -96,7 +96,7 @@ def dtm_volume(request: VolumeRequest, events: Events = SILENT) -> VolumeReport:
     """
     inputs = [request.a, request.b, *([request.polygons] if request.polygons else [])]
     if request.difference is not None:
-        check_output(request.difference, inputs, overwrite=request.overwrite)
+        check_output(request.difference, inputs, overwrite=request.overwrite, raster=True)
     a, b = (open_terrain(path, request.crs) for path in (request.a, request.b))
     system = common_system({t.path: t.height_system for t in (a, b)}, request.height_system) or "same, not named"
     if not same_crs(a.crs, b.crs):

@@ -264,10 +264,16 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
         )
     curvature = request.earth_curvature or "none"
     if request.earth_curvature is None and table is not None and table.cartesian:
-        curvature = _in_true_metres(table, systems, crs, np.array([p[0] for p in poses.values()], float), talk)
+        curvature = _in_true_metres(table, *systems, crs, np.array([p[0] for p in poses.values()], float), talk)
     request = replace(request, earth_curvature=curvature)
     project = _checked(request, terrain, *systems, crs, dict(used.values()), images)
-    return InitResult(request.path, project, tuple(f.name for f in lonely_files), tuple(lonely_names), tuple(unusable))
+    return InitResult(
+        path=request.path,
+        project=project,
+        without_orientation=tuple(f.name for f in lonely_files),
+        without_image=tuple(lonely_names),
+        unusable=tuple(unusable),
+    )
 
 
 def _readable(files: Sequence[Path]) -> tuple[dict[Path, RasterInfo], list[str]]:
@@ -292,7 +298,8 @@ def _readable(files: Sequence[Path]) -> tuple[dict[Path, RasterInfo], list[str]]
 
 def _in_true_metres(
     table: OrientationTable,
-    systems: tuple[str | None, str],
+    terrain_system: str | None,
+    system: str,
     crs: str,
     centers: NDArray[np.float64],
     talk: Callable[[str], None],
@@ -301,10 +308,10 @@ def _in_true_metres(
     X, Y = centers[:, :2].mean(axis=0).tolist()
     scale = float(LocalFrame(crs, (X, Y)).scale(np.array([X, Y])))
     metre = f"1 m on the ground is {scale:.5f} m of the map"
-    if systems[1] != "same":
+    if system != "same":
         try:
-            for system in {system for system in systems if system is not None}:
-                height_step(system, "ellipsoidal", crs)(centers)
+            for each in {terrain_system, system} - {None}:
+                height_step(str(each), "ellipsoidal", crs)(centers)
         except HeightSystemError as error:
             talk(
                 f"  warning: earth_curvature none, though the poses of {table.file.name} are in true metres ({metre}, "

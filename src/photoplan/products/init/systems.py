@@ -233,7 +233,7 @@ def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDAr
     XY = table.centers[:, :2]
     bounds = (XY[:, 0].min(), XY[:, 1].min(), XY[:, 0].max(), XY[:, 1].max())
     with named_by(table.file):
-        step = crs_step(table.crs, crs, bounds)
+        step = crs_step(table.crs, crs, bounds).near(XY[0])
         centers = np.column_stack([step(XY), table.centers[:, 2]])
     return centers, degrees_of(grid_rotation(step, XY) @ table.rotations)
 

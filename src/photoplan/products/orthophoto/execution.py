@@ -113,7 +113,7 @@ def execute(
     make_folder(folder)
     marker.begin()
     if kept:
-        run.events.talk(f"note: {len(kept)} of {len(plan.products)} products are finished already")
+        run.events.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
     if plan.settings.choice is not None:
         _tell_of_one_colour([p for p in plan.products if p.plan.name not in kept], plan.project, run.events)
     run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))

@@ -77,6 +77,11 @@ def plan_mosaic(
     events.begin("finding tiles", len(looked) * len(parts), "images")
     found = [_product(project, chosen, looked, names, name, part, events) for part in parts]
     products = tuple(each for each in found if each is not None)
+    drawn = drawn_regions(project, chosen, tuple(names), grid)
+    if drawn is not None and not drawn.meet:
+        events.talk(
+            f"warning: {chosen.choice.seams}: none of its regions lies in the mosaic; look at their place and CRS"
+        )
     seen = {image for each in products for image in each.images}
     blind += [f"{one.name}: sees nothing inside the bounds" for one in looked if one.name not in seen]
     refuse_blind(chosen, products, blind)

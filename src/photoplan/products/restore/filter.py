@@ -169,8 +169,6 @@ class RestoreRequest:
             raise UsageError(f"dtype {self.dtype!r}; allowed are {', '.join(TYPES)}")
         if self.compress not in COMPRESSIONS:
             raise UsageError(f"compression {self.compress!r}; allowed are {', '.join(COMPRESSIONS)}")
-        if self.workers < 1:
-            raise UsageError(f"{self.workers} workers; at least one is needed")
 
     @property
     def folder(self) -> Path:

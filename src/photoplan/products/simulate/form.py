@@ -11,7 +11,7 @@ from typing import Any
 from photoplan.engine.steps import steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import Events
-from photoplan.io.product import check_output
+from photoplan.io.product import check_output, is_product
 from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import run_key, run_times, write_run_record
 from photoplan.plain import pick
@@ -110,7 +110,9 @@ class Forming:
         times, key = run_times(), self.key
         with ResultLog.beside(self.output, key, locked=False) as log:
             for frame, (path, _) in enumerate(self.frames):
-                check_output(path, self.inputs, overwrite=self.overwrite or is_kept(log, frame, path))
+                # A run that died may have given the name and not yet kept that it had.
+                mine = is_kept(log, frame, path) or (log.finished and is_product(path, "PHOTOPLAN_SEED"))
+                check_output(path, self.inputs, overwrite=self.overwrite or bool(mine))
             tags = {"PHOTOPLAN_SCENE": self.name, "PHOTOPLAN_SEED": str(self.model.seed)}
             with steps(self.output.name, self.workers, events, log) as run:
                 events.begin("images", count_parts(self.model, self.scene, len(self.frames)), "parts")

@@ -317,7 +317,15 @@ class _Level:
             reason = "too few features look alike" if alike else "features that look alike fit no common geometry"
             own, reason = self.store.settings, "" if len(p) else reason
             scale = 1 / own.factor
-            yield TriedPair(names[p.first], names[p.second], scale, own.count, p.tried, len(p), reason)
+            yield TriedPair(
+                first=names[p.first],
+                second=names[p.second],
+                scale=scale,
+                features=own.count,
+                matches=p.tried,
+                verified=len(p),
+                reason=reason,
+            )
 
 
 def _matched(

@@ -79,7 +79,15 @@ def _track(isd: Isd) -> LineTrack:
     for name in ("instrument_pointing", "body_rotation"):
         its = np.sort(sense * (isd.moments(name) - centre))
         known = (max(known[0], its[0]), min(known[1], its[-1])) if len(its) > 1 else known
-    return LineTrack(isd.lines, rows, sense * began, sense * lasts, courses[0], courses[1], known)
+    return LineTrack(
+        lines=isd.lines,
+        knots=rows,
+        moments=sense * began,
+        rates=sense * lasts,
+        positions=courses[0],
+        attitudes=courses[1],
+        known=known,
+    )
 
 
 def _clock(isd: Isd) -> tuple[_Floats, _Floats, _Floats]:
