@@ -5,14 +5,13 @@ from __future__ import annotations
 from photoplan.cli.lazy import LazyGroup
 from photoplan.cli.verb import Verb
 
-_R, _P = "requests.terrain:", "products.dtm."
 #: A row for each command; `build` has a module of its own.
 VERBS: dict[str, str | Verb] = {
     "build": "Predict a terrain model from points and lines.",
     "info": Verb(
         "Show what a model holds.",
         "Show the figures of MODEL: units, lines, accuracy, gross errors. A raster is shown as by `photoplan info`.",
-        _R + "InfoRequest",
+        "requests.terrain:InfoRequest",
         "products.describe:describe_terrain",
     ),
     "refine": Verb(
@@ -22,8 +21,8 @@ VERBS: dict[str, str | Verb] = {
         Both are terrain models or rasters of heights. Each mesh is divided by a whole number. Inside a band along the
         polygons' border the difference of the two is blended in; outside nothing changes.
         """,
-        _R + "RefineRequest",
-        _P + "refine:dtm_refine",
+        "requests.terrain:RefineRequest",
+        "products.dtm.refine:dtm_refine",
         record="refine",
     ),
     "sample": Verb(
@@ -33,8 +32,8 @@ VERBS: dict[str, str | Verb] = {
 
         Both are empty where there is no model; a raster has no sigma.
         """,
-        _R + "SampleRequest",
-        _P + "sample:dtm_sample",
+        "requests.terrain:SampleRequest",
+        "products.dtm.sample:dtm_sample",
         record="sample",
     ),
     "profile": Verb(
@@ -44,8 +43,8 @@ VERBS: dict[str, str | Verb] = {
 
         There is a point wherever the surface bends: at grid lines, breaklines and edges of triangles; at a wall two.
         """,
-        _R + "ProfileRequest",
-        _P + "profile:dtm_profile",
+        "requests.terrain:ProfileRequest",
+        "products.dtm.profile:dtm_profile",
         {"outputs.png": "report.dtm.profile:profile_picture"},
         record="profile",
     ),
@@ -56,8 +55,8 @@ VERBS: dict[str, str | Verb] = {
         Columns: height, is_index, depression. Higher ground is on a line's right. A post exactly at a level counts as
         above it.
         """,
-        _R + "ContourRequest",
-        _P + "contours:make_contours",
+        "requests.terrain:ContourRequest",
+        "products.dtm.contours:make_contours",
         {"preview": "report.dtm.profile:contours_picture"},
         record="contours",
     ),
@@ -67,8 +66,8 @@ VERBS: dict[str, str | Verb] = {
 
         Slopes are those of the model's surface at each pixel, so breaklines stay sharp.
         """,
-        _R + "ShadeRequest",
-        _P + "shading:dtm_shade",
+        "requests.terrain:ShadeRequest",
+        "products.dtm.shading:dtm_shade",
     ),
     "slope": Verb(
         "Slope, slope classes or aspect.",
@@ -76,14 +75,14 @@ VERBS: dict[str, str | Verb] = {
 
         Places without terrain are NaN, or class 0.
         """,
-        _R + "SlopeRequest",
-        _P + "shading:dtm_slope",
+        "requests.terrain:SlopeRequest",
+        "products.dtm.shading:dtm_slope",
     ),
     "tint": Verb(
         "Height tints.",
         "Colour MODEL by height: red, green, blue, with a mask where it has no terrain.",
-        _R + "TintRequest",
-        _P + "shading:dtm_tint",
+        "requests.terrain:TintRequest",
+        "products.dtm.shading:dtm_tint",
     ),
     "volume": Verb(
         "Cut and fill between two models.",
@@ -91,8 +90,8 @@ VERBS: dict[str, str | Verb] = {
 
         Cut is where A lies above B. Where one of the models has no height nothing is counted; that area is printed.
         """,
-        _R + "VolumeRequest",
-        _P + "volume:dtm_volume",
+        "requests.terrain:VolumeRequest",
+        "products.dtm.volume:dtm_volume",
     ),
     "visible": Verb(
         "What can be seen from points.",
@@ -100,8 +99,8 @@ VERBS: dict[str, str | Verb] = {
 
         Places without terrain block nothing.
         """,
-        _R + "VisibleRequest",
-        _P + "visible:dtm_visible",
+        "requests.terrain:VisibleRequest",
+        "products.dtm.visible:dtm_visible",
     ),
     "flow": Verb(
         "Catchments and flow lengths.",
@@ -109,8 +108,8 @@ VERBS: dict[str, str | Verb] = {
 
         Pits are filled first; area and volume of the filling are printed.
         """,
-        _R + "FlowRequest",
-        _P + "flow:dtm_flow",
+        "requests.terrain:FlowRequest",
+        "products.dtm.flow:dtm_flow",
     ),
     "export": Verb(
         "GeoTIFF, TIN or XYZ of a model.",
@@ -118,8 +117,8 @@ VERBS: dict[str, str | Verb] = {
 
         Triangulations hold walls as vertical triangles (LandXML cannot); points are the posts and the lines' vertices.
         """,
-        _R + "ExportRequest",
-        _P + "export:dtm_export",
+        "requests.terrain:ExportRequest",
+        "products.dtm.export:dtm_export",
     ),
 }
 
