@@ -42,26 +42,14 @@ def storable(cls: _T) -> _T:
 
 
 def encode(value: Any) -> bytes:
-    """Return a value as bytes.
-
-    Raises
-    ------
-    NotData
-        It holds something that is not data, or of a class that is not registered.
-    """
+    """Return a value as bytes."""
     arrays: list[np.ndarray[Any, Any]] = []
     text = json.dumps(_tagged(value, arrays)).encode()
     return b"".join([_START.pack(_MAGIC, len(text)), text, *(a.tobytes() for a in arrays)])
 
 
 def decode(content: bytes) -> Any:
-    """Return the value that `encode` wrote.
-
-    Raises
-    ------
-    NotData
-        The bytes are damaged, or hold a class that is not registered or values that do not fit it.
-    """
+    """Return the value that `encode` wrote."""
     try:
         magic, length = _START.unpack_from(content)
         if magic != _MAGIC or length > min(MOST_TEXT, len(content) - _START.size):

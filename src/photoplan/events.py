@@ -23,29 +23,11 @@ class Events(Protocol):
     """Who is told how far a work is. Called from the thread that began the work alone."""
 
     def begin(self, phase: str, units: int = 0, unit: str = "tiles") -> None:
-        """A phase begins, and the one before has ended.
-
-        Parameters
-        ----------
-        phase : str
-            What is done, such as "planning".
-        units : int
-            Its parts; 0: not known.
-        unit : str
-            What a part is.
-        """
+        """A phase begins, and the one before has ended."""
         ...
 
     def done(self, units: int = 1, pixels: int = 0, begun: float = 0.0, what: str = "") -> None:
-        """So many more parts of the phase are done, with so many more pixels; 0 is a sign of life.
-
-        Parameters
-        ----------
-        begun : float
-            How many parts those add up to that are done now of parts that have begun.
-        what : str
-            What is done in one of these, such as "level 2 of 5".
-        """
+        """So many more parts of the phase are done, with so many more pixels; 0 is a sign of life."""
         ...
 
     def kept(self, units: int) -> None:

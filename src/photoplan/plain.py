@@ -67,17 +67,6 @@ def plain(value: Any, where: str = "value") -> Any:
 
     Data classes and mappings become objects, arrays, tuples and sets (sorted) lists, enumerations their values, paths
     and dates text. NaN and infinity become None: JSON does not know them.
-
-    Parameters
-    ----------
-    value : object
-    where : str
-        What a message calls it.
-
-    Raises
-    ------
-    UsageError
-        Something in it is none of these.
     """
     if value is None or type(value) in (str, bool, int):
         return value

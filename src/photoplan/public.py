@@ -25,15 +25,7 @@ _PLAIN = (bool, int, float, str, Path)
 
 
 def public(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of a package.
-
-    Parameters
-    ----------
-    package : str
-        Its `__name__`.
-    homes : mapping
-        Module of photoplan → names that it gives, with blanks between them; a name that is empty is the module itself.
-    """
+    """`__getattr__`, `__dir__` and `__all__` of a package."""
     home = {name: module for module, names in homes.items() for name in names.split()}
     home |= {module: "" for module, names in homes.items() if not names}
 
@@ -92,13 +84,7 @@ _MANY, _NAMED = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
 
 
 def fitted(value: Any, hint: Any, where: str) -> Any:
-    """A value in the form that a type hint declares; hints that are not judged leave it as it is.
-
-    Raises
-    ------
-    UsageError
-        It has another type, or is NaN.
-    """
+    """A value in the form that a type hint declares; hints that are not judged leave it as it is."""
     kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     if value is None or Any in kinds or not all(map(_is_judged, kinds)):
         return value

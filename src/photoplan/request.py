@@ -22,19 +22,7 @@ _LIMITS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at 
 
 
 def opt(help: str, default: Any = ..., **how: Any) -> Any:
-    """Declare a field that is an option of the command line; without a default it is required.
-
-    Parameters
-    ----------
-    help : str
-        Names the thing, with its unit; the default in brackets if it is not a plain value.
-    default : object
-    **how
-        Limits ``gt``, ``ge``, ``lt``, ``le``, and ``infinite=True`` if infinity is accepted; ``flag``, a name other
-        than the field's; ``metavar``; ``section`` of the help; ``writes=True``, a file that is written;
-        ``advanced=True``, rarely needed; ``listed=True``, a tuple that is written with commas; ``size=True``, a number
-        of bytes; ``required=True``, at least one of several.
-    """
+    """Declare a field that is an option of the command line; without a default it is required."""
     limits = {name: how.pop(name) for name in _LIMITS if name in how}
     if how.pop("infinite", False):
         limits["allow_inf_nan"] = True
@@ -47,13 +35,7 @@ def arg(help: str = "", **how: Any) -> Any:
 
 
 class Request(BaseModel):
-    """Options of an operation, checked when they are set.
-
-    Raises
-    ------
-    UsageError
-        A value is not of the declared type or beyond its limits, or an option is missing or unknown.
-    """
+    """Options of an operation, checked when they are set."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False)
 

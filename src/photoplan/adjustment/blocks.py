@@ -100,15 +100,7 @@ class Layout:
         return {**values, **moved}
 
     def spelled(self, direction: _Floats, scale: _Floats) -> str:
-        """The unknowns that take part in a direction, the largest part first.
-
-        Parameters
-        ----------
-        direction : ndarray, shape (count,)
-            Of scaled unknowns, of length one.
-        scale : ndarray, shape (count,)
-            From these to the unknowns themselves.
-        """
+        """The unknowns that take part in a direction, the largest part first."""
         parts: list[tuple[float, str]] = []
         most = max(len(kind.owners) for kind in self.kinds)
         for kind in self.kinds:

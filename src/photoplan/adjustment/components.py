@@ -34,21 +34,6 @@ def variance_components(contrasts: _Floats, fixed: _Floats, parts: Sequence[_Flo
     Contrasts are combinations Kᵀy of observations that no unknown moves, KᵀA = 0, so that their likelihood is the
     restricted one (Patterson and Thompson 1971). The steps are those of average information (Gilmour, Thompson and
     Cullis 1995) on the logarithms of the variances, halved where they lead to less likely ones.
-
-    Parameters
-    ----------
-    contrasts : ndarray, shape (n,)
-    fixed : ndarray, shape (n, n)
-        KᵀVK of the errors that are as stated.
-    parts : sequence of ndarray, shape (n, n)
-        KᵀVK of the others.
-    start : array_like, shape (k,)
-        Start values of the variances, positive.
-
-    Raises
-    ------
-    ValueError
-        The covariance matrix of the start values is not positive definite.
     """
     values = np.asarray(start, float)
     now = _Likelihood.at(contrasts, fixed, parts, values)

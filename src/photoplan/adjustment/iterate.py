@@ -62,24 +62,7 @@ def levenberg(
     moved: Callable[[State, _Floats], State | None],
     most: int = 25,
 ) -> Equations[State]:
-    """The state with the least sum of squares near a start (Levenberg 1944, Marquardt 1963).
-
-    Parameters
-    ----------
-    start : state
-        Anything; it is only handed to the two functions.
-    equations : callable
-        Design (n, u) and residuals (n,) of a state; None: it is none.
-    moved : callable
-        A state after a step (u,), of which it may take a part; None: there is none.
-    most : int
-        Most steps, those that made things worse included.
-
-    Returns
-    -------
-    Equations
-        At the best state that was found, converged or not.
-    """
+    """The state with the least sum of squares near a start (Levenberg 1944, Marquardt 1963)."""
     first = equations(start)
     assert first is not None
     now = Equations(start, *first)

@@ -119,11 +119,6 @@ class Fit:
         """Residuals of some rows against the fit without these rows, same shape as their residuals.
 
         (I − H)⁻¹ v: the fit need not be repeated.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            The other rows do not determine the unknowns.
         """
         hat = self.A[rows] @ self.cofactors @ self.A[rows].T
         if self.weight is not None:
@@ -132,21 +127,7 @@ class Fit:
 
 
 def solve(A: _Floats, y: _Floats, weight: _Floats | None = None) -> Fit:
-    """Least squares of A x = y.
-
-    Parameters
-    ----------
-    A : ndarray, shape (n, u)
-    y : ndarray, shape (n,) or (n, k)
-        Observations; k columns are independent observations of the same equations.
-    weight : ndarray, shape (n,), optional
-        Inverse variances, up to a factor; None: all 1. Rows of weight 0 do not count.
-
-    Returns
-    -------
-    Fit
-        Of rank u where the equations determine all unknowns.
-    """
+    """Least squares of A x = y."""
     root = None if weight is None else np.sqrt(weight)
     B = A if root is None else A * root[:, None]
     z = y if root is None else (y.T * root).T

@@ -20,15 +20,7 @@ BISQUARE = 4.685
 
 
 def spread(residuals: ArrayLike, centre: float | None = 0.0) -> float:
-    """Standard deviation by the median of absolute values (MAD) of residuals; NaN: none is finite.
-
-    Parameters
-    ----------
-    residuals : array_like
-        Any shape; values that are not finite do not count.
-    centre : float, optional
-        What they are taken from; None: their median.
-    """
+    """Standard deviation by the median of absolute values (MAD) of residuals; NaN: none is finite."""
     values = np.asarray(residuals, float)
     values = values[np.isfinite(values)]
     if not values.size:
@@ -67,16 +59,6 @@ def variance_factors(e: _Floats, redundancies: _Floats, groups: NDArray[np.int64
 
     Groups with little redundancy keep the factor that they had: the more a group's weight grows, the less checks it, so
     its factor may not fall for ever, nor jump back.
-
-    Parameters
-    ----------
-    e : ndarray, shape (n,)
-        Residuals divided by the standard deviations that were stated.
-    redundancies : ndarray, shape (n,)
-        Redundancy numbers with the weights of `before`.
-    groups : ndarray, shape (n,)
-        Group of each observation.
-    before : ndarray, shape (groups,)
     """
     total = np.bincount(groups, redundancies, len(before))
     square = np.bincount(groups, e**2, len(before))

@@ -84,20 +84,6 @@ def film_shrinkage(
     """Shrinkage of the film since its calibration, if the scanner's sampling distance is known.
 
     It includes what the scanner errs: only that of a calibrated scanner is true to some hundredths of a permille.
-
-    Parameters
-    ----------
-    transformation : Affine2D or Bilinear2D
-        From image plane to scan.
-    pitch : (float, float)
-        Distance of two columns and of two rows on the film, in the unit of the image plane.
-    covariance : ndarray, shape (6, 6) or (8, 8), optional
-        Of the coefficients, as `FiducialFit` has it.
-
-    Raises
-    ------
-    InputError
-        A sampling distance is not positive.
     """
     if not all(math.isfinite(p) and p > 0 for p in pitch):
         raise InputError(f"sampling distance {pitch} of the scan; two positive numbers are needed")
@@ -118,17 +104,7 @@ def film_shrinkage(
 def residuals_on_film(
     transformation: Affine2D | Bilinear2D, plane: ArrayLike, residuals: ArrayLike
 ) -> NDArray[np.float64]:
-    """Residuals in the scan as residuals in the image plane: x right, y up, in its unit, shape (n, 2).
-
-    Parameters
-    ----------
-    transformation : Affine2D or Bilinear2D
-        From image plane to scan.
-    plane : array_like, shape (n, 2)
-        Where they are, image plane.
-    residuals : array_like, shape (n, 2)
-        Column and row, pixels.
-    """
+    """Residuals in the scan as residuals in the image plane: x right, y up, in its unit, shape (n, 2)."""
     J = transformation.derivative(np.asarray(plane, float))
     return np.linalg.solve(J, np.asarray(residuals, float)[..., None])[..., 0]
 

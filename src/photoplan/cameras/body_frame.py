@@ -71,11 +71,6 @@ class BodyFrameCamera:
         """Image points (..., 2) to rays: the point of the ray at `height` and its tangent there, each (..., 3).
 
         `height` is one number or one for each point. NaN where a ray passes the body.
-
-        Raises
-        ------
-        UsageError
-            `height` is missing.
         """
         if height is None:
             raise UsageError("rays over a body are curved on the map; give a height")

@@ -34,15 +34,7 @@ def radius_below(ground: BodyGround, S: _Floats) -> _Floats:
 
 
 def meet(ground: BodyGround, S: _Floats, d: _Floats, heights: _Floats) -> tuple[_Floats, _Floats]:
-    """Rays from points (n, 3) with unit directions (n, 3), in the axes of the body, at heights (n,).
-
-    Returns
-    -------
-    point : ndarray, shape (n, 3)
-        Where they meet the heights, on the map; NaN where they do not.
-    tangent : ndarray, shape (n, 3)
-        Unit direction there, on the map.
-    """
+    """Rays from points (n, 3) with unit directions (n, 3), in the axes of the body, at heights (n,)."""
     with np.errstate(all="ignore"):
         # The ellipsoid at these heights, nearly, is the unit sphere in units of its semi-axes.
         axes = np.stack([ground.ellipsoid.a + heights] * 2 + [ground.ellipsoid.b + heights], axis=1)
@@ -68,21 +60,7 @@ def meet(ground: BodyGround, S: _Floats, d: _Floats, heights: _Floats) -> tuple[
 
 
 def vantage_over(ground: BodyGround, centers: _Floats, seen: Callable[[float], _Floats]) -> Vantage:
-    """Above the middle of what a camera sees: the highest ground there is, but not above the camera.
-
-    Parameters
-    ----------
-    ground : BodyGround
-    centers : ndarray, shape (n, 3)
-        Places of the camera in the axes of the body; NaN where it is not known.
-    seen : callable
-        Map points (n, 3) of rays all over the image at a height.
-
-    Raises
-    ------
-    InputError
-        It does not see the ground.
-    """
+    """Above the middle of what a camera sees: the highest ground there is, but not above the camera."""
     low, high = heights_of(ground)
     flying = ground.to_map(centers)[:, 2]
     if np.isnan(flying).all():

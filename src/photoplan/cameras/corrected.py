@@ -79,19 +79,7 @@ class CurvatureCorrection:
 def corrected_camera(
     frame: FrameCamera, nadir_height: float, radius: float, before: tuple[Warp, ...] = ()
 ) -> WarpedCamera:
-    """A frame camera in map coordinates with earth curvature as a correction (Ecker 1991, §4.6.5.2).
-
-    Parameters
-    ----------
-    frame : FrameCamera
-        Camera with its pose in map coordinates.
-    nadir_height : float
-        Height of the ground below the camera, metres.
-    radius : float
-        Earth radius increased by that height, metres.
-    before : tuple of Warp
-        Displacements in map coordinates that come first (refraction).
-    """
+    """A frame camera in map coordinates with earth curvature as a correction (Ecker 1991, §4.6.5.2)."""
     X, Y, Z = frame.center.tolist()
     correction = CurvatureCorrection((X, Y, Z), nadir_height, radius)
     return WarpedCamera(frame, (*before, correction), frame.center, 1.0 / radius)

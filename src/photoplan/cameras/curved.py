@@ -22,20 +22,7 @@ def local_pose(pose: Pose, local: LocalFrame) -> Pose:
 def curved_camera(
     interior: Interior, lens: Lens, pose: Pose, local: LocalFrame, before: tuple[Warp, ...] = ()
 ) -> WarpedCamera:
-    """A camera in map coordinates that projects strictly in a local tangential system (Ecker 1991, §4.6.5.1).
-
-    Parameters
-    ----------
-    interior, lens
-        Interior orientation and lens.
-    pose : Pose
-        Projection centre in map coordinates (with ellipsoidal height), angles relative to the map's axes there. A pose
-        in the local system is brought here by ``Pose(local.to_map(center), local.axes(…).T @ R_local_camera)``.
-    local : LocalFrame
-        The system; where its origin lies changes the result by rounding only.
-    before : tuple of Warp
-        Displacements in map coordinates that come first (refraction).
-    """
+    """A camera in map coordinates that projects strictly in a local tangential system (Ecker 1991, §4.6.5.1)."""
     frame = FrameCamera(interior, lens, local_pose(pose, local))
     radius = earth_radius(local.crs, pose.center[:2])
     return WarpedCamera(frame, (*before, local), pose.center, 1.0 / radius)

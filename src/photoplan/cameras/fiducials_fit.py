@@ -58,20 +58,7 @@ class FiducialFit:
 
 
 def fit_marks(model: str, plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
-    """`fit_similarity`, `fit_affine` or `fit_bilinear`, by the name of the model.
-
-    Parameters
-    ----------
-    model : str
-        similarity, affine or bilinear.
-    plane_mm, scan_px, mirrored
-        As for `fit_affine`.
-
-    Raises
-    ------
-    InputError
-        There is no such model; and see `fit_affine`.
-    """
+    """`fit_similarity`, `fit_affine` or `fit_bilinear`, by the name of the model."""
     fits = {"similarity": fit_similarity, "affine": fit_affine, "bilinear": fit_bilinear}
     if model not in fits:
         raise InputError(f"interior orientation {model!r}; allowed are {', '.join(fits)}")
@@ -79,26 +66,7 @@ def fit_marks(model: str, plane_mm: Marks, scan_px: Marks, *, mirrored: bool = F
 
 
 def fit_affine(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
-    """Affine transformation from image plane to scan by least squares (Ecker 1991, eq. 4.2; Behr 1989, eq. 5.2).
-
-    Parameters
-    ----------
-    plane_mm : Marks
-        Calibrated marks, millimetres, x right, y up.
-    scan_px : Marks
-        The same marks measured in the scan: column and row, pixels, (0, 0) the centre of the upper-left pixel.
-    mirrored : bool
-        Whether the two systems are known to have the same handedness: the film was scanned through its back, or the
-        rows are counted upwards (as the marks of Ecker 1991, §8.1).
-
-    Raises
-    ------
-    InputError
-        A mark is unknown, named twice, given twice under two names, exchanged with another or far off, less than three
-        are left, or the scan is mirrored against what was said.
-    GeometryError
-        The marks lie on a line.
-    """
+    """Affine transformation from image plane to scan by least squares (Ecker 1991, eq. 4.2; Behr 1989, eq. 5.2)."""
     common = _pair(plane_mm, scan_px, "affine")
     found = _adjust(common.plane, common.scan, _affine_design)
     _check_marks(common, found.residuals, found.unknowns, mirrored)

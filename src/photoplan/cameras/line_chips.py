@@ -30,11 +30,6 @@ class ChippedLine:
     Chips may stand one behind the other: what they see at one moment lies apart then, and each finds a ground point at
     a moment of its own. Where they overlap, that chip counts which sees a point two columns inside or more, of both the
     one of lower columns; `moments` names all. Between chips that lie more than a column apart nothing is seen.
-
-    Raises
-    ------
-    InputError
-        The chips do not follow each other along the line.
     """
 
     chips: tuple[LineCamera, ...]

@@ -31,11 +31,6 @@ class LineLook:
 
     Lens distortion, the place of the line and the pitch of its detectors are one smooth curve, kept as Chebyshev
     polynomials of the column. Camera axes are those of the file; the camera looks along +Z.
-
-    Raises
-    ------
-    InputError
-        The curve is not smooth, or turns back.
     """
 
     columns: int

@@ -81,15 +81,6 @@ class LineSight:
 
         How far a point lies beside the line between the rows is interpolated as the poses are, so that what passes
         there and back within a row is found too.
-
-        Returns
-        -------
-        point : ndarray, shape (k,)
-            Number of the point.
-        between : ndarray, shape (k, 2)
-            Rows between which it passes.
-        stays : ndarray of bool, shape (k,)
-            Whether it is on the other side at the next whole row too.
         """
         parts = [(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, bool))]
         many = max(1, _TOGETHER // (2 * reach + 4))

@@ -24,13 +24,7 @@ _ROOM = (0.25, 256.0)
 
 @dataclass(frozen=True, eq=False)
 class LineTrack:
-    """From the lines of an image to position and rotation, in the axes of a body.
-
-    Raises
-    ------
-    InputError
-        Times do not grow, or nothing of the image is oriented.
-    """
+    """From the lines of an image to position and rotation, in the axes of a body."""
 
     lines: int
     """Rows of the image."""

@@ -40,18 +40,6 @@ def fitted_functions(geodetic: ArrayLike, xy: ArrayLike) -> RationalFunctions:
 
     The equation v · den(n) = num(n) is linear in the coefficients; divided by the denominator of the round before its
     residuals are those in the image (Tao & Hu 2001, eq. 12–16).
-
-    Parameters
-    ----------
-    geodetic : array_like, shape (n, 3)
-        Longitude, latitude (degrees) and ellipsoidal height, spread over a volume.
-    xy : array_like, shape (n, 2)
-        Their positions, pixels.
-
-    Raises
-    ------
-    GeometryError
-        There are too few points, or they lie in a plane.
     """
     ground, image = (np.array(values, float) for values in (geodetic, xy))
     if len(ground):
@@ -76,20 +64,7 @@ def fitted_functions(geodetic: ArrayLike, xy: ArrayLike) -> RationalFunctions:
 
 
 def fit_rpc(camera: Camera, ground: GeodeticGround, heights: tuple[float, float]) -> FittedRpc:
-    """Rational polynomials for all that a camera sees between two heights of the ground.
-
-    Parameters
-    ----------
-    camera : Camera
-        Over the map of `ground`.
-    heights : (float, float)
-        Lowest and highest, in the ground's height system, metres.
-
-    Raises
-    ------
-    GeometryError
-        There is no volume, the camera does not look down on it, or polynomials do not follow it.
-    """
+    """Rational polynomials for all that a camera sees between two heights of the ground."""
     XYZ = _seen(camera, heights, _FIT)
     functions = fitted_functions(ground(XYZ), project(camera, XYZ))
     between = _seen(camera, heights, _CHECK)

@@ -82,11 +82,6 @@ class WarpedCamera:
         """Image points (..., 2) to rays: the point of the ray at `height` and its tangent there, each (..., 3).
 
         `height` is one number or one for each point. Rays that do not reach it in front of the camera give NaN.
-
-        Raises
-        ------
-        UsageError
-            `height` is missing.
         """
         if height is None:
             raise UsageError("rays of a camera with earth curvature or refraction are curved; give a height")

@@ -150,13 +150,7 @@ def _undecoded(error: BaseException | None) -> bool:
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run a verb; every error becomes a message on stderr and an exit code.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        The verb and what follows it; those of the process if it is None.
-    """
+    """Run a verb; every error becomes a message on stderr and an exit code."""
     try:
         code = photoplan.main(arguments, prog_name="photoplan", standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt):

@@ -70,25 +70,13 @@ def pattern_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def edge_options(options: dict[str, Any]) -> dict[str, Any]:
-    """Options of a call that measures edges; those of patterns are refused.
-
-    Raises
-    ------
-    click.UsageError
-        An option goes with ``--pattern``, which is not given.
-    """
+    """Options of a call that measures edges; those of patterns are refused."""
     _refuse(_OF_PATTERNS, "goes with --pattern")
     return {name: value for name, value in options.items() if name not in {"pattern", *_OF_PATTERNS}}
 
 
 def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: dict[str, Any]) -> None:
-    """Measure the patterns of images and print what was found.
-
-    Raises
-    ------
-    click.UsageError
-        An option is for edges.
-    """
+    """Measure the patterns of images and print what was found."""
     from photoplan.io.run_record import recording
     from photoplan.products.mtf.patterns import PatternRequest, measure_patterns
     from photoplan.report.mtf.patterns import pattern_page

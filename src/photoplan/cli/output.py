@@ -21,19 +21,7 @@ _REMARK = re.compile(r" \(`[a-z][a-z0-9_]*`[^()`]*\)")
 
 
 def spelled(text: str, verb: click.Command | None, group: click.Command | None = None) -> str:
-    """A text of the library with its parameters as options.
-
-    Parameters
-    ----------
-    group : click.Command, optional
-        Holds the verbs that a text may name, as in ``declare `crs` to `photoplan init` ``: theirs are the options that
-        `verb` does not have.
-
-    Returns
-    -------
-    str
-        Parameters that none of the verbs has stay as they are; remarks in parentheses that begin with one are left out.
-    """
+    """A text of the library with its parameters as options."""
     if "`" not in text or verb is None:
         return text
     spellings: dict[str, str] = {}
@@ -109,24 +97,7 @@ def _spelled(text: object) -> str:
 
 
 def end_with_failures(failed: Mapping[str, str], done: int, what: str = "images failed") -> None:
-    """Name the images that failed, if any did.
-
-    Parameters
-    ----------
-    failed : mapping
-        Why, by name of the image.
-    done : int
-        Number of the others.
-    what : str
-        What the message says of them.
-
-    Raises
-    ------
-    InputError
-        All failed.
-    TilesFailed
-        Some did.
-    """
+    """Name the images that failed, if any did."""
     if failed and not done:
         raise InputError("\n".join(failed.values()))
     if failed:

@@ -25,20 +25,7 @@ _FEW = 0.01
 
 
 class Telling:
-    """The events of a command; a context manager that leaves no unfinished line behind.
-
-    Parameters
-    ----------
-    result : callable
-        Prints a result; it goes to stdout.
-    terminal : bool or None
-        Whether stderr is one; None: as it is.
-    clock : callable
-        Seconds from anywhere.
-    compilations : Compilations
-        Kernels that are compiled meanwhile. While one is, the line shows their number instead of the phase; rates and
-        times left do not include the time that they took.
-    """
+    """The events of a command; a context manager that leaves no unfinished line behind."""
 
     def __init__(
         self,

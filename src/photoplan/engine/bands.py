@@ -19,19 +19,6 @@ def detail_bands(
     Each is what one smoothing takes away that the finer one has left; the last is what the coarsest has left. Smoothed
     is over usable pixels alone, by weights that fall along rows and columns to nothing beyond a reach; a pixel's bands
     depend on what lies within the last but one of the reaches, in a sum of always the same order.
-
-    Parameters
-    ----------
-    values : ndarray, shape (bands, height, width)
-    usable : ndarray of bool, shape (height, width)
-    reaches : sequence of int
-        One for each band of detail; the last is not used.
-    at : (slice, slice)
-        Rows and columns that are wanted.
-
-    Yields
-    ------
-    ndarray of float64, of the wanted part; of no use where the picture is not
     """
     picture = np.where(usable, values, 0).astype(np.float64)
     before = picture[(slice(None), *at)]

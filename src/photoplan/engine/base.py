@@ -18,22 +18,7 @@ class Reader(FullSize, Protocol):
     """A source image of uint8, uint16, int16 or float32, alpha not counted; safe to call from several threads."""
 
     def read(self, window: Window, level: int = 0) -> Pixels:
-        """Pixels of a window inside the image, shape (bands, height, width), and their validity.
-
-        Parameters
-        ----------
-        window : Window
-            Pixels of the image as it is at `level`.
-        level : int
-            The image is reduced by f = 2 to the power of this: pixel (i, j) is the mean of the valid pixels among
-            columns i·f to i·f + f − 1 and rows j·f to j·f + f − 1, and valid if at least half of those that are inside
-            the image are. `level_size` gives its size. Never a choice of single pixels, which would alias.
-
-        Returns
-        -------
-        values, valid
-            The validity has shape (height, width), True = valid; None means that every pixel is valid.
-        """
+        """Pixels of a window inside the image, shape (bands, height, width), and their validity."""
         ...
 
 
@@ -44,13 +29,7 @@ class Step(Protocol):
     """
 
     def check(self, size: tuple[int, int], bands: int) -> None:
-        """Refuse images that the step is not for.
-
-        Raises
-        ------
-        InputError
-            Saying why; the image is named by the caller.
-        """
+        """Refuse images that the step is not for."""
         ...
 
     def result(self, stored: np.dtype[Any]) -> np.dtype[Any]:

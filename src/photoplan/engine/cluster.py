@@ -74,15 +74,7 @@ def answer(question: Question, token: str) -> Answer:
 
 
 def judge(address: str, own: Answer, answers: Mapping[str, Answer | BaseException]) -> list[str]:
-    """Notes on workers that differ without harm.
-
-    Raises
-    ------
-    UsageError
-        A worker has another photoplan.
-    InputError
-        A worker does not see an input.
-    """
+    """Notes on workers that differ without harm."""
     notes: dict[str, None] = {}
     for worker, said in answers.items():
         if isinstance(said, BaseException) or said.fingerprint != own.fingerprint:
@@ -112,13 +104,7 @@ class Parcel:
     digest: bytes
 
     def open(self) -> Any:
-        """The result; its file is gone then.
-
-        Raises
-        ------
-        ResourceError
-            It is not what the worker wrote.
-        """
+        """The result; its file is gone then."""
         path = Path(self.path)
         try:
             content = path.read_bytes()
@@ -143,13 +129,7 @@ class RemoteJob:
     """Where results go; None: to the client."""
 
     def __call__(self, task: Any) -> Any:
-        """The job's result, or where it lies.
-
-        Raises
-        ------
-        UsageError
-            This worker has another photoplan.
-        """
+        """The job's result, or where it lies."""
         if source_fingerprint() != self.fingerprint:
             raise UsageError("a worker that came later has another photoplan; install the same one everywhere")
         made = self.job(task)
@@ -162,22 +142,7 @@ class RemoteJob:
 
 
 class Cluster(Executor):
-    """A cluster that was asked and found good; it is the cluster that tries a tile again when its worker dies.
-
-    Parameters
-    ----------
-    address : str
-        Of the scheduler.
-    retries : int
-        How often a tile is tried again.
-
-    Raises
-    ------
-    UsageError
-        There is no scheduler, or its version does not fit.
-    ResourceError
-        It has no workers.
-    """
+    """A cluster that was asked and found good; it is the cluster that tries a tile again when its worker dies."""
 
     def __init__(self, address: str, retries: int) -> None:
         try:
@@ -216,13 +181,7 @@ class Cluster(Executor):
         return sum(self._client.nthreads().values())
 
     def ask(self, question: Question, events: Events) -> None:
-        """Ask all workers who they are and what they see.
-
-        Raises
-        ------
-        UsageError, InputError
-            See `judge`.
-        """
+        """Ask all workers who they are and what they see."""
         token = ""
         folder = Path(question.folder) if question.folder else None
         if folder is not None and folder.is_dir():
@@ -249,26 +208,14 @@ class Cluster(Executor):
         return RemoteJob(job, source_fingerprint(), None if shared is None else os.fspath(shared.resolve()))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Submit to the cluster.
-
-        Raises
-        ------
-        ResourceError
-            The scheduler is gone.
-        """
+        """Submit to the cluster."""
         try:
             return self._inner.submit(fn, *args, **kwargs)
         except (OSError, RuntimeError) as error:
             raise self.lost() from error
 
     def check(self) -> None:
-        """Make sure that somebody works.
-
-        Raises
-        ------
-        ResourceError
-            The scheduler is gone, or it has had no workers for some seconds.
-        """
+        """Make sure that somebody works."""
         if self._client.status != "running":
             raise self.lost()
         try:

@@ -71,21 +71,7 @@ def execute_tile(
     kernel: str,
     onto: tuple[NDArray[Any], NDArray[np.bool_]] | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Compose one compiled tile: each source paints the pixels that it owns, and nothing else is computed.
-
-    Parameters
-    ----------
-    sources : sequence of Source
-        One for each row of the table of sources; all with the same bands and type of pixels.
-    onto : (values, valid), optional
-        What of the tile has been painted before.
-
-    Returns
-    -------
-    values : ndarray, shape (bands, height, width)
-        In the sources' dtype, 0 where invalid; without bands if nothing was read.
-    valid : ndarray of bool, shape (height, width)
-    """
+    """Compose one compiled tile: each source paints the pixels that it owns, and nothing else is computed."""
     values, valid = onto or (np.zeros((0, *tile.relief.shape)), np.zeros(tile.relief.shape, bool))
     for layer in tile.layers:
         window, reader = layer.anchors.source_window, sources[layer.source].reader
@@ -335,13 +321,7 @@ class Address(Protocol):
     """How a worker opens what a plan needs: small, and pickles."""
 
     def open(self) -> Opened:
-        """Sources and surface; kept for the next tile.
-
-        Raises
-        ------
-        InputError
-            An input has changed since it was planned.
-        """
+        """Sources and surface; kept for the next tile."""
         ...
 
 

@@ -57,20 +57,7 @@ class Outcome:
 
 
 def executor_factory(kind: str, workers: int) -> Callable[[], Executor]:
-    """How to make (and make again) the executor a user asked for.
-
-    Parameters
-    ----------
-    kind : str
-        ``"threads"``, ``"processes"`` or the address of a Dask scheduler (``tcp://host:port``).
-    workers : int
-        Number of threads or processes; a cluster has its own number.
-
-    Raises
-    ------
-    UsageError
-        Unknown kind, or less than one worker.
-    """
+    """How to make (and make again) the executor a user asked for."""
     if not 1 <= workers <= _MOST_WORKERS:
         raise UsageError(f"{workers} workers; 1 to {_MOST_WORKERS} are accepted")
     if kind == "threads":
@@ -133,13 +120,7 @@ def threads(workers: int) -> Workers:
 
 
 def open_workers(kind: str, workers: int, question: Question, events: Events) -> Workers:
-    """The workers that a user asked for; those of a cluster are asked who they are.
-
-    Raises
-    ------
-    UsageError, InputError, ResourceError
-        See `executor_factory`, `Cluster` and `judge`.
-    """
+    """The workers that a user asked for; those of a cluster are asked who they are."""
     make = executor_factory(kind, workers)
     if "://" not in kind:
         return Workers(make, workers)
@@ -153,17 +134,7 @@ def open_workers(kind: str, workers: int, question: Question, events: Events) ->
 
 
 class Workers:
-    """The executor of a whole run, a context manager: made when first needed, and anew when its workers died.
-
-    Parameters
-    ----------
-    make : callable
-        Makes an executor, see `executor_factory`.
-    threads : int
-        Tasks that it works at at once.
-    cluster : Cluster, optional
-        The executor, where it is one that has been asked already.
-    """
+    """The executor of a whole run, a context manager: made when first needed, and anew when its workers died."""
 
     def __init__(self, make: Callable[[], Executor], threads: int = 1, cluster: Cluster | None = None) -> None:
         self._make = make
@@ -191,13 +162,7 @@ class Workers:
         return job if self._cluster is None else self._cluster.prepared(job, folder)
 
     def check(self) -> None:
-        """Make sure that somebody works.
-
-        Raises
-        ------
-        ResourceError
-            A cluster is gone, or has no workers.
-        """
+        """Make sure that somebody works."""
         if self._cluster is not None:
             self._cluster.check()
 
@@ -234,26 +199,7 @@ def run_tiles(
     in_flight: int,
     pulse: Callable[[], None] = lambda: None,
 ) -> Iterator[Outcome]:
-    """Run `work(task)` for every task and yield outcomes as they come, in any order.
-
-    Parameters
-    ----------
-    tasks : iterable
-        Small and hashable; for processes and clusters they and `work` must pickle. Taken as they are needed.
-    work : callable
-        Returns a tile's result.
-    workers : Workers
-        They stay for the next call.
-    in_flight : int
-        Tasks that are submitted and not yet yielded: what bounds memory.
-    pulse : callable
-        Called about every second while nothing comes.
-
-    Raises
-    ------
-    PhotoplanError
-        Raised by the work itself: an input or resource fault stops the run, since the other tiles share the inputs.
-    """
+    """Run `work(task)` for every task and yield outcomes as they come, in any order."""
     more = iter(tasks)
     waiting: deque[Any] = deque()
     alone: deque[Any] = deque()
@@ -334,11 +280,6 @@ def available_cpus(root: Path = Path("/")) -> int:
     The least of the machine's processors, those that the process is bound to, and the quota of its control groups, also
     of those around them: ``cpu.max`` of version 2, ``cpu.cfs_quota_us`` and ``cpu.cfs_period_us`` of version 1. A quota
     of two and a half processors counts as three.
-
-    Parameters
-    ----------
-    root : Path
-        Where the system's files begin; another folder in tests.
     """
     counts = [float(os.cpu_count() or 1)]
     if sys.platform == "linux":

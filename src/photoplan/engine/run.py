@@ -100,13 +100,7 @@ class Tally:
     reasons: list[str] = field(default_factory=list)
 
     def check(self, name: object) -> None:
-        """Refuse to complete what lacks tiles.
-
-        Raises
-        ------
-        TilesFailed
-            Some failed again and again.
-        """
+        """Refuse to complete what lacks tiles."""
         if self.failed:
             failed = ", ".join(map(str, sorted(self.failed)))
             raise TilesFailed(f"{name}: tiles {failed} could not be computed ({self.reasons[0]}); nothing is written")
@@ -152,22 +146,7 @@ class Kept(Generic[T]):
 
 
 def tiles_in_flight(wanted: int, memory: int | None, base: int, each: int) -> int:
-    """Tiles that may be under way at once.
-
-    Parameters
-    ----------
-    wanted : int
-        Without a bound on memory.
-    memory : int or None
-        Bytes that the run should stay under.
-    base, each : int
-        Bytes taken whatever runs, and by each tile.
-
-    Raises
-    ------
-    UsageError
-        `memory` does not suffice for one tile.
-    """
+    """Tiles that may be under way at once."""
     if memory is None:
         return wanted
     fits = (memory - base) // each
@@ -178,18 +157,7 @@ def tiles_in_flight(wanted: int, memory: int | None, base: int, each: int) -> in
 
 
 class Runner(Generic[T]):
-    """Makes products one after the other.
-
-    Parameters
-    ----------
-    in_flight : int or None
-        Tiles under way at once; None: as many as keep the workers busy.
-    events : Events
-        Told of tiles that are done, and of each product's result.
-    excuse : callable
-        Gets a product and the error it ended with: returns its result (None: it has none), or raises the error to end
-        the run.
-    """
+    """Makes products one after the other."""
 
     def __init__(
         self,
@@ -226,13 +194,7 @@ class Runner(Generic[T]):
             self._pool.shutdown()
 
     def run(self, works: Iterable[Work[T] | Kept[T]]) -> list[T]:
-        """Compute the tiles of all products, and have each completed while the next is computed.
-
-        Raises
-        ------
-        PhotoplanError
-            A product could not be made, and its error was not excused; finished tiles are kept.
-        """
+        """Compute the tiles of all products, and have each completed while the next is computed."""
         with self:
             for work in works:
                 if isinstance(work, Kept):

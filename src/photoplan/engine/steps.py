@@ -91,19 +91,7 @@ class _Keeping:
 
 
 class Steps:
-    """A `map` by workers, for the steps of one product; the same calls in a later run find the results in the store.
-
-    Parameters
-    ----------
-    workers : Workers
-        To threads functions and items are handed over as they are; for processes and clusters they pickle.
-    store : Store, optional
-        Keeps results; None: they end with the process.
-    root : str
-        What results depend on beside the store's key.
-    scratch : callable, optional
-        Makes a folder where results of a cluster may lie on their way.
-    """
+    """A `map` by workers, for the steps of one product; the same calls in a later run find the results in the store."""
 
     def __init__(
         self,
@@ -129,23 +117,7 @@ class Steps:
         pixels: Callable[[Any], int] = lambda item: 0,
         kept: Callable[[Any], Any] = lambda result: result,
     ) -> Iterator[Any]:
-        """Results of a function of all items, in their order.
-
-        Parameters
-        ----------
-        names : sequence, optional
-            What the result of each item depends on beside the store's key; None: the root and the numbers of the call
-            and of the item.
-        pixels : callable
-            Those of an item, for the rate that is told.
-        kept : callable
-            What the store keeps of a result, found here and not by workers: of arrays where they are, for instance.
-
-        Raises
-        ------
-        TilesFailed
-            An item failed again and again.
-        """
+        """Results of a function of all items, in their order."""
         values, self._calls = list(items), self._calls + 1
         store = Memory() if self._store is None else self._store
         # Numbers, where they suffice: two of them are never the same, other than two digests.
@@ -186,13 +158,7 @@ def steps(
     question: Question | None = None,
     scratch: Scratch | None = None,
 ) -> Iterator[Steps]:
-    """Steps by workers that end with the context: threads of this process, or what `executor_factory` knows.
-
-    Parameters
-    ----------
-    question : Question, optional
-        What workers of a cluster are asked before any step.
-    """
+    """Steps by workers that end with the context: threads of this process, or what `executor_factory` knows."""
     if store is not None and store.finished:
         events.talk(f"{name}: {len(store.finished)} results of an earlier run are kept")
     with open_workers(executor, workers, question or Question(dict), events) as pool:

@@ -25,13 +25,6 @@ class BodyGround:
     """Ground coordinates of a project in the axes of its body: metres, z towards the pole, x towards longitude 0.
 
     On earth the axes are those of WGS 84, with the CRS's own operation to them; elsewhere those of the CRS's own datum.
-
-    Raises
-    ------
-    InputError
-        The CRS is not a projected one in metres, it lies on another body, or there is no exact operation to WGS 84.
-    HeightSystemError
-        The grid that joins the height systems is missing.
     """
 
     crs: str

@@ -165,15 +165,7 @@ _ORDERS = {
 
 
 def bounds_fault(bounds: Sequence[float], crs: str | None = None, covered: Bounds | None = None) -> str | None:
-    """Why bounds xmin, ymin, xmax, ymax cannot be meant, with what is probably meant; None if they can.
-
-    Parameters
-    ----------
-    crs : str, optional
-        CRS that they are in.
-    covered : tuple of float, optional
-        Bounds in it that they should meet. What does not meet them is a fault only if it does in another order or CRS.
-    """
+    """Why bounds xmin, ymin, xmax, ymax cannot be meant, with what is probably meant; None if they can."""
     try:
         given = tuple(float(value) for value in bounds) if not isinstance(bounds, str) else ()
     except (TypeError, ValueError):

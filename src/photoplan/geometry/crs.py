@@ -29,13 +29,7 @@ _HUNDREDTH = np.pi / 180.0 / 100.0
 
 @lru_cache(maxsize=256)
 def parse_crs(text: str, where: str = "CRS") -> CRS:
-    """CRS of a string: `EPSG:…`, WKT, or a PROJ string. `where` names it in messages.
-
-    Raises
-    ------
-    InputError
-        The text is not a CRS.
-    """
+    """CRS of a string: `EPSG:…`, WKT, or a PROJ string. `where` names it in messages."""
     try:
         crs = CRS.from_user_input(text.strip())
         why = "" if text.strip()[:5].upper() == "EPSG:" else _unusable(crs)
@@ -166,13 +160,7 @@ def middle_longitude(text: str) -> float | None:
 
 
 def refuse_inexact(crs: str, XY: ArrayLike) -> None:
-    """Refuse a projection which PROJ cannot invert at map points (n, 2): there and back must lead to the same place.
-
-    Raises
-    ------
-    InputError
-        It leads more than a millimetre away; some projections have no exact inverse on flattened bodies.
-    """
+    """Refuse a projection which PROJ cannot invert at map points (n, 2): there and back must lead to the same place."""
     parsed = parse_crs(crs)
     XY = np.asarray(XY, float).reshape(-1, 2)
     if not parsed.is_projected or parsed.geodetic_crs is None:
@@ -198,13 +186,7 @@ def inexact_projection(crs: str, off: float) -> InputError:
 
 
 def require_projected_metres(text: str, where: str = "CRS") -> CRS:
-    """The CRS, if it is projected, horizontal and in metres; else an error that says what to give instead.
-
-    Raises
-    ------
-    InputError
-        The CRS is geographic, geocentric, local, in feet, or compound.
-    """
+    """The CRS, if it is projected, horizontal and in metres; else an error that says what to give instead."""
     crs = parse_crs(text, where)
     if crs.is_compound:
         horizontal, vertical = split_compound(text)
@@ -252,11 +234,6 @@ def split_compound(text: str, where: str = "CRS") -> tuple[str | None, str | Non
     The second is a vertical CRS's string for a compound CRS, ``"ellipsoidal"`` for a three-dimensional one (its own
     string if its heights are not metres upwards), and None where nothing is said of heights. A local (engineering) CRS
     in metres, or an undefined one of GeoPackage, names no place: both are None, as if nothing was stated.
-
-    Raises
-    ------
-    InputError
-        The text is not a CRS.
     """
     crs = parse_crs(text, where)
     if crs.name.casefold().startswith("undefined") or (
@@ -335,13 +312,7 @@ class CrsStep:
     _own: threading.local = field(default_factory=threading.local, repr=False, compare=False)
 
     def __call__(self, XY: ArrayLike) -> NDArray[np.float64]:
-        """Coordinates (..., 2) in the source CRS to the target CRS, X east and Y north; NaN stays NaN.
-
-        Raises
-        ------
-        InputError
-            A point lies where the operation is not defined.
-        """
+        """Coordinates (..., 2) in the source CRS to the target CRS, X east and Y north; NaN stays NaN."""
         XY = np.asarray(XY, float)
         out = self.where_defined(XY)
         lost = ~np.isfinite(out).all(axis=-1) & np.isfinite(XY).all(axis=-1)
@@ -396,23 +367,7 @@ def crs_step(
     bounds: tuple[float, float, float, float] | None = None,
     about: float | None = None,
 ) -> CrsStep:
-    """Exact step from one horizontal CRS to another.
-
-    Parameters
-    ----------
-    source, target : str
-        Strings that pyproj reads; of compound CRSs the horizontal part is taken.
-    bounds : tuple of float, optional
-        xmin, ymin, xmax, ymax in `source`: where it is used, which decides between operations of different areas.
-    about : float, optional
-        X of the target near which its results are counted; see `CrsStep.about`.
-
-    Raises
-    ------
-    InputError
-        No operation without a fallback is available (a missing grid is named), or PROJ cannot invert one of the
-        projections in the bounds.
-    """
+    """Exact step from one horizontal CRS to another."""
     a, b = (parse_crs(t).to_2d() for t in (source, target))
     a, b = (c.sub_crs_list[0] if c.is_compound else c for c in (a, b))
     area = area_of(a, bounds)
@@ -517,11 +472,6 @@ def grid_rotation(step: CrsStep, XY: ArrayLike) -> NDArray[np.float64]:
 
     It is the difference of the meridian convergences: the nearest rotation to the derivatives of the step, taken
     over ±50 metres. Heights keep their axis.
-
-    Raises
-    ------
-    InputError
-        One of the systems is left-handed.
     """
     for crs in (step.source, step.target):
         if is_left_handed(crs):
@@ -543,26 +493,7 @@ def grid_rotation(step: CrsStep, XY: ArrayLike) -> NDArray[np.float64]:
 def topocentric_poses(
     origin: tuple[float, float, float], target: str, centers: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points of a local tangential system brought into a projected CRS, with the rotation of the axes there.
-
-    Parameters
-    ----------
-    origin : tuple of float
-        Latitude and longitude in degrees (WGS 84) and ellipsoidal height of the system's origin; its axes point
-        east, north and up there.
-    target : str
-        Projected CRS in metres.
-    centers : array_like, shape (n, 3)
-        East, north, up, metres.
-
-    Returns
-    -------
-    XYZ : ndarray, shape (n, 3)
-        Map coordinates and ellipsoidal height.
-    R : ndarray, shape (n, 3, 3)
-        Takes the local system's axes to map axes at each point: convergence of meridians and the inclination of the
-        two horizons. The map's scale is no rotation and is left out.
-    """
+    """Points of a local tangential system brought into a projected CRS, with the rotation of the axes there."""
     require_projected_metres(target)
     lat, lon, h = origin
     to_degrees = Transformer.from_pipeline(

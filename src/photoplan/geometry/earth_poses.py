@@ -47,22 +47,7 @@ def geodetic_of_geocentric(xyz: ArrayLike) -> tuple[float, float, float]:
 
 
 def enu_poses(geodetic: ArrayLike) -> tuple[tuple[float, float, float], _Floats, _Floats]:
-    """Points given by latitude and longitude as one tangential system about their middle.
-
-    Parameters
-    ----------
-    geodetic : array_like, shape (n, 3)
-        Latitude, longitude (degrees, WGS 84) and ellipsoidal height.
-
-    Returns
-    -------
-    origin : tuple of float
-        Latitude, longitude (degrees) and ellipsoidal height of the system's origin.
-    enu : ndarray, shape (n, 3)
-        The points, metres.
-    R : ndarray, shape (n, 3, 3)
-        East, north and up *at each point* (columns) in the axes of the system.
-    """
+    """Points given by latitude and longitude as one tangential system about their middle."""
     points = np.asarray(geodetic, float).reshape(-1, 3)
     earth = np.column_stack(_to_earth().transform(points[:, 1], points[:, 0], points[:, 2]))
     origin = geodetic_of_geocentric(earth.mean(axis=0))
@@ -94,20 +79,7 @@ def _to_earth() -> Transformer:
 
 
 def map_poses(crs: str, xyz: ArrayLike) -> tuple[_Floats, _Floats]:
-    """Geocentric points (n, 3) of the datum of a projected CRS as map points, with the map's axes there.
-
-    Returns
-    -------
-    XYZ : ndarray, shape (n, 3)
-        Map coordinates and ellipsoidal heights, metres.
-    R_earth_map : ndarray, shape (n, 3, 3)
-        Grid east, grid north and up at each point (columns) in geocentric axes.
-
-    Raises
-    ------
-    InputError
-        The CRS is not a projected one in metres, or a point has no place in it.
-    """
+    """Geocentric points (n, 3) of the datum of a projected CRS as map points, with the map's axes there."""
     xyz = np.asarray(xyz, float).reshape(-1, 3)
     frame = _frame_at(crs, xyz)
     XYZ = frame.from_geocentric(xyz)
@@ -163,24 +135,7 @@ def _frame_at(crs: str, xyz: _Floats) -> LocalFrame:
 
 
 def topocentric_of_map(origin: tuple[float, float, float], crs: str, XYZ: ArrayLike) -> tuple[_Floats, _Floats]:
-    """Inverse of `photoplan.geometry.crs.topocentric_poses`: map points with height as east, north, up.
-
-    Parameters
-    ----------
-    origin : tuple of float
-        Latitude and longitude in degrees (WGS 84) and ellipsoidal height.
-    crs : str
-        Projected CRS in metres.
-    XYZ : array_like, shape (n, 3)
-        Map coordinates and ellipsoidal heights.
-
-    Returns
-    -------
-    enu : ndarray, shape (n, 3)
-        Metres.
-    R_map_enu : ndarray, shape (n, 3, 3)
-        Takes the local system's axes to map axes at each point.
-    """
+    """Inverse of `photoplan.geometry.crs.topocentric_poses`: map points with height as east, north, up."""
     require_projected_metres(crs)
     XYZ = np.asarray(XYZ, float).reshape(-1, 3)
     lonlat = crs_step(crs, "EPSG:4326")(XYZ[:, :2])
@@ -193,13 +148,7 @@ def topocentric_of_map(origin: tuple[float, float, float], crs: str, XYZ: ArrayL
 
 
 def is_local_crs(text: str, where: str) -> bool:
-    """Whether a text is the WKT of a local system, one without any relation to the earth.
-
-    Raises
-    ------
-    InputError
-        It is one, and not in metres.
-    """
+    """Whether a text is the WKT of a local system, one without any relation to the earth."""
     if not text.strip().upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
         return False
     if split_compound(text, where)[0] is not None:

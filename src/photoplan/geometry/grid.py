@@ -69,13 +69,7 @@ _EARTH = 1e8
 
 
 def refuse_absurd(size: tuple[float, float], tile: int, where: str) -> None:
-    """Refuse a raster that no one means, before any work; `where` names it and its resolution in the message.
-
-    Raises
-    ------
-    UsageError
-        It has more than `MOST_TILES` tiles.
-    """
+    """Refuse a raster that no one means, before any work; `where` names it and its resolution in the message."""
     width, height = size
     tiles = -(-width // tile) * -(-height // tile)
     if tiles > MOST_TILES:
@@ -86,13 +80,7 @@ def refuse_absurd(size: tuple[float, float], tile: int, where: str) -> None:
 
 
 def check_resolution(resolution: float) -> None:
-    """Refuse pixels that no map has.
-
-    Raises
-    ------
-    UsageError
-        They are not between a thousandth of a millimetre and a thousand kilometres.
-    """
+    """Refuse pixels that no map has."""
     if not (math.isfinite(resolution) and resolution > 0):
         raise UsageError(f"resolution {resolution}; a positive number of metres is needed")
     if not _FINEST <= resolution <= _COARSEST:

@@ -29,13 +29,7 @@ OPTIONS = (
 
 
 def check_height_system(name: str, where: str = "height system") -> str:
-    """The name in its canonical form.
-
-    Raises
-    ------
-    HeightSystemError
-        It is not a height system.
-    """
+    """The name in its canonical form."""
     if name.strip().casefold() in ("ellipsoidal", "same"):
         return name.strip().casefold()
     try:
@@ -52,13 +46,7 @@ def check_height_system(name: str, where: str = "height system") -> str:
 
 
 def require_metric_heights(name: str, where: str) -> str:
-    """The name in its canonical form, if its heights are metres upwards.
-
-    Raises
-    ------
-    HeightSystemError
-        It is not a height system, or in another unit, or of depths.
-    """
+    """The name in its canonical form, if its heights are metres upwards."""
     name = check_height_system(name, where)
     metric, rise = metric_heights(name)
     if rise != 1.0:
@@ -83,11 +71,6 @@ def declared_pair(terrain: str | None, orientation: str | None) -> tuple[str, st
     """Height systems of terrain and orientation, both known; ``"same"`` stands for the other one's where it has a name.
 
     Both are in metres upwards: readers convert heights in other units.
-
-    Raises
-    ------
-    HeightSystemError
-        One of them is not stated; the message says what can be declared.
     """
     if terrain is None or orientation is None:
         raise HeightSystemError(
@@ -106,22 +89,7 @@ def declared_pair(terrain: str | None, orientation: str | None) -> tuple[str, st
 
 
 def common_system(stated: Mapping[Path, str | None], declared: str | None) -> str | None:
-    """The one height system of several terrain files; None: none names it, and it is declared to be one.
-
-    Parameters
-    ----------
-    stated : mapping
-        Height system by file; None: the file does not state it.
-    declared : str, optional
-        `same`: those that state none have that of the others.
-
-    Raises
-    ------
-    HeightSystemError
-        They differ, or one states none and nothing is declared.
-    UsageError
-        Something else is declared.
-    """
+    """The one height system of several terrain files; None: none names it, and it is declared to be one."""
     if declared not in (None, "same"):
         raise UsageError(f"height system {declared!r}; `same` declares that all models have one")
     named = {
@@ -156,13 +124,7 @@ class HeightStep:
     _own: threading.local = field(default_factory=threading.local, repr=False, compare=False)
 
     def __call__(self, XYZ: ArrayLike) -> NDArray[np.float64]:
-        """Heights in the target system of points (..., 3); NaN stays NaN.
-
-        Raises
-        ------
-        HeightSystemError
-            A point lies outside the operation's grid.
-        """
+        """Heights in the target system of points (..., 3); NaN stays NaN."""
         XYZ = np.asarray(XYZ, float)
         out = self.where_defined(XYZ)
         lost = np.isfinite(XYZ).all(axis=-1) & np.isnan(out)
@@ -202,22 +164,7 @@ class HeightStep:
 def height_step(
     source: str, target: str, crs: str, bounds: tuple[float, float, float, float] | None = None
 ) -> HeightStep:
-    """Exact step from one height system to another at points of a projected CRS.
-
-    Parameters
-    ----------
-    source, target : str
-        Names as returned by `declared_pair`.
-    crs : str
-        Horizontal CRS of the points.
-    bounds : tuple of float, optional
-        xmin, ymin, xmax, ymax of the points, which decides between operations of different areas.
-
-    Raises
-    ------
-    HeightSystemError
-        The grid that joins the systems is not installed (it is named, with its address), or none is known.
-    """
+    """Exact step from one height system to another at points of a projected CRS."""
     source, target = check_height_system(source), check_height_system(target)
     if source == target or "same" in (source, target):
         return HeightStep(
@@ -249,13 +196,7 @@ def height_step(
 def heights_in(
     XYZ: NDArray[np.float64], crs: str, own: str | None, wanted: str | None, where: str
 ) -> NDArray[np.float64]:
-    """Points (n, 3) of a file that states its height system, with heights in the wanted one; NaN stays NaN.
-
-    Raises
-    ------
-    HeightSystemError
-        The two differ and no exact operation joins them, or a height without X and Y would have to be converted.
-    """
+    """Points (n, 3) of a file that states its height system, with heights in the wanted one; NaN stays NaN."""
     if own in (None, "same") or wanted in (None, "same") or not np.isfinite(XYZ[:, 2]).any():
         return XYZ
     assert own is not None and wanted is not None

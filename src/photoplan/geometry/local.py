@@ -92,13 +92,7 @@ class ProjectedCrs:
     """The inverse of the same projection of a sphere; None: the body is flattened no more than the earth."""
 
     def radians(self, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Longitude and latitude in radians of map points (..., 2); NaN where the projection ends.
-
-        Raises
-        ------
-        InputError
-            The body is flattened, and PROJ cannot invert the projection at most of the points.
-        """
+        """Longitude and latitude in radians of map points (..., 2); NaN where the projection ends."""
         lon, lat = self._inverse(self.to_geographic, XY)
         return (lon, lat) if self.sphere is None else self._inverted(XY, lon, lat)
 
@@ -201,11 +195,6 @@ class LocalFrame:
     Heights are taken as ellipsoidal (Ecker 1991, §4.6.5): a geoid undulation that is constant over the product moves
     everything together and does no harm; where it is not, heights are converted before. (Z of the map system is
     measured along the ellipsoid's normal of each point, up of the local system along the origin's.)
-
-    Raises
-    ------
-    InputError
-        The CRS is not a projected one in metres, or the origin lies outside its projection.
     """
 
     crs: str

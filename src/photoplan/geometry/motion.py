@@ -23,11 +23,6 @@ class EvenTable:
 
     Towards the ends of the table fewer neighbours are taken, as many on either side: polynomials that are not centred
     swing. Beyond the ends the outermost polynomial goes on; who asks there decides whether that is known.
-
-    Raises
-    ------
-    InputError
-        Fewer than two rows, a value that is not finite, or a step that is not positive.
     """
 
     start: float

@@ -42,12 +42,8 @@ class NearGround:
     """Of X, Y, Z on the ellipsoid and of their change up to 10 km above it, (terms, 6); None: there are none."""
 
     def __call__(self, XYZ: ArrayLike) -> _Floats:
-        """Map X, Y and height (n, 3) to the axes of the body, from the origin (n, 3); NaN where the CRS has no place.
-
-        Raises
-        ------
-        HeightSystemError
-            A point lies outside the grid that joins the height systems.
+        """Map X, Y and height (n, 3) to the axes of the body, from the origin (n, 3); NaN where the CRS has
+        no place.
         """
         XYZ = np.asarray(XYZ, float)
         near = self._is_near(XYZ)

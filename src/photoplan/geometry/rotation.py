@@ -29,25 +29,7 @@ def _about(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rotation_from_angles(angles: ArrayLike, order: str = "opk") -> NDArray[np.float64]:
-    """Rotation matrices of three angles given in the sequence of `order`.
-
-    Parameters
-    ----------
-    angles : array_like, shape (..., 3)
-        Radians, in the sequence that `order` spells: with ``"pok"`` the first angle is φ.
-    order : str
-        One of `ROTATION_ORDERS`; the first letter is the primary rotation, o = about X, p = about Y, k = about Z.
-
-    Returns
-    -------
-    R_ground_camera : ndarray, shape (..., 3, 3)
-        Takes camera axes to ground axes; for ``"opk"`` it is Ecker 1991, eq. 3.3.
-
-    Raises
-    ------
-    UsageError
-        `order` is unknown.
-    """
+    """Rotation matrices of three angles given in the sequence of `order`."""
     if order not in ROTATION_ORDERS:
         raise UsageError(f"rotation order {order!r}; allowed are {', '.join(ROTATION_ORDERS)}")
     angles = np.asarray(angles, float)
@@ -64,11 +46,6 @@ def angles_from_rotation(R_ground_camera: ArrayLike, order: str = "opk") -> NDAr
     """Angles in radians, in the sequence of `order`, of a rotation matrix; inverse of `rotation_from_angles`.
 
     The second one is in [−π/2, π/2]. At its ends only one combination of the others is determined; the first is then 0.
-
-    Raises
-    ------
-    UsageError
-        `order` is unknown.
     """
     if order not in ROTATION_ORDERS:
         raise UsageError(f"rotation order {order!r}; allowed are {', '.join(ROTATION_ORDERS)}")

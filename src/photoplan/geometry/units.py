@@ -144,20 +144,7 @@ def known_metres(unit: str | int) -> float | None:
 
 
 def metres_in(unit: str | int, where: str) -> float:
-    """Metres in a unit of length.
-
-    Parameters
-    ----------
-    unit : str or int
-        Name in any usual spelling, or EPSG code.
-    where : str
-        File and element, for the message.
-
-    Raises
-    ------
-    InputError
-        The unit is not known.
-    """
+    """Metres in a unit of length."""
     found = known_metres(unit)
     if found is None:
         raise InputError(f"{where}: {str(unit)[:60]!r} is not a known unit of length; known are {_ACCEPTED}")
@@ -177,27 +164,7 @@ def unit_label(metres: float | None) -> str:
 
 
 def agreed_metres(stated: float | None, system: float | None, where: str, *, in_one_file: bool) -> float:
-    """Metres in the unit of coordinates of which the file states a unit and a reference system states one, too.
-
-    Parameters
-    ----------
-    stated : float or None
-        Unit of the file itself: of a band, a drawing, a header; None: none.
-    system : float or None
-        Unit of the CRS or of the height system, negative for depths; None: none is known.
-    where : str
-        File and element, for the message.
-    in_one_file : bool
-        Whether the file itself states the reference system; then both must agree. A declared system in metres gives
-        way to the unit of the file, because it says what the heights refer to, and the file in which unit they are.
-
-    Raises
-    ------
-    InputError
-        The two contradict each other.
-    HeightSystemError
-        Nothing is stated.
-    """
+    """Metres in the unit of coordinates of which the file states a unit and a reference system states one, too."""
     if system is None and stated is None:
         raise HeightSystemError(
             f"{where}: the unit of heights is not stated, and X and Y are not in metres; declare a height system with "
@@ -248,13 +215,7 @@ class MetricSystem:
         return replace(self, heights=metric, height_scale=rise)
 
     def to_metres(self, XYZ: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-        """Coordinates (..., 3) in metres; NaN stays NaN.
-
-        Raises
-        ------
-        InputError
-            The unit of heights is not stated, and there are some.
-        """
+        """Coordinates (..., 3) in metres; NaN stays NaN."""
         if self.is_plain:
             return XYZ
         rise = self.height_scale
@@ -265,13 +226,7 @@ class MetricSystem:
 
 @lru_cache(maxsize=256)
 def metric_system(text: str, where: str = "CRS") -> MetricSystem:
-    """The reference system of a text (EPSG code, WKT, PROJJSON or PROJ string) in metres.
-
-    Raises
-    ------
-    InputError
-        The text is not a CRS, or its axes have several units.
-    """
+    """The reference system of a text (EPSG code, WKT, PROJJSON or PROJ string) in metres."""
     crs = parse_crs(text, where)
     if crs.type_name == "Engineering CRS":
         units = " and ".join(dict.fromkeys(axis.unit_name for axis in crs.axis_info[:2]))
@@ -301,18 +256,7 @@ def metric_system(text: str, where: str = "CRS") -> MetricSystem:
 
 @lru_cache(maxsize=256)
 def metric_heights(name: str, where: str = "height system") -> tuple[str, float]:
-    """Height system in metres upwards, and the metres upwards in a unit of the given one (negative for depths).
-
-    Parameters
-    ----------
-    name : str
-        ``"ellipsoidal"``, ``"same"``, or text of a vertical, compound or three-dimensional CRS.
-
-    Raises
-    ------
-    InputError
-        The text is not a CRS or says nothing of heights.
-    """
+    """Height system in metres upwards, and the metres upwards in a unit of the given one (negative for depths)."""
     word = name.strip().casefold()
     if word in ("ellipsoidal", "same"):
         return word, 1.0

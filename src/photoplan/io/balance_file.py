@@ -61,13 +61,7 @@ class BalanceFile(Entry):
 
 
 def read_balance_file(path: Path) -> BalanceFile:
-    """Contents of a balance file.
-
-    Raises
-    ------
-    InputError
-        The file is not of this form; the message names the entry.
-    """
+    """Contents of a balance file."""
     return read_entries(path, BalanceFile, _MAX_BYTES)
 
 

@@ -90,21 +90,7 @@ def plain_tables(db: sqlite3.Connection) -> set[str]:
 
 
 def check_plain_file(path: str | os.PathLike[str], what: str = "raster") -> Path:
-    """The path of an existing, readable, non-empty plain file.
-
-    Parameters
-    ----------
-    path
-        As it was given.
-    what
-        Name of the kind of file for messages.
-
-    Raises
-    ------
-    InputError
-        For `/vsi…` paths, URLs, subdataset syntax (`DRIVER:file:part`), inline documents, folders, devices, and files
-        that are absent, empty or may not be read.
-    """
+    """The path of an existing, readable, non-empty plain file."""
     text = os.fspath(path)
     if not text:
         raise InputError(f"no {what} was given: the path is empty")
@@ -134,13 +120,7 @@ def check_plain_file(path: str | os.PathLike[str], what: str = "raster") -> Path
 
 
 def raster_driver(path: Path) -> str:
-    """The one driver that may open a plain file, named by the file's first bytes (its suffix does not matter).
-
-    Raises
-    ------
-    InputError
-        If the content is none of `DRIVER_NAMES`; a virtual raster is named as such.
-    """
+    """The one driver that may open a plain file, named by the file's first bytes (its suffix does not matter)."""
     head = _head(path, 512)
     for magic, driver in _MAGIC:
         if head.startswith(magic):
@@ -180,28 +160,7 @@ def check_sidecars(path: Path) -> None:
 def check_declared_size(
     path: Path, limits: RasterLimits, *, size: tuple[int, int], pixel_bytes: int, block: tuple[int, int], stored: float
 ) -> None:
-    """Compare what a header promises with what the file can hold.
-
-    Parameters
-    ----------
-    path
-        For messages.
-    limits
-        What is allowed.
-    size
-        Width and height in pixels.
-    pixel_bytes
-        Bytes of one decoded pixel, all bands together.
-    block
-        Width and height of a block.
-    stored
-        Decoded bytes per stored byte, over the blocks that are stored; 0 if none is.
-
-    Raises
-    ------
-    InputError
-        Naming the limit that is exceeded.
-    """
+    """Compare what a header promises with what the file can hold."""
     width, height = size
     pixels = width * height
     if width < 1 or height < 1:

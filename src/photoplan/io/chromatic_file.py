@@ -43,28 +43,12 @@ class ChromaticFile(Entry):
 
 
 def read_chromatic(path: Path) -> ChromaticFile:
-    """A model of lateral chromatic aberration.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or an entry is missing, unknown or of a wrong type; the message names its line.
-    """
+    """A model of lateral chromatic aberration."""
     return read_entries(path, ChromaticFile, _MAX_BYTES)
 
 
 def write_chromatic(path: Path, contents: Mapping[str, Any], bands: Sequence[Mapping[str, Any]]) -> None:
-    """Write a model; the name holds the old or the whole new file.
-
-    Parameters
-    ----------
-    path
-        The file.
-    contents
-        `image_size`, `reference`, `description`.
-    bands
-        Entries of `ChromaticBand` by name.
-    """
+    """Write a model; the name holds the old or the whole new file."""
     lines = ["# Lateral chromatic aberration: where a band lies against the reference, pixels.",
              "# A term [i, j, a, b] adds (a, b) u^i v^j; u, v from the image's middle in units of half its diagonal.",
              'format = "photoplan chromatic 1"']  # fmt: skip

@@ -53,13 +53,7 @@ class LabelRow:
 
 
 def contour_files(path: Path, labels: bool) -> list[Path]:
-    """What `write_contours` writes: the file, and for formats of one layer another one with the labels.
-
-    Raises
-    ------
-    UsageError
-        The ending of the name is none of `FORMATS`.
-    """
+    """What `write_contours` writes: the file, and for formats of one layer another one with the labels."""
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise UsageError(f"{path}: contours are written as {', '.join(FORMATS)}; give a name with such an ending")
@@ -82,35 +76,6 @@ def write_contours(
     A GeoPackage has the layers `contours` and `labels`; Shapefile and GeoJSON have a second file `NAME_labels`; a DXF
     the CAD layers CONTOUR, CONTOUR_INDEX and CONTOUR_LABEL. Columns are `height`, `is_index`, `depression`; of labels
     `text`, `height`, `angle` (degrees counter-clockwise from east) and `size` (metres).
-
-    Parameters
-    ----------
-    path
-        Its ending chooses the format, see `FORMATS`.
-    lines
-        In any order. GeoJSON holds all of them in memory at once, the others some thousands.
-    labels
-        Called when all lines have been taken; None: no labels.
-    crs
-        CRS of both; a DXF cannot state it.
-    inputs
-        Files that must not be overwritten.
-    overwrite
-        Replace files that exist.
-
-    Returns
-    -------
-    list of Path
-        The files that were written.
-
-    Raises
-    ------
-    UsageError
-        The ending is unknown, a file exists or is an input, or the folder cannot be written.
-    RunLocked
-        Another run is writing the same file.
-    ResourceError
-        The disk is full.
     """
     files = contour_files(path, labels is not None)
     for file in files:

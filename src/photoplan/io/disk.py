@@ -87,13 +87,7 @@ def received(folder: Path) -> None:
 
 
 def refuse_outward(folder: Path) -> None:
-    """Refuse to write through a link inside a received folder that leads out of it.
-
-    Raises
-    ------
-    UsageError
-        Naming the link and where it leads.
-    """
+    """Refuse to write through a link inside a received folder that leads out of it."""
     folder = Path(os.path.abspath(folder))  # noqa: PTH100 - `resolve` would follow the links
     for place in (folder, *folder.parents):
         for home in _RECEIVED.intersection(place.parents):
@@ -109,13 +103,6 @@ def open_own(path: Path, flags: int = os.O_RDWR | os.O_CREAT) -> int:
 
     A folder that came from elsewhere may hold a link under the name: to a file that is not to be changed, or a device
     or pipe that would never end.
-
-    Raises
-    ------
-    UsageError
-        A link, a folder, a device or a file that has a second name is there.
-    OSError
-        The system cannot.
     """
     writes = flags & (os.O_RDWR | os.O_WRONLY)
     foreign = UsageError(f"{path}: must be a plain file of photoplan, and is a link or something else; remove it")
@@ -150,13 +137,7 @@ def open_own(path: Path, flags: int = os.O_RDWR | os.O_CREAT) -> int:
 
 
 def read_own(path: Path, most: int = 256 << 20) -> bytes:
-    """Return the content of a file that photoplan wrote, such as a run record; links and devices are not read.
-
-    Raises
-    ------
-    OSError
-        There is no such plain file, or it is larger than `most` bytes.
-    """
+    """Return the content of a file that photoplan wrote, such as a run record; links and devices are not read."""
     try:
         descriptor = open_own(path, os.O_RDONLY)
     except UsageError as error:
@@ -182,13 +163,7 @@ def make_parents(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder for products, if it is not there.
-
-    Raises
-    ------
-    UsageError
-        It cannot be made.
-    """
+    """Make a folder for products, if it is not there."""
     try:
         make_parents(folder)
     except OSError as error:

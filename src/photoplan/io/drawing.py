@@ -81,13 +81,7 @@ class _Found:
 
 
 def drawing_metres(path: Path, number: int) -> float | None:
-    """Metres in the unit of a drawing by its $INSUNITS; None: it states none.
-
-    Raises
-    ------
-    InputError
-        The number stands for no unit, or for one in which no terrain is drawn.
-    """
+    """Metres in the unit of a drawing by its $INSUNITS; None: it states none."""
     if number == 0:
         return None
     name, metres = DRAWING_UNITS.get(number, (f"number {number}", 0.0))
@@ -100,13 +94,7 @@ def drawing_metres(path: Path, number: int) -> float | None:
 
 
 def read_drawing(path: Path) -> DrawingFile:
-    """All entities of a drawing's model space that have geometry.
-
-    Raises
-    ------
-    InputError
-        The file is not a DXF drawing, is damaged beyond repair, or its blocks grow without bound.
-    """
+    """All entities of a drawing's model space that have geometry."""
     # Only drawings need it, and it takes a third of a second.
     import ezdxf  # noqa: PLC0415
 

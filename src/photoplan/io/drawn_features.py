@@ -41,13 +41,7 @@ class DrawnFeatures:
 
 
 def read_drawn_features(path: Path, layer: str | None) -> DrawnFeatures:
-    """Features of a layer; `layer`: of several layers one, of a drawing a layer of the drawing.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, has several layers and none is stated, or holds nothing to draw.
-    """
+    """Features of a layer; `layer`: of several layers one, of a drawing a layer of the drawing."""
     path = check_plain_file(path, "vector file")
     drawing = is_drawing(path)
     name, found = read_chosen(path, layer)

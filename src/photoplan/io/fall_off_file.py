@@ -50,13 +50,7 @@ class FallOffEntry(Entry):
 
 
 def read_fall_off_entry(path: Path) -> FallOffEntry:
-    """Contents of a correction file.
-
-    Raises
-    ------
-    InputError
-        The file is not of this form; the message names the entry.
-    """
+    """Contents of a correction file."""
     return read_entries(path, FallOffEntry, _MAX_BYTES)
 
 

@@ -56,13 +56,7 @@ class FilterEntries:
 
 
 def read_filter_file(path: Path) -> FilterEntries:
-    """Read a filter: TOML by its ending `.toml`, rows of numbers otherwise.
-
-    Raises
-    ------
-    InputError
-        The file is missing, no filter, or an entry is wrong; the message names it, or the line.
-    """
+    """Read a filter: TOML by its ending `.toml`, rows of numbers otherwise."""
     path = Path(path)
     if path.suffix.lower() != ".toml":
         return FilterEntries((KernelEntry(_matrix(path)),), description=f"matrix of {path.name}")
@@ -84,13 +78,7 @@ def read_filter_file(path: Path) -> FilterEntries:
 
 
 def is_filter(path: Path) -> bool:
-    """Whether a TOML file says that it is a filter.
-
-    Raises
-    ------
-    InputError
-        It is no TOML.
-    """
+    """Whether a TOML file says that it is a filter."""
     return read_toml(path)[0].get("kind") == FILTER_KIND
 
 

@@ -30,13 +30,7 @@ class Fingerprint:
 
 
 def fingerprint(path: str | os.PathLike[str]) -> Fingerprint:
-    """Fingerprint of a file; reads at most 4 MiB, whatever its size.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
+    """Fingerprint of a file; reads at most 4 MiB, whatever its size."""
     path = Path(path)
     digest = hashlib.sha256()
     try:

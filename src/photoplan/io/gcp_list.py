@@ -52,21 +52,7 @@ class _Line:
 
 
 def read_gcp_list(path: Path, crs: str | None = None, height_system: str | None = None) -> GcpList:
-    """Control and its measurements.
-
-    Parameters
-    ----------
-    crs : str, optional
-        Projected CRS that the points are wanted in; that of the file otherwise.
-    height_system : str, optional
-        The height system that heights are wanted in; they are converted if the file states another one.
-
-    Raises
-    ------
-    InputError
-        A line cannot be read, a point has two positions or is measured in an image twice (file and line are named), or
-        no exact transformation into `crs` is known.
-    """
+    """Control and its measurements."""
     path = Path(path)
     lines = [(n, text.strip()) for n, text in enumerate(read_text(path, MAX_BYTES).split("\n"), 1) if text.strip()]
     if not lines:

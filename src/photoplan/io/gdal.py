@@ -103,13 +103,7 @@ def first_cause(error: BaseException) -> str:
 
 
 def open_raster(path: Path, driver: str | None, overview: int | None = None, **options: Any) -> Any:
-    """Open a raster, or one of its overviews (from 0), for reading with one driver (None: any) and its options.
-
-    Raises
-    ------
-    InputError
-        If GDAL cannot open it.
-    """
+    """Open a raster, or one of its overviews (from 0), for reading with one driver (None: any) and its options."""
     try:
         with not_georeferenced(), gdal_settings():
             options |= {} if overview is None else {"OVERVIEW_LEVEL": overview}

@@ -44,13 +44,6 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str | None)
     """Write layers as one GeoPackage, which appears complete or not at all and replaces an older one.
 
     Without a `crs` they lie in a plane of their own, such as that of an image.
-
-    Raises
-    ------
-    UsageError
-        The folder cannot be written to.
-    ResourceError
-        The disk is full.
     """
     try:
         make_parents(path.parent)
@@ -91,13 +84,6 @@ def write_point_layers(path: Path, layers: Sequence[PointLayer], crs: str) -> No
     """Write layers of points as one GeoPackage, which appears complete or not at all and replaces an older one.
 
     Layers without points are left out.
-
-    Raises
-    ------
-    UsageError
-        The folder cannot be written to.
-    ResourceError
-        The disk is full.
     """
     vectors = [
         VectorLayer(item.name, "Point Z", shapely.points(item.XYZ), item.columns) for item in layers if len(item.XYZ)
@@ -113,19 +99,7 @@ def write_residuals(
     redundancies: NDArray[np.float64],
     rejected: NDArray[np.bool_],
 ) -> None:
-    """Write measurements with their residuals as a table that `photoplan adjust` reads again as image points.
-
-    Parameters
-    ----------
-    residuals, normalised, redundancies : ndarray, shape (n, 2)
-        Columns and rows; NaN, an empty field, where a measurement was not used.
-    rejected : ndarray, shape (n,)
-
-    Raises
-    ------
-    ResourceError, UsageError
-        The disk is full, or the folder cannot be written to.
-    """
+    """Write measurements with their residuals as a table that `photoplan adjust` reads again as image points."""
     pairs = ("residual", "normalised", "redundancy")
     names = [f"{name}_{axis}" for name in pairs for axis in "xy"]
     rows = []

@@ -52,30 +52,7 @@ def read_ground_points(
     columns: str | None = None,
     decimal_comma: bool = False,
 ) -> GroundPoints:
-    """Ground points of a table or of the first layer of a GeoPackage with points.
-
-    Parameters
-    ----------
-    crs : str, optional
-        The CRS that the points must be in, where the file (or a ``.prj`` beside it) states one. Coordinates that it
-        states in feet or another unit are converted to metres; standard deviations are in metres always.
-    height_system : str, optional
-        The height system that heights are wanted in; they are converted if the file states another one.
-    columns : str, optional
-        Columns of a table in their order where it does not name them; ``-`` for one that is not used.
-    decimal_comma : bool
-        Whether a table writes numbers as 1,5.
-
-    Returns
-    -------
-    GroundPoints
-        Coordinates NaN where the field is empty, standard deviations NaN where none is stated.
-
-    Raises
-    ------
-    InputError
-        A line or feature cannot be read, a name is given twice, or the CRS is another one; file and line are named.
-    """
+    """Ground points of a table or of the first layer of a GeoPackage with points."""
     path = Path(path)
     if path.suffix.lower() == ".gpkg":
         return _from_layer(path, crs, height_system)
@@ -190,13 +167,7 @@ def _floats(path: Path, role: str, column: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def write_ground_points(path: Path, points: GroundPoints) -> None:
-    """Write ground points as a table with header; it appears complete or not at all.
-
-    Raises
-    ------
-    ResourceError, UsageError
-        The disk is full, or the folder cannot be written to.
-    """
+    """Write ground points as a table with header; it appears complete or not at all."""
     rows = []
     for k, name in enumerate(points.names):
         numbers = ["" if np.isnan(v) else f"{v:.4f}" for v in points.XYZ[k]]

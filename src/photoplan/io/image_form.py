@@ -47,13 +47,7 @@ class ImageForm:
 
 
 def placement_of(info: RasterInfo) -> Placement:
-    """Where a file that `read_info` has checked lies.
-
-    Raises
-    ------
-    InputError
-        Its pixels have no area.
-    """
+    """Where a file that `read_info` has checked lies."""
     if info.to_map is None:
         return Placement(info.size, crs=info.crs)
     x0, xx, xy, y0, yx, yy = info.to_map

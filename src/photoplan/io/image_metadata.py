@@ -69,13 +69,7 @@ class ImageMetadata:
 
 
 def read_image_metadata(path: str | Path) -> ImageMetadata:
-    """Metadata of a JPEG or TIFF image; pixels are not read.
-
-    Raises
-    ------
-    InputError
-        The file is neither, it states a position that is not on the earth, or its XMP holds entities.
-    """
+    """Metadata of a JPEG or TIFF image; pixels are not read."""
     path = Path(path)
     exif, packet, faults = read_exif(path)
     try:
@@ -276,13 +270,7 @@ _NAMES = {
 
 
 def read_exif(path: Path) -> tuple[dict[str, ExifValue], str | None, tuple[str, ...]]:
-    """EXIF entries by their standard names, the XMP packet as text (None: there is none), and what is damaged.
-
-    Raises
-    ------
-    InputError
-        The file is neither JPEG nor TIFF, or the header of a TIFF is damaged.
-    """
+    """EXIF entries by their standard names, the XMP packet as text (None: there is none), and what is damaged."""
     try:
         with path.open("rb") as file:
             start = file.read(4)

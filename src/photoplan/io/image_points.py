@@ -38,28 +38,7 @@ _FEW = 0.02
 def read_image_points(
     path: Path, *, columns: str | None = None, decimal_comma: bool = False, doubtful: list[str] | None = None
 ) -> ImagePoints:
-    """Measured image points of a table.
-
-    Parameters
-    ----------
-    columns : str, optional
-        Columns in their order, as in ``"image,point,-,x,y"``, where the table does not say.
-    decimal_comma : bool
-        Whether numbers are written 1,5.
-    doubtful : list of str, optional
-        Takes a note where a few points are measured twice in an image, and these measurements are set aside; without
-        it they are an error.
-
-    Returns
-    -------
-    ImagePoints
-        Images under the name that their first line has; standard deviations NaN where the table states none.
-
-    Raises
-    ------
-    InputError
-        A line cannot be read, or a point is measured twice in an image; the message names the line.
-    """
+    """Measured image points of a table."""
     table = read_table(Path(path), _COLUMNS, Dialect(columns, decimal_comma=decimal_comma))
     points, images = table.names("point"), table.names("image")
     spelled = same_images(images)
@@ -110,11 +89,6 @@ def named_as(points: ImagePoints, names: Sequence[str]) -> tuple[ImagePoints, tu
     """The measurements with the images' names written as in `names`, and the images that are not among these.
 
     See `photoplan.io.names.ImageNames`. Images that are not known keep their name.
-
-    Raises
-    ------
-    InputError
-        Two images of the points are one image of `names`, or one may be several of them.
     """
     try:
         found = ImageNames(names).match(points.images)
@@ -140,11 +114,6 @@ def write_image_points(path: Path, points: ImagePoints) -> None:
     """Write measurements as a table with header; it appears complete or not at all.
 
     Standard deviations are written where one is known.
-
-    Raises
-    ------
-    ResourceError, UsageError
-        The disk is full, or the folder cannot be written to.
     """
     stated = bool(np.isfinite(points.sigma).any())
     rows = []

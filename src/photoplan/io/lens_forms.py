@@ -60,13 +60,7 @@ def opencv_form(camera: CameraEntry) -> OpenCVForm | None:
 
 
 def opencv_losses(block: OrientationBlock, *, rational: bool = True, fisheye: bool = True) -> list[Loss]:
-    """What of a block's cameras a format with OpenCV's lenses cannot hold.
-
-    Parameters
-    ----------
-    rational, fisheye : bool
-        Whether the format has k4–k6, and the fisheye lens.
-    """
+    """What of a block's cameras a format with OpenCV's lenses cannot hold."""
     lost = []
     for name, camera in block.cameras.items():
         if camera.pixels is None:
@@ -119,13 +113,7 @@ def agisoft_form(camera: CameraEntry) -> AgisoftForm | None:
 
 
 def frame_camera(form: OpenCVForm | AgisoftForm, where: str) -> CameraEntry:
-    """The description of a camera in one of the two forms; `where` begins messages.
-
-    Raises
-    ------
-    InputError
-        A value is not allowed, or Agisoft's fisheye has terms that are not supported.
-    """
+    """The description of a camera in one of the two forms; `where` begins messages."""
     if isinstance(form, OpenCVForm):
         (fx, fy), point = form.focal, form.point
         names = ("k1", "k2", "k3", "k4", "k5", "k6")

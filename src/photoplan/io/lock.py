@@ -25,15 +25,6 @@ class FileLock:
     """An exclusive lock on a file beside the product; a context manager.
 
     The system releases it when the process ends, however it ends, so a lock file that was left behind means nothing.
-
-    Raises
-    ------
-    RunLocked
-        On entry, if another run holds it.
-    UsageError
-        On entry, if the file cannot be made (folder absent or read-only), or is a link or not a lock.
-    ResourceError
-        On entry, if the disk is full.
     """
 
     def __init__(self, path: Path) -> None:

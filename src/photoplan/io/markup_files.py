@@ -22,11 +22,6 @@ def read_yaml(path: Path) -> Any:
 
     Aliases (which let a small file unfold without bound), deep nesting and repeated keys are refused before anything
     is built.
-
-    Raises
-    ------
-    InputError
-        The file is not such YAML.
     """
     return parse_yaml(read_text(path, 200_000), path)
 
@@ -68,13 +63,7 @@ class NotWellFormed(InputError):
 
 
 def read_xml(path: Path, max_bytes: int) -> Element:
-    """Root of an XML file.
-
-    Raises
-    ------
-    InputError
-        The file is missing, larger than `max_bytes`, damaged, or holds a document type or entities.
-    """
+    """Root of an XML file."""
     return parse_xml(read_text(path, max_bytes), str(path))
 
 
@@ -106,13 +95,7 @@ def _refuse_deep(root: Element, where: str) -> None:
 
 
 def numbers(element: Element | None, where: str, count: int) -> tuple[float, ...]:
-    """The `count` numbers that an element holds as text.
-
-    Raises
-    ------
-    InputError
-        There is no such element, or it holds something else.
-    """
+    """The `count` numbers that an element holds as text."""
     words = (element.text or "").split() if element is not None else []
     try:
         values = [float(w) for w in words]

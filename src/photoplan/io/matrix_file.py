@@ -31,13 +31,7 @@ BANDS = (
 
 @dataclass(frozen=True, eq=False)
 class MatrixFile:
-    """A coordinate matrix on the disk.
-
-    Raises
-    ------
-    InputError
-        The file is no matrix of a view.
-    """
+    """A coordinate matrix on the disk."""
 
     path: Path
     info: RasterInfo = field(init=False, repr=False)

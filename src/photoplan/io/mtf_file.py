@@ -33,13 +33,7 @@ class MtfTable:
     """Frequencies are cycles per pixel, or per millimetre on the sensor."""
 
     def per_pixel(self, pixel_um: float | None) -> NDArray[np.float64]:
-        """Frequencies in cycles per pixel.
-
-        Raises
-        ------
-        InputError
-            They are per millimetre and the size of a pixel is not known.
-        """
+        """Frequencies in cycles per pixel."""
         if self.unit == "px":
             return self.frequency
         if pixel_um is None:
@@ -51,14 +45,7 @@ class MtfTable:
 
 
 def read_mtf_table(path: Path) -> MtfTable:
-    """MTF values of a text table with a header: ``cycles_per_px`` or ``cycles_per_mm``, and ``modulation``.
-
-    Raises
-    ------
-    InputError
-        A column is missing, a field is no number, a frequency is negative or occurs twice, or a modulation is not
-        between 0 and 1.5; the message names file and line.
-    """
+    """MTF values of a text table with a header: ``cycles_per_px`` or ``cycles_per_mm``, and ``modulation``."""
     words = read_head(path).casefold()
     unit: Literal["px", "mm"] = "mm" if any(name in words for name in _FREQUENCY["mm"]) else "px"
     if unit == "mm" and any(name in words for name in _FREQUENCY["px"]):

@@ -32,11 +32,6 @@ def safe_stem(name: str) -> str:
     Folders and the suffix of a raster format are dropped; letters and digits of any script, ``-``, ``_`` and inner
     ``.`` stay; everything else becomes ``_``. Reserved device names get a trailing ``_``; stems of more than 120 bytes
     are cut and end with eight digits of a hash of the whole name, so that they stay different.
-
-    Raises
-    ------
-    InputError
-        Nothing usable is left of the name.
     """
     text = unicodedata.normalize("NFC", name)
     stem = match_key(name)
@@ -53,13 +48,7 @@ def safe_stem(name: str) -> str:
 
 
 def file_in(folder: Path, name: str) -> Path:
-    """Path of a file that is called `name`, wherever the name comes from; it cannot lead out of the folder.
-
-    Raises
-    ------
-    InputError
-        The name holds more than one part, cannot be a file's on every system, or would be hidden.
-    """
+    """Path of a file that is called `name`, wherever the name comes from; it cannot lead out of the folder."""
     name = name if isinstance(name, str) else ""  # what comes from JSON may be anything
     stem, dot, _ = name.partition(".")
     if (
@@ -81,11 +70,6 @@ def unique_stems(names: Iterable[str]) -> dict[str, str]:
 
     Names with one base name get their folders in front, as many as tell them apart, then a number. Capitals are ignored
     in the comparison, since common file systems ignore them.
-
-    Raises
-    ------
-    InputError
-        Nothing usable is left of a name.
     """
     stems = {name: safe_stem(name) for name in names}
     taken: set[str] = set()
@@ -143,13 +127,7 @@ class ImageNames:
             self._by_key.setdefault(match_key(name).casefold(), []).append(name)
 
     def find(self, name: str) -> str | None:
-        """The image that is meant; None if no image has the base name.
-
-        Raises
-        ------
-        InputError
-            Several images fit equally well.
-        """
+        """The image that is meant; None if no image has the base name."""
         if name in self._names:
             return name
         known = self._by_key.get(match_key(name).casefold(), [])
@@ -162,13 +140,7 @@ class ImageNames:
         return fitting[0] if fitting else None
 
     def match(self, given: Sequence[str]) -> list[str | None]:
-        """The image of each of several names, no two of which are one image; None if no image has the base name.
-
-        Raises
-        ------
-        InputError
-            A name fits several images, or several names fit one image, equally well.
-        """
+        """The image of each of several names, no two of which are one image; None if no image has the base name."""
         found = [self.find(name) for name in given]
         best: dict[str, int] = {}
         for k, known in enumerate(found):
@@ -202,11 +174,6 @@ def same_images(names: Iterable[str]) -> dict[str, str]:
     """Each name of a file with the spelling that the file first gives the image.
 
     An image may be written with or without folders and suffix; names whose folders differ are different images.
-
-    Raises
-    ------
-    InputError
-        A name without folder may be one of several images.
     """
     groups: dict[str, dict[str, tuple[str, ...]]] = {}
     for name in dict.fromkeys(names):
@@ -235,13 +202,7 @@ def match_key(name: str) -> str:
 
 
 def check_input_name(text: str) -> str:
-    """Refuse an input that is not a plain path: GDAL's virtual systems, URLs, driver prefixes, inline documents.
-
-    Raises
-    ------
-    InputError
-        The text is not the path of a file on this computer.
-    """
+    """Refuse an input that is not a plain path: GDAL's virtual systems, URLs, driver prefixes, inline documents."""
     plain = text.strip().replace("\\", "/")
     reason = None
     if not plain:

@@ -36,11 +36,6 @@ def scratch(folder: Path) -> Iterator[Path]:
 
     Its name cannot be known in advance and nobody else can write there, so that no library follows a link that was laid
     out for it. A lock inside shows that its process lives: what dead ones have left behind is removed here.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be written.
     """
     refuse_outward(folder)
     if folder not in _TIDIED:
@@ -199,13 +194,6 @@ def together() -> Iterator[None]:
     Their order is that in which they were finished: a run record comes last. A run that dies between two names leaves
     files of which `is_unfinished` knows, so that the same command goes on. Inside another such context this one does
     nothing: the outer one names all.
-
-    Raises
-    ------
-    UsageError
-        A file appeared under one of the names meanwhile, or a folder cannot be written.
-    ResourceError
-        The disk is full.
     """
     if _GROUP.get() is not None:
         yield
@@ -226,13 +214,7 @@ def together() -> Iterator[None]:
 
 @contextmanager
 def locked(lock: Path) -> Iterator[None]:
-    """Hold a lock, see `FileLock`; inside `together` until the files have their names.
-
-    Raises
-    ------
-    RunLocked, UsageError, ResourceError
-        See `FileLock`.
-    """
+    """Hold a lock, see `FileLock`; inside `together` until the files have their names."""
     group = _GROUP.get()
     with ExitStack() as stack:
         if group is None:
@@ -244,13 +226,7 @@ def locked(lock: Path) -> Iterator[None]:
 
 
 def give_name(part: Path, path: Path) -> None:
-    """Give a complete file its name, when it is safe on the disk: now, or with the others of `together`.
-
-    Raises
-    ------
-    OSError
-        The system cannot.
-    """
+    """Give a complete file its name, when it is safe on the disk: now, or with the others of `together`."""
     sync_file(part)
     group = _GROUP.get()
     if group is None:
@@ -261,13 +237,7 @@ def give_name(part: Path, path: Path) -> None:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a small file so that its name holds either the old or the whole new content; see `give_name`.
-
-    Raises
-    ------
-    ResourceError, UsageError
-        See `disk_error`.
-    """
+    """Write a small file so that its name holds either the old or the whole new content; see `give_name`."""
     try:
         with scratch(path.parent) as folder:
             partial = folder / path.name

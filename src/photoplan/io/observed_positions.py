@@ -72,13 +72,7 @@ class PositionTable:
     """What was left out."""
 
     def positions(self, sigma: tuple[float, float] | None = None) -> ObservedPositions:
-        """The positions; those without a standard deviation get `sigma` (horizontal coordinates, height; metres).
-
-        Raises
-        ------
-        InputError
-            No standard deviation is stated for a position.
-        """
+        """The positions; those without a standard deviation get `sigma` (horizontal coordinates, height; metres)."""
         default = np.full(3, np.nan) if sigma is None else np.array([sigma[0], sigma[0], sigma[1]])
         full = np.where(np.isnan(self.sigma), default, self.sigma)
         lost = np.flatnonzero(np.isnan(full).any(axis=1))
@@ -109,26 +103,7 @@ def read_observed_positions(
     height_system: str | None = None,
     columns: str | None = None,
 ) -> PositionTable:
-    """Observed positions of a file.
-
-    Parameters
-    ----------
-    path : Path
-        Table of text, a file of any format of orientations, or a folder of images with GPS positions in EXIF or XMP.
-    form : TableFormat, optional
-        Unit and order of the angles, decimal sign.
-    crs : str, optional
-        The CRS that positions must be in, where the file states one.
-    height_system : str, optional
-        The height system that heights are wanted in; they are converted if the file states another one.
-    columns : str, optional
-        Columns of a table in their order where it does not name them; ``-`` for one that is not used.
-
-    Raises
-    ------
-    InputError
-        A line cannot be read, an image is given twice, or the CRS is another one; file and line are named.
-    """
+    """Observed positions of a file."""
     path, form = Path(path), form or TableFormat()
     if path.is_dir() and crs is not None and not (path / "images.txt").is_file():
         return _from_images(path, crs)

@@ -25,13 +25,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def read_text(path: Path, max_bytes: int) -> str:
-    """Text of a UTF-8 file (a byte order mark is dropped, line ends become newlines).
-
-    Raises
-    ------
-    InputError
-        The file is missing, is larger than `max_bytes`, or is not UTF-8; the message names the line.
-    """
+    """Text of a UTF-8 file (a byte order mark is dropped, line ends become newlines)."""
     try:
         size = path.stat().st_size
         if size > max_bytes:
@@ -48,13 +42,7 @@ def read_text(path: Path, max_bytes: int) -> str:
 
 
 def decoded_text(path: Path, raw: bytes, first_line: int = 1) -> str:
-    """UTF-8 text with plain line ends; `raw` begins with the file's line `first_line`.
-
-    Raises
-    ------
-    InputError
-        It is not UTF-8, or holds a zero byte; the message names the line and what the file looks like.
-    """
+    """UTF-8 text with plain line ends; `raw` begins with the file's line `first_line`."""
     try:
         text = raw.decode("utf-8-sig" if first_line == 1 else "utf-8")
         at, wrong = text.find("\0"), "holds a zero byte; this is not a text file"
@@ -68,13 +56,7 @@ def decoded_text(path: Path, raw: bytes, first_line: int = 1) -> str:
 
 
 def read_head(path: Path) -> str:
-    """The beginning of a text file, to tell formats apart; bytes that are not UTF-8 are replaced.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read.
-    """
+    """The beginning of a text file, to tell formats apart; bytes that are not UTF-8 are replaced."""
     try:
         with path.open("rb") as file:
             raw = file.read(65_536)
@@ -84,24 +66,13 @@ def read_head(path: Path) -> str:
 
 
 def read_json(path: Path, max_bytes: int = 1_000_000_000) -> Any:
-    """Plain contents of a JSON file; NaN and infinity are refused, since JSON has no such numbers.
-
-    Raises
-    ------
-    InputError
-        The file is not JSON, or nested without reason.
-    """
+    """Plain contents of a JSON file; NaN and infinity are refused, since JSON has no such numbers."""
     return parse_json(read_text(path, max_bytes), str(path))
 
 
 def read_json_lines(path: Path, max_bytes: int = 1_000_000_000) -> list[Any]:
     """Plain contents of a file that has a JSON document in each line, with the marks of a JSON sequence (RFC 8142) or
     without, or a single one in all lines.
-
-    Raises
-    ------
-    InputError
-        As of `read_json`.
     """
     text = read_text(path, max_bytes)
     lines = [line.lstrip("\x1e") for line in text.split("\n")]
@@ -116,11 +87,6 @@ def parse_json(text: str, where: str, first_line: int = 1) -> Any:
     """Plain contents of a JSON text, the one place where foreign JSON is taken apart.
 
     Whole numbers beyond 64 bits become floats; NaN, infinity and numbers too large for a float are refused.
-
-    Raises
-    ------
-    InputError
-        The text is not JSON, or nested without reason; the message begins with `where`.
     """
 
     def refuse(word: str) -> NoReturn:
@@ -142,26 +108,14 @@ def parse_json(text: str, where: str, first_line: int = 1) -> Any:
 
 
 def json_object(text: Any, where: str) -> dict[str, Any]:
-    """Members of a JSON text that must be an object.
-
-    Raises
-    ------
-    InputError
-        It is none; the message begins with `where`.
-    """
+    """Members of a JSON text that must be an object."""
     if not isinstance(text, str):
         raise InputError(f"{where}: {type(text).__name__} instead of a text in JSON")
     return members(parse_json(text, where), where)
 
 
 def members(value: Any, where: str) -> dict[str, Any]:
-    """The value, if it is an object of JSON; None stands for an empty one.
-
-    Raises
-    ------
-    InputError
-        It is something else; the message begins with `where`.
-    """
+    """The value, if it is an object of JSON; None stands for an empty one."""
     if value is None:
         return {}
     if not isinstance(value, dict):
@@ -170,13 +124,7 @@ def members(value: Any, where: str) -> dict[str, Any]:
 
 
 def elements(value: Any, where: str) -> list[Any]:
-    """The value, if it is a list of JSON; None stands for an empty one.
-
-    Raises
-    ------
-    InputError
-        It is something else; the message begins with `where`.
-    """
+    """The value, if it is a list of JSON; None stands for an empty one."""
     if value is None:
         return []
     if not isinstance(value, list):
@@ -185,13 +133,7 @@ def elements(value: Any, where: str) -> list[Any]:
 
 
 def number_rows(value: Any, where: str, width: int) -> NDArray[np.float64]:
-    """A list of lists of `width` finite numbers, shape (n, width); None stands for an empty one.
-
-    Raises
-    ------
-    InputError
-        It is something else; the message begins with `where`.
-    """
+    """A list of lists of `width` finite numbers, shape (n, width); None stands for an empty one."""
     rows = elements(value, where)
     try:
         out = np.array(rows, float).reshape(-1, width) if rows else np.empty((0, width))
@@ -203,13 +145,7 @@ def number_rows(value: Any, where: str, width: int) -> NDArray[np.float64]:
 
 
 def build(model: type[M], values: dict[str, Any], source: str) -> M:
-    """A model of plain values; errors become messages that begin with `source`.
-
-    Raises
-    ------
-    InputError
-        A value is not allowed.
-    """
+    """A model of plain values; errors become messages that begin with `source`."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -217,13 +153,7 @@ def build(model: type[M], values: dict[str, Any], source: str) -> M:
 
 
 def finite(value: Any, where: str, count: int | None = None) -> Any:
-    """A finite number, or `count` of them as a tuple of floats.
-
-    Raises
-    ------
-    InputError
-        It is something else; the message begins with `where`.
-    """
+    """A finite number, or `count` of them as a tuple of floats."""
     if count is not None:
         if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
             raise InputError(f"{where}: {value!r} given; {count} numbers are needed")
@@ -255,12 +185,8 @@ class StatedCrs:
 
 
 def crs_beside(path: Path) -> StatedCrs | None:
-    """CRS (EPSG code, WKT or PROJ string) in the file of the same name with the suffix ``.prj``; None: there is none.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or states no CRS that is known.
+    """CRS (EPSG code, WKT or PROJ string) in the file of the same name with the suffix ``.prj``; None: there
+    is none.
     """
     side = next((p for p in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if p.is_file()), None)
     if side is None:
@@ -275,13 +201,7 @@ MAX_BYTES = 200_000_000
 
 
 def read_toml(path: Path, max_bytes: int = MAX_BYTES) -> tuple[dict[str, Any], str]:
-    """Contents of a TOML file and its text.
-
-    Raises
-    ------
-    InputError
-        The file is missing, too large, not UTF-8 or not TOML; the message names the line.
-    """
+    """Contents of a TOML file and its text."""
     text = read_text(path, max_bytes)
     try:
         return tomllib.loads(text), text
@@ -290,13 +210,7 @@ def read_toml(path: Path, max_bytes: int = MAX_BYTES) -> tuple[dict[str, Any], s
 
 
 def read_entries(path: Path, model: type[M], max_bytes: int = MAX_BYTES) -> M:
-    """Contents of a TOML file as a checked value.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or an entry is missing, unknown or wrong; the message names the entry and its line.
-    """
+    """Contents of a TOML file as a checked value."""
     contents, text = read_toml(path, max_bytes)
     try:
         return model.model_validate(contents)

@@ -33,30 +33,7 @@ def write_plain_tiff(
     source: int,
     dress: Callable[[Any], None] | None = None,
 ) -> None:
-    """Write a tiled TIFF.
-
-    Parameters
-    ----------
-    path
-        The file; replaced if it is there.
-    profile
-        What `rasterio.open` needs: size, bands, type, reference system, transform, side of the blocks; and `colormap`,
-        a colour table.
-    tags
-        Tags of the data set.
-    blocks
-        (number of the block in row order, first byte, length) of every block, in the order of writing; blocks
-        that are not named stay unwritten (sparse).
-    source
-        Descriptor of the open file that holds the blocks' bytes, in this machine's byte order.
-    dress
-        Called with the data set while its header is made: for names and colours of bands, and metadata.
-
-    Raises
-    ------
-    OSError
-        If the disk is full or the file cannot be written.
-    """
+    """Write a tiled TIFF."""
     path.unlink(missing_ok=True)
     fixed = {"driver": "GTiff", "tiled": True, "interleave": "pixel", "sparse_ok": True, "compress": "none"}
     colours = profile.get("colormap")

@@ -57,13 +57,7 @@ class PlanTables:
 
 
 def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> None:
-    """Write a plan; it appears under its name only when complete.
-
-    Raises
-    ------
-    UsageError
-        The file exists and `overwrite` is False.
-    """
+    """Write a plan; it appears under its name only when complete."""
     if path.exists() and not overwrite:
         raise UsageError(f"{path} exists; give `overwrite` to replace it")
     make_parents(path.parent)
@@ -117,13 +111,7 @@ def _write_layer(
 
 
 def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header of a plan, and some columns of its tiles: product, tile, sources, cells, residual_px.
-
-    Raises
-    ------
-    InputError
-        The file is missing or no plan of this format.
-    """
+    """Header of a plan, and some columns of its tiles: product, tile, sources, cells, residual_px."""
     if not path.is_file():
         raise InputError(f"{path}: no such plan")
     try:

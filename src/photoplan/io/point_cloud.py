@@ -30,13 +30,7 @@ _LAS_DATE = 90
 
 
 def check_cloud(path: Path) -> None:
-    """Refuse a name that says no format, or a format whose library is missing.
-
-    Raises
-    ------
-    UsageError
-        Naming the way out.
-    """
+    """Refuse a name that says no format, or a format whose library is missing."""
     kind = path.suffix.lower()
     if kind not in CLOUD_SUFFIXES:
         raise UsageError(f"{path}: {kind or 'no suffix'}; points are written by suffix: {', '.join(CLOUD_SUFFIXES)}")
@@ -47,31 +41,7 @@ def check_cloud(path: Path) -> None:
 
 
 def write_cloud(path: Path, heights: Path, sigmas: Path, grey: Path, crs: str, frame: Frame | None = None) -> int:
-    """Write the posts of a surface that have a height.
-
-    Parameters
-    ----------
-    path : Path
-        Its suffix says the format. LAS 1.4 without a date, with point format 6: the grey value is the intensity,
-        the standard deviation of the height an extra dimension `sigma`, metres. PLY: binary, little-endian, x, y, z,
-        sigma and grey.
-    heights, sigmas, grey : Path
-        Finished rasters, which may still wait for their names; grey values as fine or several times finer: their means.
-    crs : str
-        Stated in LAS, which can.
-    frame : Frame, optional
-        Of the rasters, where they lie on no map: points are on the ground, their standard deviations along its heights.
-
-    Returns
-    -------
-    int
-        Points.
-
-    Raises
-    ------
-    UsageError, ResourceError
-        The place cannot be written, or the disk is full.
-    """
+    """Write the posts of a surface that have a height."""
     write = _write_ply if path.suffix.lower() == ".ply" else _write_las
     try:
         with ExitStack() as opened:

@@ -51,21 +51,7 @@ class VectorFeatures:
 
 
 def read_features(path: Path, *kinds: str, crs: str | None = None) -> VectorFeatures:
-    """Objects of the first layer of a GeoPackage, Shapefile, GeoJSON or FlatGeobuf.
-
-    Parameters
-    ----------
-    kinds : str
-        What the objects may be: `Polygon`, `Point`, `LineString`; several objects in one are taken as such.
-    crs : str, optional
-        That of the model for which they are wanted.
-
-    Raises
-    ------
-    InputError
-        The file is none of these formats, holds no such objects, or polygons that cross themselves (all are named), or
-        states another CRS.
-    """
+    """Objects of the first layer of a GeoPackage, Shapefile, GeoJSON or FlatGeobuf."""
     path = check_plain_file(path, "vector file")
     with path.open("rb") as file:
         head = file.read(16)
@@ -131,13 +117,7 @@ def label_polygons(labels: NDArray[np.int32], grid: MapGrid) -> dict[int, Any]:
 
 
 def check_vectors(path: Path) -> None:
-    """Refuse a name that `write_features` would not write, before anything is computed for it.
-
-    Raises
-    ------
-    UsageError
-        The name does not end with `.gpkg`.
-    """
+    """Refuse a name that `write_features` would not write, before anything is computed for it."""
     if path.suffix.lower() != ".gpkg":
         raise UsageError(f"{path}: vectors are written as GeoPackage; give a name that ends with .gpkg")
 
@@ -145,24 +125,6 @@ def check_vectors(path: Path) -> None:
 def write_features(
     path: Path, kind: str, shapes: Sequence[Any], columns: Mapping[str, NDArray[Any]], crs: str | None, layer: str
 ) -> None:
-    """Write one layer as a GeoPackage that appears under its name only when it is complete; replaces an older one.
-
-    Parameters
-    ----------
-    path : Path
-        Its name must end with `.gpkg`.
-    kind : str
-        Geometry type: `Polygon`, `MultiPolygon`, `LineString Z`, `Point Z` …
-    shapes : sequence of shapely geometries
-    columns : mapping
-        Name and values of each column.
-
-    Raises
-    ------
-    UsageError
-        The name does not end with `.gpkg`, or the folder cannot be written.
-    ResourceError
-        The disk is full.
-    """
+    """Write one layer as a GeoPackage that appears under its name only when it is complete; replaces an older one."""
     check_vectors(path)
     write_geopackage(path, [VectorLayer(layer, kind, shapes, columns)], crs)

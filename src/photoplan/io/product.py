@@ -53,13 +53,7 @@ class ProductFacts:
 def check_output(
     path: Path, inputs: Sequence[Path | str] = (), *, overwrite: bool = False, raster: bool = False
 ) -> None:
-    """Refuse an output that exists, or that is one of the inputs, also by a link, or a `raster` of another suffix.
-
-    Raises
-    ------
-    UsageError
-        Naming the file and the way out.
-    """
+    """Refuse an output that exists, or that is one of the inputs, also by a link, or a `raster` of another suffix."""
     for source in map(Path, inputs):
         same = path.exists() and source.exists() and path.samefile(source)
         if same or path.resolve() == source.resolve():
@@ -95,16 +89,6 @@ class ProductFile:
     and only then gives it its name. Leaving the context without `complete` keeps the log.
 
     A second run on the same output is refused while the first one lives. `append` may be called from several threads.
-
-    Raises
-    ------
-    UsageError
-        When made or entered: a type or option that is not allowed, an output that exists or is an input, a folder
-        that cannot be written.
-    RunLocked
-        On entry, if another run is writing this product.
-    ResourceError
-        In `append` and `complete`, if the disk is full: no product, no temporary files, finished tiles are kept.
     """
 
     path: Path
@@ -220,19 +204,7 @@ class ProductFile:
         valid: NDArray[np.bool_] | None = None,
         record: Mapping[str, Any] | None = None,
     ) -> None:
-        """Add a finished tile.
-
-        Parameters
-        ----------
-        index
-            Its place in `windows`.
-        pixels
-            Shape (bands, height, width) of the tile's window, in the product's type.
-        valid
-            Shape (height, width), True = valid; None: all.
-        record
-            Its figures, for whoever goes on with this run: numbers and lists of numbers.
-        """
+        """Add a finished tile."""
         pixels = np.asarray(pixels)
         window = self._windows[index]
         shape = self.bands, window.height, window.width

@@ -32,32 +32,7 @@ def check_product(
     overviews: bool,
     driver: str = "COG",
 ) -> None:
-    """Compare a file with what it must hold.
-
-    Parameters
-    ----------
-    path
-        The file.
-    profile
-        Size, bands, type, transform, reference system and nodata as they were asked for.
-    samples
-        Windows that are read again.
-    expected
-        Pixels (bands, h, w) and validity (h, w) of a window.
-    lossy
-        The compression changes values a little.
-    overviews
-        There must be overviews.
-    driver
-        Format of the file, see `ProductFile`.
-
-    Raises
-    ------
-    PhotoplanError
-        Naming what differs.
-    InputError
-        If blocks of any directory lie beyond the end of the file, or cannot be decoded.
-    """
+    """Compare a file with what it must hold."""
     if driver == "COG":
         read_tiff_layouts(path)
     with open_raster(path, "GTiff" if driver == "COG" else driver) as dataset, gdal_settings():

@@ -28,27 +28,6 @@ def write_quicklook(product: Path, picture: Path, *, max_side: int = 1600) -> Pa
     Only the overview of a suitable size is read. Bytes are shown as they are, with their colour table if there is one;
     other types are stretched from the second to the ninety-eighth percentile. One or two bands are shown grey, more as
     red, green, blue.
-
-    Parameters
-    ----------
-    product
-        A raster with overviews.
-    picture
-        The PNG; replaced if it is there.
-    max_side
-        Longest side of the picture, pixels.
-
-    Returns
-    -------
-    Path
-        The picture.
-
-    Raises
-    ------
-    InputError
-        If the product cannot be read.
-    ResourceError, UsageError
-        If the picture cannot be written.
     """
     _check_side(max_side)
     with _opened(product) as dataset, gdal_settings():
@@ -61,11 +40,6 @@ def read_reduced(product: Path, *, max_side: int) -> tuple[NDArray[Any], tuple[f
     """All bands of a product from its nearest overview, NaN where invalid, and its outer edges xmin ymin xmax ymax.
 
     The product may still wait for its name.
-
-    Raises
-    ------
-    InputError
-        If the product cannot be read.
     """
     _check_side(max_side)
     with _opened(standing(product)) as dataset, gdal_settings():
@@ -84,17 +58,6 @@ def write_overview(products: Sequence[Path], picture: Path, title: str = "", *, 
 
     Transparent where there is nothing. The products must share one reference system;
     those with another one than the first are left out. None if there is nothing to show.
-
-    Parameters
-    ----------
-    products
-        North-up rasters with overviews.
-    picture
-        The PNG; replaced if it is there.
-    title
-        Stands in the PNG; `refuse_foreign_overview` compares it.
-    max_side
-        Longest side of the picture, pixels.
     """
     _check_side(max_side)
     sheets = _placed(products)
@@ -117,13 +80,7 @@ def write_overview(products: Sequence[Path], picture: Path, title: str = "", *, 
 
 
 def refuse_foreign_overview(picture: Path, title: str = "") -> None:
-    """Refuse to replace a picture that `write_overview` did not write, or wrote with another title.
-
-    Raises
-    ------
-    UsageError
-        Naming it.
-    """
+    """Refuse to replace a picture that `write_overview` did not write, or wrote with another title."""
     if not picture.exists():
         return
     try:

@@ -36,17 +36,7 @@ _blocks = BlockCache(48 << 20)
 
 
 def reduced_by_blocks(key: Hashable, reader: FullSize, window: Window, level: int) -> Pixels:
-    """A window of an image that is reduced by 2^level, see `geometry.levels.reduced`.
-
-    Parameters
-    ----------
-    key : hashable
-        What tells the file and its state from all others.
-    window : Window
-        Of the reduced image.
-    level : int
-        0: nothing is reduced, nor kept.
-    """
+    """A window of an image that is reduced by 2^level, see `geometry.levels.reduced`."""
     if level == 0:
         return reader.read(window)
     whole = Window(0, 0, *level_size(reader.size, level))
@@ -77,12 +67,6 @@ class RasterReader:
     Safe to call from several threads (each has its own handle) and to pickle. Pixels keep their type and are used as
     they are stored; a palette is expanded to its three colours. See `photoplan.io.validity` for the rule of validity. A
     band that is tagged as alpha is a colour band if its values are those of a picture, see `with_alpha_judged`.
-
-    Raises
-    ------
-    InputError
-        When made: whatever `read_info` refuses, a type of pixels or a colour model that cannot be used. When read:
-        damaged pixels, with file, band and window.
     """
 
     path: Path
@@ -149,11 +133,6 @@ def with_alpha_judged(info: RasterInfo, alpha: bool | None = None) -> RasterInfo
 
     Some programs tag the fourth band of every image as alpha, also near infrared. A mask is 0 or opaque (the highest
     value there is), except at soft borders next to 0; it has few other values. A picture has many, in most pixels.
-
-    Parameters
-    ----------
-    alpha : bool, optional
-        True: the tag is right. False: it is wrong. None: the values decide.
     """
     if not info.alpha_bands or alpha is True or not info.colour_bands:
         return info
@@ -308,13 +287,7 @@ class Overview:
 
 @lru_cache(maxsize=256)
 def best_overview(info: RasterInfo, level: int) -> Overview | None:
-    """The overview that saves most on the way to a level; None if there is none that can be used.
-
-    Parameters
-    ----------
-    level : int
-        At least 1.
-    """
+    """The overview that saves most on the way to a level; None if there is none that can be used."""
     if info.palette or info.missing_blocks:
         return None
     for wanted in range(level, 0, -1):

@@ -27,13 +27,7 @@ from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout
 
 
 def check_png_complete(path: Path) -> None:
-    """Follow the chunks to the end chunk; the decoder itself would deliver a cut-off picture without a word.
-
-    Raises
-    ------
-    InputError
-        If the file ends before its end chunk.
-    """
+    """Follow the chunks to the end chunk; the decoder itself would deliver a cut-off picture without a word."""
     size = path.stat().st_size
     with path.open("rb") as file:
         position = 8
@@ -145,22 +139,7 @@ class RasterInfo:
 
 
 def read_info(path: str | Path, *, limits: RasterLimits = IMAGE_LIMITS, allow_remote: bool = False) -> RasterInfo:
-    """Read the facts of a raster from its header, and refuse a file that cannot be what it says.
-
-    Parameters
-    ----------
-    path
-        A plain file (TIFF, JPEG, PNG, JPEG 2000, BMP or ASCII grid; judged by content, not by name).
-    limits
-        How much the header may promise.
-    allow_remote
-        Follow virtual rasters, `/vsi…` paths and URLs too; such a source is not checked before it is opened.
-
-    Raises
-    ------
-    InputError
-        If the file is not plain, not a raster, cut off, contradicts itself, or promises more than `limits`.
-    """
+    """Read the facts of a raster from its header, and refuse a file that cannot be what it says."""
     if allow_remote and not Path(path).is_file():
         return _describe(Path(path), None, None, limits)
     plain = check_plain_file(path)

@@ -55,11 +55,6 @@ def damaged_block(path: Path, window: Window, pixels: NDArray[Any]) -> str | Non
     `pixels` (bands, h, w) are what was read of the window. If they are one block, they are compared with its checksum;
     any other block, and one that does not agree, is decoded once per process for this, and not kept. Files with another
     compression have no checksum and pass.
-
-    Raises
-    ------
-    InputError
-        The directory of the file contradicts itself.
     """
     state = path.stat()
     blocks = _blocks(path, state.st_mtime_ns, state.st_ino)
@@ -128,24 +123,7 @@ _CHUNK = 8 << 20
 
 
 class DecodedPicture:
-    """Pixels of a picture in a temporary file that has no name and ends with its last user.
-
-    Parameters
-    ----------
-    size
-        Width and height in pixels.
-    bands
-        Number of bands.
-    dtype
-        Type of the pixels.
-    read
-        Reads a window of whole rows, shape (bands, height, width).
-
-    Raises
-    ------
-    ResourceError
-        If the folder for temporary files is full.
-    """
+    """Pixels of a picture in a temporary file that has no name and ends with its last user."""
 
     def __init__(
         self, size: tuple[int, int], bands: int, dtype: np.dtype[Any], read: Callable[[Window], NDArray[Any]]
@@ -226,26 +204,7 @@ def read_pixels(
     missing: MissingBlocks | None = None,
     overview: tuple[int, tuple[int, int]] | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-    """Stored values of the bands without alpha, shape (bands, h, w), and the validity by the one rule (None: all).
-
-    Parameters
-    ----------
-    info
-        The file.
-    window
-        Pixels inside the file.
-    missing
-        What `missing_blocks` said of the file.
-    overview
-        Number and size of the overview that is read instead; None: the raster itself.
-
-    Raises
-    ------
-    UsageError
-        If the window is empty or leaves the raster.
-    InputError
-        If the pixels cannot be read or are damaged, with file, band and window.
-    """
+    """Stored values of the bands without alpha, shape (bands, h, w), and the validity by the one rule (None: all)."""
     size = info.size if overview is None else overview[1]
     if window.size == 0 or window.col < 0 or window.row < 0 or np.any(np.array(window.stop) > size):
         raise UsageError(f"{info.path}: {window} is not inside the raster of {size[0]} × {size[1]} pixels")

@@ -60,15 +60,7 @@ class Regions:
 
 
 def source_regions(path: Path, grid: MapGrid, images: int) -> dict[int, Any]:
-    """Outline of what each image paints, along the edges of pixels: multipolygons by row plus one.
-
-    Parameters
-    ----------
-    path : Path
-        A raster of sources.
-    images : int
-        How many there are; larger numbers mark filled pixels, which are left out.
-    """
+    """Outline of what each image paints, along the edges of pixels: multipolygons by row plus one."""
     found: dict[int, list[Any]] = {}
     with rasterio.open(path) as file:
         for part in grid.window.tiles(_PART):
@@ -86,15 +78,7 @@ def source_regions(path: Path, grid: MapGrid, images: int) -> dict[int, Any]:
 
 
 def write_regions(path: Path, images: Sequence[str], shapes: Mapping[int, Any], crs: str | None) -> None:
-    """Write regions as a GeoPackage with the layer `regions`: columns image, source and area_m2.
-
-    Raises
-    ------
-    UsageError
-        The folder cannot be written.
-    ResourceError
-        The disk is full.
-    """
+    """Write regions as a GeoPackage with the layer `regions`: columns image, source and area_m2."""
     rows = list(shapes)
     columns = {
         "image": np.array([images[row - 1] for row in rows], object),
@@ -107,12 +91,6 @@ def write_regions(path: Path, images: Sequence[str], shapes: Mapping[int, Any], 
 def read_regions(path: Path, images: Sequence[str], grid: MapGrid, known: Sequence[str] = ()) -> Regions:
     """Regions of a GeoPackage, as `write_regions` writes them or somebody has drawn them; those of images that are
     `known`, but none of the table of sources `images`, are left out.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, has no column `image`, names an image that is not among `images`, or holds polygons
-        that cross themselves.
     """
     read = read_features(path, "Polygon", crs=grid.crs)
     features = read.items

@@ -30,22 +30,6 @@ class ResultLog:
     """A crash-safe log of results by their names, as `photoplan.engine.run.Steps` asks for; a context manager.
 
     Results are data, see `photoplan.codec`: reading a log that came with a project runs no code.
-
-    Parameters
-    ----------
-    path : Path
-        The log; it stays when the context ends.
-    key : str
-        What makes a run itself: a log with another key is started afresh.
-    lock : Path or None
-        Held while the context lasts, see `photoplan.io.naming.locked`; None: whoever opens the log has one.
-
-    Raises
-    ------
-    RunLocked
-        On entry, if another run holds the lock.
-    UsageError, ResourceError
-        The file cannot be made or written; what was kept before is kept.
     """
 
     def __init__(self, path: Path, key: str, lock: Path | None) -> None:
@@ -112,13 +96,7 @@ class ResultLog:
         return index
 
     def rows(self, at: int, shape: tuple[int, int, int], first: int, last: int) -> NDArray[np.float32]:
-        """Rows from `first` to before `last` of an array of a shape (rows, columns, n) that is kept.
-
-        Raises
-        ------
-        PhotoplanError
-            The file cannot be read, or is no longer what was written.
-        """
+        """Rows from `first` to before `last` of an array of a shape (rows, columns, n) that is kept."""
         row = shape[1] * shape[2] * _BYTES
         try:
             found = self._open.part(at, first * row, (last - first) * row)

@@ -70,13 +70,7 @@ def record_path(product: Path) -> Path:
 
 
 def refuse_foreign_record(path: Path) -> None:
-    """Refuse to replace a file that has the name of a run record and is none.
-
-    Raises
-    ------
-    UsageError
-        Naming it.
-    """
+    """Refuse to replace a file that has the name of a run record and is none."""
     if os.path.exists(path) and _read_record(path) is None:  # noqa: PTH110 - a name may be too long for `Path.exists`
         raise UsageError(f"{path}: exists already and is no run record; move it away, or say `overwrite`")
 
@@ -120,24 +114,6 @@ def recording(kind: str, request: Any, inputs: Iterable[Any]) -> Iterator[Callab
     """The record of a command that measures or converts: what it reads is looked at now, before it changes any of it.
 
     What is written inside gets its names together with the record, see `photoplan.io.naming.together`.
-
-    Parameters
-    ----------
-    request : dataclass
-        See `settings_of`.
-    inputs : iterable
-        Files; what is none (a word, or missing and not needed) is passed over.
-
-    Yields
-    ------
-    callable
-        Takes the files that were written, None among them passed over, and the figures. Writes the record beside the
-        first of them; `PROJECT.KIND.run.json` beside a project that was changed; nothing if there are none.
-
-    Raises
-    ------
-    InputError
-        An input cannot be read; see `write_run_record` for the callable.
     """
     times, settings = run_times(), settings_of(request)
     read = {Path(each): None for each in inputs if each is not None and Path(each).is_file()}
@@ -165,31 +141,7 @@ def write_run_record(
     path: Path | None = None,
     **told: Any,
 ) -> Path:
-    """Write the record of a product as JSON; the name holds the old or the whole new record.
-
-    Parameters
-    ----------
-    product : Path
-        The record stands beside it, see `record_path`; with the whole name before ``.run.json`` where that would
-        replace the record of another file.
-    key : str
-        The digest of all that decides its content.
-    inputs : iterable
-        Files, or their entries, see `input_entry`.
-    run : mapping
-        Workers and whatever else was chosen without an effect on the content; times, see `run_times`.
-    path : Path, optional
-        Another place for the record.
-    **told
-        What the kind of product has to say: `product`, `settings`, and more.
-
-    Raises
-    ------
-    UsageError
-        If the record holds something that JSON cannot say, or the folder cannot be written.
-    ResourceError
-        If the disk is full.
-    """
+    """Write the record of a product as JSON; the name holds the old or the whole new record."""
     entries = [_entry(each) for each in inputs]
     record = {"file": product.name, **told, "key": key, "inputs": entries, "run": run, "versions": versions()}
     if path is None:

@@ -25,11 +25,6 @@ def read_pitch(path: Path) -> tuple[float, float] | None:
     """Distance of two columns and of two rows in millimetres, from the resolution tags of a TIFF, JPEG or EXIF header.
 
     None where the file states none, or states it without a unit.
-
-    Raises
-    ------
-    InputError
-        The file is no raster that can be used.
     """
     info = read_info(path)
     with open_raster(info.path, info.driver) as file:
@@ -54,13 +49,7 @@ def _jfif(path: Path) -> tuple[float, float] | None:
 
 
 def parse_pitch(text: str) -> tuple[float, float]:
-    """Distance of two columns and of two rows in millimetres, from ``1200dpi``, ``21um`` or ``21,20.8um``.
-
-    Raises
-    ------
-    UsageError
-        The text is none of these.
-    """
+    """Distance of two columns and of two rows in millimetres, from ``1200dpi``, ``21um`` or ``21,20.8um``."""
     match = re.fullmatch(r"\s*([\d.]+)(?:\s*,\s*([\d.]+))?\s*(dpi|um|µm|μm)\s*", text, re.IGNORECASE)
     numbers = [_number(match[k] or match[1]) for k in (1, 2)] if match else [None]
     if match is None or None in numbers:

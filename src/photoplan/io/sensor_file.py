@@ -185,13 +185,7 @@ class SensorDescription(Entry):
 
 
 def read_sensor(path: Path) -> SensorDescription:
-    """The description of a sensor.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, an entry is unknown, wrong or missing (with its line), or nothing is described.
-    """
+    """The description of a sensor."""
     described = read_entries(path, SensorDescription, _MAX_BYTES)
     if not described.model_fields_set - {"name", "stated"}:
         raise InputError(

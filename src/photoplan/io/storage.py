@@ -111,22 +111,7 @@ PICTURES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
 
 def write_picture(source: Path, target: Path, driver: str, quality: int, note: str) -> None:
-    """Copy a raster of one or three bands of bytes into a PNG or JPEG, row by row.
-
-    Parameters
-    ----------
-    driver : str
-        A value of `PICTURES`.
-    quality : int
-        Of JPEG.
-    note : str
-        What the picture says of itself, as its comment; a PNG also takes over the tags of the source.
-
-    Raises
-    ------
-    PhotoplanError, rasterio.errors.RasterioError
-        As `write_cog`.
-    """
+    """Copy a raster of one or three bands of bytes into a PNG or JPEG, row by row."""
     options: dict[str, Any] = {"quality": quality, "comment": note} if driver == "JPEG" else {}
     if driver == "PNG":
         options = {"write_metadata_as_text": "YES", "description": note}
@@ -189,15 +174,7 @@ class CogOptions:
 
 
 def write_cog(source: Path, target: Path, options: CogOptions, dtype: np.dtype[Any]) -> None:
-    """Copy a raster into a cloud-optimised GeoTIFF; memory stays low because the source is read by blocks.
-
-    Raises
-    ------
-    PhotoplanError
-        If GDAL complained in any way, at closing too.
-    rasterio.errors.RasterioError
-        If GDAL could not write.
-    """
+    """Copy a raster into a cloud-optimised GeoTIFF; memory stays low because the source is read by blocks."""
     temporary = {"CPL_TMPDIR": os.fspath(target.parent), "GDAL_TIFF_INTERNAL_MASK": True, "GDAL_PAM_ENABLED": False}
     with gdal_settings(**temporary), warnings_of_gdal() as found:
         rasterio.shutil.copy(source, target, driver="COG", **options.creation(dtype))

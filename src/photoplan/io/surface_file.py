@@ -11,13 +11,7 @@ TARGET = "PHOTOPLAN_TARGET"
 
 
 def target_of(path: Path, driver: str) -> str | None:
-    """What the heights of a raster lie over, where that is no map; None: a map, or the file says nothing.
-
-    Raises
-    ------
-    InputError
-        The file cannot be opened.
-    """
+    """What the heights of a raster lie over, where that is no map; None: a map, or the file says nothing."""
     with open_raster(path, driver) as dataset:
         target: str = dataset.tags().get(TARGET, "map")
     return None if target == "map" else target

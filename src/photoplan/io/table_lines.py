@@ -41,13 +41,7 @@ def has_decimal_comma(text: str) -> bool:
 
 
 def number(text: str, where: str, decimal_comma: bool = False, empty: bool = False) -> float:
-    """The number of a field.
-
-    Raises
-    ------
-    InputError
-        It is none; the message begins with `where`, and says what may be meant (`empty`: fields may be empty).
-    """
+    """The number of a field."""
     value = decimal(text, decimal_comma)
     if value is not None:
         return value
@@ -85,20 +79,7 @@ def _field(value: object, delimiter: str) -> str:
 
 
 def split_line(path: Path, item: Line, delimiter: str) -> tuple[str, ...]:
-    """Fields of a line, stripped; quotes hold a delimiter together.
-
-    Parameters
-    ----------
-    item : tuple of int and str
-        Number of the line, from 1, and its text.
-    delimiter : str
-        One of `DELIMITERS`; a table in columns by spaces may hold tabs too.
-
-    Raises
-    ------
-    InputError
-        Its double quotes are not closed. A single quote that is not closed is an apostrophe.
-    """
+    """Fields of a line, stripped; quotes hold a delimiter together."""
     line, text = item
     if '"' not in text and "'" not in text:
         fields = text.split() if delimiter == " " else text.split(delimiter)
@@ -117,13 +98,7 @@ def split_line(path: Path, item: Line, delimiter: str) -> tuple[str, ...]:
 
 
 def line_blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Number of the first line, and whole lines, of one part of a file after the other.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is not UTF-8, or holds a zero byte or a line of a megabyte; the message names the line.
-    """
+    """Number of the first line, and whole lines, of one part of a file after the other."""
     number, rest = 1, b""
     try:
         with path.open("rb") as file:

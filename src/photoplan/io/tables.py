@@ -121,13 +121,7 @@ class Table:
         return [row[at] for row in self.rows]
 
     def names(self, role: str) -> list[str]:
-        """Fields of a role, none of them empty.
-
-        Raises
-        ------
-        InputError
-            A field is empty, has control characters or more than 1000 characters.
-        """
+        """Fields of a role, none of them empty."""
         found = self.texts(role)
         for k, text in enumerate(found):
             if not text or any(ord(c) < 32 for c in text) or len(text) > 1000:
@@ -144,11 +138,6 @@ class Table:
         """Numbers of a role, shape (n,), or of several, (n, roles).
 
         NaN where the field is empty (if `empty`) or there is no such column.
-
-        Raises
-        ------
-        InputError
-            A field is no finite number.
         """
         found = [self._numbers(role, empty) for role in roles]
         return found[0] if len(found) == 1 else np.stack(found, axis=1)
@@ -172,16 +161,7 @@ class Table:
 
 
 def read_table(path: Path, columns: Columns, dialect: Dialect = Dialect(), max_bytes: int = MAX_BYTES) -> Table:
-    """The fields of a text table.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read or holds no data, needed columns are missing, or a line has another number of fields
-        than the first; the message names the line.
-    UsageError
-        The columns that were declared are not those of such a table.
-    """
+    """The fields of a text table."""
     size = path.stat().st_size if path.exists() else 0
     if size > max_bytes:
         raise InputError(f"{path}: {size} bytes; at most {max_bytes} are read from a file of this kind")
@@ -209,13 +189,7 @@ def wrong_width(width: int, layout: TableLayout) -> str:
 
 
 def find_layout(path: Path, lines: Sequence[Line], columns: Columns, dialect: Dialect = Dialect()) -> TableLayout:
-    """What the columns hold, from the first lines of a file; at least one of them holds data.
-
-    Raises
-    ------
-    InputError, UsageError
-        As `read_table`.
-    """
+    """What the columns hold, from the first lines of a file; at least one of them holds data."""
     data = [item for item in lines if not item[1].lstrip().startswith("#")][:_SNIFFED]
     line, delimiter = data[0][0], _delimiter(path, data, columns, dialect)
     first = split_line(path, data[0], delimiter)
@@ -352,11 +326,6 @@ def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[objec
     """Write a comma-separated table with a header; it appears complete or not at all, in a folder that is made.
 
     Fields are written as `photoplan.io.table_lines.csv_line` does.
-
-    Raises
-    ------
-    ResourceError, UsageError
-        The disk is full, or the folder cannot be written to.
     """
     try:
         make_parents(path.parent)

@@ -90,24 +90,12 @@ class TiffLayout:
 
 
 def read_tiff_layout(path: Path) -> TiffLayout:
-    """Read the first directory of a TIFF or BigTIFF.
-
-    Raises
-    ------
-    InputError
-        If the directory is not there, contradicts itself, or speaks of bytes beyond the end of the file.
-    """
+    """Read the first directory of a TIFF or BigTIFF."""
     return read_tiff_layouts(path, most=1)[0]
 
 
 def read_tiff_layouts(path: Path, most: int = 64) -> list[TiffLayout]:
-    """Read the directories of a TIFF or BigTIFF in the order of their chain: image, overviews, masks.
-
-    Raises
-    ------
-    InputError
-        See `read_tiff_layout`.
-    """
+    """Read the directories of a TIFF or BigTIFF in the order of their chain: image, overviews, masks."""
     file_size = path.stat().st_size
     try:
         with path.open("rb") as file:

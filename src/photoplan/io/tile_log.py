@@ -61,19 +61,6 @@ def _text(figures: Mapping[str, Any] | None) -> bytes:
 class TileLog:
     """Finished tiles by their index; a context manager that closes the file and leaves it in place.
 
-    Parameters
-    ----------
-    path
-        The file; made when absent.
-    key
-        What makes a run itself: a digest of inputs, parameters and version. A log with another key, or one that
-        another user has begun, is started afresh.
-
-    Raises
-    ------
-    UsageError, ResourceError
-        If the file cannot be made or written; after a failed `append` the log still holds what it held before.
-
     Notes
     -----
     `append` may be called from several threads. Two processes must not share a log: see `FileLock`.
@@ -166,15 +153,7 @@ class TileLog:
             self._end += len(head) + length
 
     def read(self, index: int) -> bytes:
-        """Payload of a tile, compared with its checksum.
-
-        Raises
-        ------
-        KeyError
-            If the tile is not in the log.
-        PhotoplanError
-            If the payload is no longer what was written.
-        """
+        """Payload of a tile, compared with its checksum."""
         place = self._places[index]
         content = self._read(place.position - place.figures, place.figures + place.length)
         if zlib.crc32(content) != place.checksum:

@@ -60,13 +60,7 @@ class Unfinished:
         return self._log
 
     def give(self, make: Callable[[Path], Path]) -> None:
-        """Give the name to what `make` writes into a working folder and compares.
-
-        Raises
-        ------
-        ResourceError
-            It could not be written, or does not hold what was.
-        """
+        """Give the name to what `make` writes into a working folder and compares."""
         try:
             with scratch(self.path.parent) as folder:
                 part = make(folder)

@@ -52,11 +52,6 @@ def refuse_undeclared(path: Path, window: Window, pixels: NDArray[Any], valid: N
     """Refuse valid pixels (bands, h, w) of signed type that are one of the usual nodata values in all bands.
 
     Resampled as grey values they would spoil their surroundings without a word.
-
-    Raises
-    ------
-    InputError
-        With the value and how it is declared.
     """
     if (
         pixels.dtype.kind not in "if"

@@ -63,13 +63,7 @@ class FeatureLayer:
 
 
 def read_layer(path: Path, name: str | None = None) -> FeatureLayer:
-    """All features of a layer, the first one with geometry if none is named.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, has no geometry, or is a view.
-    """
+    """All features of a layer, the first one with geometry if none is named."""
     if name == ENTITIES:
         drawn = read_drawing(path)
         own = {"Layer": drawn.layers, "EntityHandle": drawn.handles, "Text": drawn.texts}
@@ -103,13 +97,7 @@ def read_layer(path: Path, name: str | None = None) -> FeatureLayer:
 def read_columns(
     path: Path, name: str, kinds: dict[str, Literal["text", "integer", "number"]]
 ) -> dict[str, NDArray[Any]]:
-    """Columns of a layer, each with a value of its kind in every row.
-
-    Raises
-    ------
-    InputError
-        The layer or a column is missing, or a value is NULL, not finite or of another kind; the row is named.
-    """
+    """Columns of a layer, each with a value of its kind in every row."""
     meta, _, values = _read(path, name, read_geometry=False)
     found = dict(zip((str(field) for field in meta["fields"]), values))
     columns: dict[str, NDArray[Any]] = {}
@@ -156,13 +144,7 @@ def read_chosen(path: Path, layer: str | None) -> tuple[str, FeatureLayer]:
 
 
 def layers_of(path: Path) -> list[str]:
-    """Names of the layers with geometry.
-
-    Raises
-    ------
-    InputError
-        The file cannot be opened.
-    """
+    """Names of the layers with geometry."""
     try:
         return [str(name) for name, kind in pyogrio.list_layers(str(path)) if kind is not None]
     except VECTOR_ERRORS as error:
@@ -170,13 +152,7 @@ def layers_of(path: Path) -> list[str]:
 
 
 def only_layer(path: Path, layer: str | None) -> str:
-    """The layer that is named, or the only one.
-
-    Raises
-    ------
-    InputError
-        There is none of this name, there are several and none is named, or it is a view.
-    """
+    """The layer that is named, or the only one."""
     names = layers_of(path)
     if layer is None and len(names) == 1:
         layer = names[0]
@@ -193,13 +169,7 @@ def _refuse_view(path: Path, layer: str) -> None:
 
 
 def views_of(path: Path) -> set[str]:
-    """Names of the views of a GeoPackage in small letters; nothing for other formats.
-
-    Raises
-    ------
-    InputError
-        The database cannot be opened.
-    """
+    """Names of the views of a GeoPackage in small letters; nothing for other formats."""
     with path.open("rb") as file:
         if file.read(6) != b"SQLite":
             return set()

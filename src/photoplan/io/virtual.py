@@ -20,13 +20,7 @@ _TYPES = {"uint8": "Byte", "int8": "Int8", "uint16": "UInt16", "int16": "Int16",
 
 
 def refuse_foreign_virtual(path: Path) -> None:
-    """Refuse to replace a file that `write_virtual` has not written.
-
-    Raises
-    ------
-    UsageError
-        Naming it.
-    """
+    """Refuse to replace a file that `write_virtual` has not written."""
     if path.is_file() and _MARK not in path.read_bytes()[:4096].decode(errors="replace"):
         raise UsageError(f"{path}: exists and is not of photoplan; move it away, or give another name")
 
@@ -79,11 +73,6 @@ def write_stacked(path: Path, rasters: Mapping[str, Path]) -> None:
     """Write a VRT that shows rasters of one resolution, which lie in its folder, as bands of one, over all of them.
 
     Each band has the name of its raster, with the number of the band where that has several.
-
-    Raises
-    ------
-    UsageError
-        Pixels of the rasters do not lie over each other.
     """
     left, top, right, bottom = float("inf"), float("-inf"), float("-inf"), float("inf")
     opened = {}

@@ -19,24 +19,7 @@ _TYPES = ("uint8", "uint16", "int16", "float32")
 
 
 def write_whole_image(path: Path, values: NDArray[Any], tags: Mapping[str, str] | None = None) -> None:
-    """Write an image without place on the map and without nodata: every value is a value.
-
-    Parameters
-    ----------
-    path
-        The file; replaced if it is there.
-    values
-        Shape (height, width) or (bands, height, width); uint8, uint16, int16 or float32.
-    tags
-        Tags of the file.
-
-    Raises
-    ------
-    UsageError
-        The type of the values is another, or the folder cannot be written.
-    ResourceError
-        The disk is full.
-    """
+    """Write an image without place on the map and without nodata: every value is a value."""
     bands = values[None] if values.ndim == 2 else values
     if bands.ndim != 3 or bands.dtype.name not in _TYPES:
         raise UsageError(f"{path}: pixels of type {bands.dtype}, shape {values.shape}; allowed are {', '.join(_TYPES)}")

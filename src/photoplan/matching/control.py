@@ -59,15 +59,6 @@ def best_place(values: NDArray[np.float32], radius: int, border: int) -> tuple[i
     """Column and row where a patch has most texture in all directions; None if none has enough values.
 
     The measure is the smaller eigenvalue of the mean products of slopes over the patch (Förstner and Gülch 1987).
-
-    Parameters
-    ----------
-    values : ndarray, shape (rows, columns)
-        NaN where there are none.
-    radius : int
-        Of the patch.
-    border : int
-        Cells along the edge that are not taken.
     """
     known = np.isfinite(values)
     if not known.any():
@@ -94,18 +85,6 @@ def correlate(patch: Array, picture: Array) -> Array:
     """Correlation coefficient of a patch with every part of a larger picture, over the cells that both have.
 
     Normalised with means and norms of the common cells (Padfield 2012, eq. 27 and 28).
-
-    Parameters
-    ----------
-    patch : ndarray, shape (m, m)
-        NaN: no value.
-    picture : ndarray, shape (n, n), n ≥ m
-        NaN: no value.
-
-    Returns
-    -------
-    ndarray, shape (n − m + 1, n − m + 1)
-        −1 where the two have too few cells in common.
     """
     mask_t, mask_f = np.isfinite(patch), np.isfinite(picture)
     t = np.where(mask_t, patch - patch[mask_t].mean(), 0.0)
@@ -187,19 +166,6 @@ def agree(
     A change of the orientation moves the points of an image smoothly; what a wrong match does is its own. Six unknowns
     are adjusted with weights that fall with the residuals (Cauchy); points that then lie farther than four robust
     standard deviations, and a pixel at least, do not agree.
-
-    Parameters
-    ----------
-    camera : CentralCamera
-        The approximate orientation.
-    XYZ : ndarray, shape (n, 3)
-        Ground points, metres.
-    xy : ndarray, shape (n, 2)
-        Where they were found, pixels.
-    covariances : pair of ndarrays
-        Of xy by the fits (n, 2, 2), and of XYZ (n, 3, 3).
-    reach : float
-        Standard deviation of the position, metres: how far the orientation may be off.
     """
     n = len(XYZ)
     gap = xy - project(camera, XYZ)

@@ -73,13 +73,7 @@ class Features:
 
 
 def opencv() -> Any:
-    """OpenCV, with one thread: work is divided over images.
-
-    Raises
-    ------
-    UsageError
-        It is not installed.
-    """
+    """OpenCV, with one thread: work is divided over images."""
     try:
         cv2 = importlib.import_module("cv2")
     except ImportError:

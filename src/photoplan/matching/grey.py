@@ -144,13 +144,6 @@ def patches_at(image: Grey, corner: NDArray[np.int64], side: int) -> NDArray[np.
     """Square windows of grey values, shape (n, side, side); NaN where there are none.
 
     The image is read once, in tiles that hold the windows; what is in memory is a tile and the result.
-
-    Parameters
-    ----------
-    corner : ndarray, shape (n, 2)
-        Column and row of the upper-left pixel of each window.
-    side : int
-        Columns and rows of a window.
     """
     out = np.empty((len(corner), side, side), np.float32)
     if not len(corner):

@@ -51,21 +51,7 @@ class Loops:
 
 
 def latin_weights(radius: int, affine: NDArray[np.float64], part: int) -> NDArray[np.float64]:
-    """Weights of the pixels that belong to one of the three parts of a patch.
-
-    Parameters
-    ----------
-    radius : int
-        Of the patch.
-    affine : ndarray, shape (n, 2, 2)
-        From offsets in the patch to offsets in the loop's first image, where the squares lie.
-    part : int
-        0, 1 or 2.
-
-    Returns
-    -------
-    ndarray, shape (n, 2 radius + 1, 2 radius + 1)
-    """
+    """Weights of the pixels that belong to one of the three parts of a patch."""
     v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1].astype(float)
     there = np.einsum("nij,jrc->nirc", affine, np.stack([u, v]))
     square = np.floor(there / SQUARE + 0.5).astype(np.int64)

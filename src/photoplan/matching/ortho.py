@@ -50,19 +50,7 @@ class OrthoPatch:
 def patch_on(
     values: NDArray[np.float64], at: tuple[float, float], Z: NDArray[np.float64], side: float
 ) -> OrthoPatch | None:
-    """A patch with the plane through its ground; None where its middle has no height.
-
-    Parameters
-    ----------
-    values : ndarray, shape (m, m)
-        Grey values, rows from north to south.
-    at : (float, float)
-        Its middle on the map.
-    Z : ndarray, shape (m, m)
-        Heights of the ground, metres; NaN: not known.
-    side : float
-        Of a cell, metres.
-    """
+    """A patch with the plane through its ground; None where its middle has no height."""
     radius = len(values) // 2
     if not np.isfinite(Z[radius, radius]):
         return None

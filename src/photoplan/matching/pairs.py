@@ -44,13 +44,7 @@ def all_pairs(count: int) -> list[Pair]:
 
 
 def pairs_by_footprints(footprints: Sequence[NDArray[np.float64]]) -> list[Pair]:
-    """Pairs whose footprints share at least 5 % of the smaller one.
-
-    Parameters
-    ----------
-    footprints : sequence of ndarrays, shape (k, 2)
-        Outline of each image on the ground.
-    """
+    """Pairs whose footprints share at least 5 % of the smaller one."""
     areas = [shapely.convex_hull(shapely.MultiPoint(f)) for f in footprints]
     tree = shapely.STRtree(areas)
     found = []
@@ -63,13 +57,7 @@ def pairs_by_footprints(footprints: Sequence[NDArray[np.float64]]) -> list[Pair]
 
 
 def pairs_by_distance(positions: NDArray[np.float64]) -> list[Pair]:
-    """Each image with its 20 nearest ones, as far as six times the median distance to the nearest one.
-
-    Parameters
-    ----------
-    positions : ndarray, shape (n, 3)
-        Projection centres, metres.
-    """
+    """Each image with its 20 nearest ones, as far as six times the median distance to the nearest one."""
     n = len(positions)
     if n < 2:
         return []

@@ -24,20 +24,7 @@ _EXPECTED = 10.0
 
 
 def noise_factors(columns: _Floats, observed: _Floats, mask: NDArray[np.bool_], expected: _Floats) -> _Floats:
-    """Factors f of the standard deviations of the first two unknowns of every patch, (n, 2).
-
-    Parameters
-    ----------
-    columns : ndarray, shape (n, m, m, u)
-        Derivatives of each pixel.
-    observed : ndarray, shape (n, m, m)
-        What they are fitted to.
-    mask : ndarray, shape (m, m)
-        Pixels that take part.
-    expected : ndarray, shape (k,)
-        Coefficients of the filter, along rows and columns, that white noise has passed; of weight where there are few
-        patches.
-    """
+    """Factors f of the standard deviations of the first two unknowns of every patch, (n, 2)."""
     n, side, _, unknowns = columns.shape
     flat = (columns * mask[..., None]).reshape(n, -1, unknowns)
     q = np.linalg.qr(flat)[0]

@@ -178,11 +178,6 @@ def local_affines(tracks: Tracks, first: NDArray[np.int64], second: NDArray[np.i
     """How the second image is turned and scaled against the first one at points of both, shape (n, 2, 2).
 
     A single feature's direction and scale are rough; medians over the neighbours are taken.
-
-    Parameters
-    ----------
-    first, second : ndarrays, shape (n,)
-        Rows of the two images' points of the same tracks.
     """
     turn = tracks.angle[second] - tracks.angle[first]
     ratio = np.log(tracks.scale[second] / tracks.scale[first])

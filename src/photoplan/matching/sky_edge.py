@@ -38,15 +38,7 @@ def edge_strength(grey: NDArray[np.floating]) -> _Floats:
 
 
 def sky_edge(strength: NDArray[np.floating], low: NDArray[np.integer], high: NDArray[np.integer]) -> _Floats:
-    """Rows of the edge in every column, to a part of a pixel, shape (width,); NaN: there is none.
-
-    Parameters
-    ----------
-    strength : ndarray, shape (height, width)
-        See `edge_strength`.
-    low, high : ndarray, shape (width,)
-        First and last row, it included, at which the edge of a column may lie; none where the first is the later one.
-    """
+    """Rows of the edge in every column, to a part of a pixel, shape (width,); NaN: there is none."""
     height, width = strength.shape
     row = np.arange(height)[:, None]
     allowed = (row >= low) & (row <= high)

@@ -70,15 +70,7 @@ class CheckAccuracy:
 
 
 def check_accuracy(residuals: NDArray[np.float64], sigma: NDArray[np.float64]) -> CheckAccuracy:
-    """Accuracy at check points.
-
-    Parameters
-    ----------
-    residuals : ndarray, shape (n, 3)
-        Adjusted minus surveyed X, Y, Z, metres; NaN: not surveyed, or not determined by the block.
-    sigma : ndarray, shape (n, 3)
-        Standard deviations of the survey, metres; NaN: not stated.
-    """
+    """Accuracy at check points."""
     known = np.isfinite(residuals)
     plane = known[:, :2].all(axis=1)
     columns = [residuals[plane, 0], residuals[plane, 1], residuals[known[:, 2], 2]]

@@ -90,19 +90,7 @@ def of_resection(points: MeasuredPoints, found: Resected, terrain: float = float
 
 
 def fitting(points: MeasuredPoints, height: int, resect: Callable[[MeasuredPoints], Resected], rms: float) -> str:
-    """What the measurements of an image, read otherwise, would fit; as a sentence.
-
-    Parameters
-    ----------
-    points : MeasuredPoints
-        As they were given.
-    height : int
-        Of the image, pixels.
-    resect : callable
-        Orients the image by other points.
-    rms : float
-        Of the residuals as measurements were given, pixels: a reading with a fifth of it fits too, whatever was stated.
-    """
+    """What the measurements of an image, read otherwise, would fit; as a sentence."""
     fits = []
     for what, other in other_points(points, height):
         try:

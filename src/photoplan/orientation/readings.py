@@ -112,22 +112,7 @@ class Sights:
 def sights_of(
     names: Sequence[str], cameras: Mapping[str, tuple[Interior, Lens]], observed: ImagePoints, ground: GroundPoints
 ) -> Sights:
-    """Sights of all measured points whose ground coordinates are known in full.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Images of the poses, in their order.
-    cameras : mapping
-        Interior orientation and lens of every image by its name; images that are missing here are not used.
-    observed : ImagePoints
-        Names of images as in `names`.
-
-    Raises
-    ------
-    InputError
-        Fewer than three measurements are of known points in known images.
-    """
+    """Sights of all measured points whose ground coordinates are known in full."""
     index = {name: k for k, name in enumerate(names)}
     known = {name: k for k, name in enumerate(ground.names) if np.isfinite(ground.XYZ[k]).all()}
     parts = []
@@ -153,13 +138,7 @@ def sights_of(
 
 
 def judge_readings(poses: StatedPoses, sights: Sights) -> tuple[FittedReading, ...]:
-    """All readings with their errors: those that fit, the best first and of equals the simpler; then the others.
-
-    Raises
-    ------
-    GeometryError
-        Under no reading is half of the points in front of the cameras.
-    """
+    """All readings with their errors: those that fit, the best first and of equals the simpler; then the others."""
     step = np.linspace(0, len(sights.image) - 1, min(SAMPLE, len(sights.image))).astype(int)
     few = Sights(sights.image[step], sights.XYZ[step], sights.tangents[step], sights.focal[step])
     ranked = []

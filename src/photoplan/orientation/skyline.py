@@ -53,22 +53,6 @@ def fit_skyline(pixels: Callable[[_Floats], _Floats], distance: _Floats, edge: _
     Neighbouring columns of terrain and photograph err together: the covariance has the autocorrelation of the
     residuals in it, as far as it is positive. Near terrain shows its errors of height more than far one: how much of
     the residuals' size falls with the distance is estimated from them.
-
-    Parameters
-    ----------
-    pixels : callable
-        Places (n, 2) of the skyline's points in the picture after a change of the unknowns (u,).
-    distance : ndarray, shape (n,)
-        Of the skyline's points, metres.
-    edge : ndarray, shape (width,)
-        Row of the edge in each column, pixels; NaN: none.
-    unknowns : int
-        3, or 4 with the camera constant.
-
-    Raises
-    ------
-    GeometryError
-        Few columns, or they do not determine a parameter; it is named.
     """
     start = np.zeros(unknowns)
     where = _columns(pixels(start), edge)

@@ -87,14 +87,7 @@ class SourceErrors:
 
 
 def figures_at(errors: SourceErrors, target: Target, uvh: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Figures of places (..., 3) that `photoplan.kernels.spread.spread_out` takes, strictly.
-
-    Returns
-    -------
-    ndarray, shape (..., 14)
-        Run of the ray (pixels of the product per metre of depth), covariance on the level through the place (pixels²),
-        derivatives of the ground; NaN where the source shows nothing.
-    """
+    """Figures of places (..., 3) that `photoplan.kernels.spread.spread_out` takes, strictly."""
     here = target.to_ground(uvh)
     metre = np.linalg.norm(target.to_ground(uvh + np.array([1.0, 0, 0])) - here, axis=-1)
     size = np.stack(np.broadcast_arrays(1.0, 1.0, metre), axis=-1)
@@ -126,30 +119,7 @@ def tile_accuracy(
     sources: Mapping[int, SourceErrors],
     owner: NDArray[np.uint16] | None = None,
 ) -> NDArray[np.float32]:
-    """Accuracy of every pixel of a tile.
-
-    Parameters
-    ----------
-    window : Window
-        The tile, in the target's pixels.
-    surface : Surface
-        What the depth is taken from; it is asked for a pixel more all round, so that slopes do not end at tiles.
-    sources : mapping
-        By row of the product's table of sources.
-    owner : ndarray of uint16, shape (height, width), optional
-        Row of the table of sources, plus one, that paints each pixel; 0: none. None: the only source paints all.
-
-    Returns
-    -------
-    ndarray, shape (6, height, width), float32
-        `BANDS`; NaN where nothing is painted, nothing is known of the depth's error, or the surface is turned away
-        from the source.
-
-    Raises
-    ------
-    UsageError
-        A source that paints has no entry in `sources`.
-    """
+    """Accuracy of every pixel of a tile."""
     around = Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2)
     relief = np.asarray(surface.relief(target, around), np.float64)
     slope = _slope(relief)
@@ -259,14 +229,6 @@ def resampling_sigma(kernel: str) -> float:
 
 
 def in_image(kernel: str, tolerance: float) -> float:
-    """Standard deviation of image coordinates by resampling and by anchors within a tolerance, pixels.
-
-    Parameters
-    ----------
-    kernel : str
-        Resampling kernel; empty: none.
-    tolerance : float
-        Largest residual of the anchors, pixels; all residuals up to it count as equally likely.
-    """
+    """Standard deviation of image coordinates by resampling and by anchors within a tolerance, pixels."""
     own = resampling_sigma(kernel) if kernel else 0.0
     return float(np.hypot(own, tolerance / np.sqrt(3)))

@@ -116,20 +116,7 @@ _FROM, _TO = _weights(_START), _weights(_START + _ALONG)
 
 
 def bend_errors(breaks: Breaks, corners: NDArray[np.float64], strict: Positions) -> NDArray[np.float64]:
-    """Residual of boxes at the breaks that cross them, pixels.
-
-    Parameters
-    ----------
-    breaks : Breaks
-        By positions that the boxes give.
-    corners : ndarray, shape (n, 8, 3)
-        Homogeneous corners of the boxes.
-
-    Returns
-    -------
-    ndarray, shape (n, 4)
-        Worst along lines in h, v and u, and worst of all; 0 where no break crosses.
-    """
+    """Residual of boxes at the breaks that cross them, pixels."""
     errors = np.zeros((len(corners), 4))
     for component, places in enumerate((np.asarray(breaks.columns), np.asarray(breaks.rows))):
         many = max(1, _MOST // (27 * max(1, len(places))))

@@ -77,21 +77,7 @@ def orientation_effect(
     radius: float = FILM_CORNER,
     w: float = 0.733,
 ) -> OrientationEffect:
-    """Displacements in the image corners by errors of the orientation, one by one (Ecker 1991, table in §8.2.2).
-
-    Parameters
-    ----------
-    center_sd : (float, float, float)
-        Standard deviations of X0, Y0, Z0, metres.
-    angles_sd : (float, float, float)
-        Of ω, φ, κ, radians.
-    c, flying_height : float
-        Camera constant and flying height above ground, metres.
-    scale_number : float, optional
-        Of the image scale; by default `flying_height` / `c`.
-    radius, w : float
-        Distance of the corner from the principal point, metres; its tangent along either axis.
-    """
+    """Displacements in the image corners by errors of the orientation, one by one (Ecker 1991, table in §8.2.2)."""
     scale = flying_height / c if scale_number is None else scale_number
     return OrientationEffect(
         X=float(displacement_by_shift(center_sd[0], scale)),

@@ -95,25 +95,6 @@ def compile_anchors(
 ) -> Anchors | None:
     """Cut a tile into boxes whose trilinear homogeneous interpolation meets the tolerance, and tabulate the field.
 
-    Parameters
-    ----------
-    projection : Projection
-        The source; its first factor is called on a few thousand points at most.
-    ground : TileGround
-        The tile.
-    rule : AnchorRule
-        Tolerance and kernel radius. A field gets half of the tolerance; what it leaves is the anchors'.
-    wanted : ndarray, shape (2, rows, cols), optional
-        What the source is to paint, see `TileGround.owned`: it decides what is read of it, and nothing else, so that a
-        pixel keeps its position whoever paints the pixels beside it.
-    longest : float
-        Source pixels along which a target pixel is averaged at most, where that is more than the anchors' scale.
-
-    Returns
-    -------
-    Anchors or None
-        None if no pixel that is wanted can lie in the image.
-
     Notes
     -----
     Every pixel is computed strictly if the tolerance is 0, and if anchors or nodes that meet it would be more than the

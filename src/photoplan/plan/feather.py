@@ -51,11 +51,6 @@ class Feather:
     ) -> dict[int, tuple[NDArray[np.float32], NDArray[np.bool_]]]:
         """Weights of the images that share pixels of a window, by row of the table of sources, shape (bands, height,
         width); all 0 where one alone paints. With each the pixels of `wide` that it sees or owns.
-
-        Parameters
-        ----------
-        share : Share
-            Of the pixels `around` the window, which are `wide`.
         """
         owner = share.owner
         assert owner is not None
@@ -82,13 +77,7 @@ class Feather:
 
 
 def feather_of(metres: float, resolution: float, tile: int, bands: bool = False) -> Feather | None:
-    """The feather of a width in metres, by bands or not; None: it is less than a pixel to both sides.
-
-    Raises
-    ------
-    UsageError
-        It is not a positive number, or wider than a tile.
-    """
+    """The feather of a width in metres, by bands or not; None: it is less than a pixel to both sides."""
     if not (np.isfinite(metres) and metres >= 0):
         raise UsageError(f"`feather` {metres:g}; a width in metres is needed, 0 for none")
     made = Feather(round(min(metres / resolution, 1e9)), bands)

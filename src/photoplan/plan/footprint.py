@@ -152,21 +152,7 @@ def image_border(size: tuple[int, int], per_side: int = 16) -> NDArray[np.float6
 
 
 def footprint(camera: Camera, terrain: Terrain, bounds: Bounds | None) -> Footprint:
-    """Footprint of an image on the ground.
-
-    Parameters
-    ----------
-    terrain : Terrain
-        In the CRS of the camera.
-    bounds : (float, float, float, float) or None
-        Outer edges of the terrain; None: it is everywhere.
-
-    Returns
-    -------
-    Footprint
-        Its bounds hold all ground that the image sees, and what projects into it behind that as long as it is no lower
-        than all ground that lies nearer. Beyond `FAR`, and `FLATTEST` heights, nothing counts.
-    """
+    """Footprint of an image on the ground."""
     seen = _seen(camera, terrain, bounds)
     if seen is None:
         return Footprint(np.full((64, 3), np.nan), None, 0.0, (math.nan, math.nan))

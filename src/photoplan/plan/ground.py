@@ -90,15 +90,7 @@ class TileGround:
     def owned(
         self, owner: NDArray[np.uint16], sources: Sequence[int], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Where the pixels are that some of `count` sources paint.
-
-        Returns
-        -------
-        ranges : ndarray, shape (n, 2, rows, cols)
-            As `TileGround.ranges`, of the squares that hold pixels of a source.
-        parts : ndarray, shape (n, 4)
-            First column, first row, end column, end row between which they are.
-        """
+        """Where the pixels are that some of `count` sources paint."""
         place = np.full(max(count, int(owner.max(initial=0))) + 1, -1)
         place[np.add(sources, 1)] = np.arange(len(sources))
         squares = np.zeros((len(sources), *self.ranges.shape[1:]), bool)

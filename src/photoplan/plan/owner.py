@@ -37,17 +37,7 @@ class Ownership(Protocol):
     """
 
     def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
-        """Who paints each pixel of a tile.
-
-        Parameters
-        ----------
-        ground : TileGround
-            The tile: its target, its window, and the depth of each pixel.
-        cameras : mapping
-            By row of the table of sources, of those that can paint in the tile: nobody else may be chosen.
-        surface : Surface
-            What the depth was taken from; what hides a pixel may lie beyond the tile.
-        """
+        """Who paints each pixel of a tile."""
         ...
 
 

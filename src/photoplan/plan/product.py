@@ -129,17 +129,7 @@ class ProductPlan:
 
 
 def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Projection], surface: Surface) -> CompiledTile:
-    """Relief, owner, anchors and field of a tile of a product. Pure: the same inputs give the same bytes.
-
-    Parameters
-    ----------
-    tile : Tile
-        A tile of the product, or a part of one.
-    cameras : mapping
-        By row of the product's table of sources, of those that can paint in the tile.
-    surface : Surface
-        What the target's depth is taken from.
-    """
+    """Relief, owner, anchors and field of a tile of a product. Pure: the same inputs give the same bytes."""
     relief, tilt = _depth(product, tile.window, surface)
     if product.clip is not None:
         relief = np.where(product.clip.rows(tile.window) > 0, relief, np.float32(np.nan))
@@ -197,18 +187,7 @@ def compile_next(
     first: CompiledTile,
     refused: Mapping[int, NDArray[np.bool_]],
 ) -> CompiledTile:
-    """A tile once more, for pixels whose source has nothing there that can be used: a mask, nodata.
-
-    Parameters
-    ----------
-    product, tile, cameras, surface
-        As for `compile_tile`.
-    first : CompiledTile
-        What came of it.
-    refused : mapping
-        By row of the table of sources, pixels (height, width) in which it is of no use. Pixels that are in none of them
-        get no owner; of the others the best source that is left, or none.
-    """
+    """A tile once more, for pixels whose source has nothing there that can be used: a mask, nodata."""
     owner, hidden = np.zeros(first.relief.shape, np.uint16), np.zeros(first.relief.shape, bool)
     ground = TileGround.of(product.target, tile.window, first.relief)
     rows = np.array(list(refused))

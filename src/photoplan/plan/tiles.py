@@ -74,13 +74,7 @@ class Tiles(Sequence[Tile]):
 
     @classmethod
     def shared(cls, sources: Sequence[Tiles]) -> Tiles:
-        """Tiles of a product that at least one of its sources can paint, from those of each source alone.
-
-        Raises
-        ------
-        UsageError
-            There are more sources than an owner raster can count.
-        """
+        """Tiles of a product that at least one of its sources can paint, from those of each source alone."""
         if len(sources) > np.iinfo(np.uint16).max - 1:
             raise UsageError(f"{len(sources):,} images in one product; at most {np.iinfo(np.uint16).max - 1:,} can be")
         index = np.concatenate([tiles.indices for tiles in sources])

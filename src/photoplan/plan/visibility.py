@@ -108,29 +108,7 @@ def sight_lines(projection: Projection, target: Target, uvh: NDArray[np.float64]
 
 
 def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) -> NDArray[np.bool_]:
-    """Pixels of a tile that lie in the image, but that something hides.
-
-    Parameters
-    ----------
-    projection : Projection
-        The source.
-    ground : TileGround
-        A tile of a map.
-    surface : Surface
-        Terrain: what the tile's relief was taken from, and what may be in the way; what it is raised from, if it is.
-
-    Returns
-    -------
-    ndarray of bool, shape (height, width)
-        Whether something is in the way to a pixel's centre, over the surface's own posts (`Terrain.lattice`); False
-        where there is no surface, and outside the image. What a pixel gets does not depend on the tile if the
-        projection is linear but for its field; else pixels at borders of hidden areas may.
-
-    Raises
-    ------
-    UsageError
-        The product is no map: what may be in the way beyond a tile is not known.
-    """
+    """Pixels of a tile that lie in the image, but that something hides."""
     window, target = ground.window, ground.target
     none = np.zeros((window.height, window.width), bool)
     low, high = float(ground.ranges[0].min()), float(ground.ranges[1].max())

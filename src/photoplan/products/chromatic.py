@@ -185,13 +185,7 @@ def _joined(parts: list[Displacements]) -> Displacements:
 
 
 def load_chromatic(path: Path) -> ChromaticModel:
-    """The model of a file.
-
-    Raises
-    ------
-    InputError
-        It cannot be read or used.
-    """
+    """The model of a file."""
     entries = read_chromatic(path)
     try:
         nan = float("nan")

@@ -201,13 +201,7 @@ def read_block(path: Path, form: TableFormat, format: str | None) -> tuple[str, 
 
 
 def with_cameras(block: OrientationBlock, path: Path) -> OrientationBlock:
-    """The block with the cameras of a file.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used, or an image's camera is not in it.
-    """
+    """The block with the cameras of a file."""
     cameras = read_cameras(path)
     table = block.table
     images = tuple(replace(image, camera=camera_name(image, cameras, table.file)) for image in table.images)
@@ -336,15 +330,7 @@ class ReadingsReport:
 
 
 def list_readings(request: ConvertRequest, image_points: Path, control: Path) -> ReadingsReport:
-    """Judge all readings of an orientation file by measured points.
-
-    Raises
-    ------
-    UsageError
-        No camera is known.
-    InputError
-        A file cannot be used, or too few points are known in both.
-    """
+    """Judge all readings of an orientation file by measured points."""
     name, block = _as_stated(request)
     if request.camera is not None:
         block = with_cameras(block, request.camera)

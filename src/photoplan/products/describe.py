@@ -89,18 +89,7 @@ def place_of(kernel: FilterKernel) -> str:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Facts of a file by name, as plain values; lists have a line each.
-
-    Parameters
-    ----------
-    path : Path
-        Any file that a command takes or makes; a folder of images or of a COLMAP model, too.
-
-    Raises
-    ------
-    InputError
-        The file is missing, damaged, or of no kind that is known.
-    """
+    """Facts of a file by name, as plain values; lists have a line each."""
     if path.is_dir():
         return _oriented(path)
     if not path.is_file():

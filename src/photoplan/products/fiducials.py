@@ -193,13 +193,7 @@ def locate_fiducials(request: FiducialsRequest, events: Events = SILENT) -> Fidu
 
 
 def scans_of(request: FiducialsRequest) -> dict[str, Path]:
-    """Files of the images that a request asks for, by the names in its report.
-
-    Raises
-    ------
-    UsageError, InputError
-        See `locate_fiducials`.
-    """
+    """Files of the images that a request asks for, by the names in its report."""
     return {job.name: job.file for job in _jobs(request, _project(request))}
 
 

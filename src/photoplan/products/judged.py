@@ -50,11 +50,6 @@ def judged(project: Project, image: ImageEntry, ground: Ground) -> tuple[JudgedV
     Without a pose there is nothing that could be read in another way, and so no view.
 
     Objects do not count: a camera below a bridge is not below the ground.
-
-    Raises
-    ------
-    InputError
-        The image is not oriented.
     """
     if not isinstance(image, Image):
         return None, _without_pose(project, image.name, ground)

@@ -285,15 +285,7 @@ def control_rows(inputs: AdjustInputs, name: str) -> list[tuple[int, int]]:
 
 
 def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -> ResectedImage:
-    """Orient one image of a project by its control points.
-
-    Raises
-    ------
-    InputError
-        The interior orientation is not known, or height systems cannot be joined.
-    GeometryError
-        The points do not determine the orientation.
-    """
+    """Orient one image of a project by its control points."""
     project = inputs.project
     described = project.cameras[image.camera]
     interior, lens = interior_of(described, image), lens_of(described)

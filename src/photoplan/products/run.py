@@ -76,13 +76,7 @@ class Run:
 
 
 def refuse_inputs(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
-    """No output may be an input, whichever product it belongs to and by whatever link.
-
-    Raises
-    ------
-    UsageError
-        One is.
-    """
+    """No output may be an input, whichever product it belongs to and by whatever link."""
     known = {_identity(file) for file in inputs}
     for path in outputs:
         if _identity(path) in known:

@@ -123,13 +123,7 @@ Found = Iterator[tuple[str, str, float, str, str]]
 
 
 def sensor_figures(described: SensorDescription, file: str) -> tuple[SensorFigure, ...]:
-    """Every figure that a description determines, in the order of its tables.
-
-    Raises
-    ------
-    InputError
-        ``[stated]`` names a figure that does not follow from the description.
-    """
+    """Every figure that a description determines, in the order of its tables."""
     parts: list[tuple[str, Found]] = []
     if described.viewing is not None:
         parts.append(("viewing", _viewing(described.viewing)))

@@ -46,13 +46,7 @@ class BalanceStep:
 
 
 def load_balance(path: Path) -> BalanceStep:
-    """The step of a balance file.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used; the message names band and entry.
-    """
+    """The step of a balance file."""
     entry = read_balance_file(path)
     tones = []
     for number, band in enumerate(entry.bands, 1):

@@ -14,15 +14,7 @@ from photoplan.project.image_size import check_size
 
 
 def frame_camera(project: Project, image: FrameImage, ground: Ground, size: tuple[int, int]) -> Camera:
-    """Camera of an image, over the ground as it is worked in.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, the image has another size than it states, or the project lies on another body.
-    HeightSystemError
-        The grid that leads from the ground's heights to the ellipsoid is missing.
-    """
+    """Camera of an image, over the ground as it is worked in."""
     file = project.resolve(image.frame)
     stated = _read(file, stamp_of(file))
     for given, where in ((stated.size, image.frame), (image.size, "the project")):

@@ -20,15 +20,7 @@ from photoplan.project.image_size import check_size
 
 
 def line_camera(project: Project, image: LineImage, ground: Ground, size: tuple[int, int]) -> Camera:
-    """Camera of an image of lines, over the ground as it is worked in.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, the image has another size than it states, or the project lies on another body.
-    HeightSystemError
-        The grid that leads from the ground's heights to the ellipsoid is missing.
-    """
+    """Camera of an image of lines, over the ground as it is worked in."""
     file = project.resolve(image.line)
     stamps = tuple(stamp_of(each) for each in image.geometry_files(project.resolve))
     stated = _read(file, stamps, image.detectors)

@@ -17,15 +17,7 @@ from photoplan.project.image_size import check_size
 
 
 def rpc_camera(project: Project, image: RpcImage, ground: Ground, size: tuple[int, int]) -> RpcCamera:
-    """Camera of an image with rational polynomials, over the ground as it is worked in.
-
-    Raises
-    ------
-    InputError
-        The polynomials cannot be read, or the image has another size than is stated.
-    HeightSystemError
-        The grid that leads from the ground's heights to the ellipsoid is missing.
-    """
+    """Camera of an image with rational polynomials, over the ground as it is worked in."""
     check_size(image.file, size, image.size, "the project states", "polynomials fit an image of full size only")
     file = project.resolve(image.geometry_file or image.file)
     _refuse_tile(image, file)

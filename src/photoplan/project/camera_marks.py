@@ -26,22 +26,7 @@ _AT_ONCE = 1 << 24
 
 
 class ScanImage:
-    """Grey values of a scan: one band, or the luminance of the first three.
-
-    Parameters
-    ----------
-    path : Path
-        Image file.
-    band : int, optional
-        Number of the band, from 1; None: the only one, or the luminance of three.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used.
-    UsageError
-        It has no such band.
-    """
+    """Grey values of a scan: one band, or the luminance of the first three."""
 
     def __init__(self, path: Path, band: int | None = None) -> None:
         self._reader = RasterReader(path)
@@ -102,20 +87,7 @@ _LARGEST = 4096
 
 
 def mark_patterns(system: FiducialSystem, folder: Path) -> dict[str, MarkPattern | MarkExample]:
-    """What each of a camera's fiducial marks looks like, by name.
-
-    Parameters
-    ----------
-    system : FiducialSystem
-        Marks of the camera.
-    folder : Path
-        Where relative names of examples start.
-
-    Raises
-    ------
-    InputError
-        Nothing is described, a mark is not, or a description is not possible; the mark is named.
-    """
+    """What each of a camera's fiducial marks looks like, by name."""
     marks = system.looks
     if marks is None:
         raise InputError(
@@ -137,20 +109,7 @@ def mark_patterns(system: FiducialSystem, folder: Path) -> dict[str, MarkPattern
 
 
 def mark_pattern(mark: described.Mark, folder: Path) -> MarkPattern | MarkExample:
-    """What one mark looks like.
-
-    Parameters
-    ----------
-    mark : Mark
-        Its description.
-    folder : Path
-        Where relative names of examples start.
-
-    Raises
-    ------
-    InputError
-        The numbers do not make a mark, or the example cannot be read.
-    """
+    """What one mark looks like."""
     if isinstance(mark, described.Example):
         return _example(mark, folder)
     if isinstance(mark, described.Polygon):

@@ -45,25 +45,13 @@ def is_there(file: Path) -> bool:
 
 
 def camera_without_pixels(project: Project, name: str) -> Camera:
-    """Camera of one image without its pixels: the image file need not be there; where it is, its size is compared.
-
-    Raises
-    ------
-    InputError
-        No size is known, that of the file is another one, or the image is not oriented.
-    """
+    """Camera of one image without its pixels: the image file need not be there; where it is, its size is compared."""
     image = project.any_image(name)
     return camera_of(project, image, ground_of(project), size_of(project, image))
 
 
 def central_without_pixels(project: Project, name: str) -> CentralCamera:
-    """The same of an image whose rays meet in a point.
-
-    Raises
-    ------
-    InputError
-        As there, or it has no pose.
-    """
+    """The same of an image whose rays meet in a point."""
     image = project.image(name)
     return posed_camera(project, image, ground_of(project), size_of(project, image))
 

@@ -21,13 +21,7 @@ from photoplan.quality.restoration.restorer import light_of
 
 
 def read_fall_off(path: Path) -> FallOffModel:
-    """The model of a correction file; `photoplan.quality.camera.fall_off_model.correct_fall_off` applies it.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used.
-    """
+    """The model of a correction file; `photoplan.quality.camera.fall_off_model.correct_fall_off` applies it."""
     entry = read_fall_off_entry(path)
     try:
         return FallOffModel(
@@ -69,13 +63,7 @@ class FallOffFile:
 
 
 def load_fall_off(path: Path) -> FallOffFile:
-    """A correction of a file that `photoplan characterise` wrote.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used, or its model gives no brightness somewhere in the image.
-    """
+    """A correction of a file that `photoplan characterise` wrote."""
     model = read_fall_off(path)
     try:
         return FallOffFile(path, model, largest_gain(model), fingerprint(path).digest)

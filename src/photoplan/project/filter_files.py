@@ -12,13 +12,7 @@ from photoplan.quality.restoration.filters import FilterKernel, RestorationFilte
 
 
 def load_filter(path: Path) -> RestorationFilter:
-    """A filter of a file: TOML, or one kernel as rows of numbers.
-
-    Raises
-    ------
-    InputError
-        The file is missing, no filter, or an entry is wrong.
-    """
+    """A filter of a file: TOML, or one kernel as rows of numbers."""
     entries = read_filter_file(path)
     try:
         kernels = tuple(FilterKernel(k.values, k.at, k.band) for k in entries.kernels)
@@ -28,15 +22,7 @@ def load_filter(path: Path) -> RestorationFilter:
 
 
 def save_filter(path: Path, filter_: RestorationFilter, *, overwrite: bool = False) -> Path:
-    """Write a filter as TOML; reading it gives the same values to the last digit.
-
-    Raises
-    ------
-    UsageError
-        The file exists and `overwrite` is False, does not end in `.toml`, or its folder cannot be written.
-    ResourceError
-        The disk is full.
-    """
+    """Write a filter as TOML; reading it gives the same values to the last digit."""
     path = Path(path)
     if path.suffix.lower() != ".toml":
         raise UsageError(f"{path}: a filter is written as TOML; give a name that ends in .toml")

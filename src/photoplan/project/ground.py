@@ -75,15 +75,8 @@ class _GroundAddress:
 
 
 def ground_of(project: Project) -> Ground:
-    """The terrain of a project with its objects, in the project's CRS and the height system that the cameras work in.
-
-    Raises
-    ------
-    InputError
-        A file of terrain or objects cannot be used, or its CRS is not known or not joined exactly to the project's;
-        objects lie below the ground.
-    HeightSystemError
-        Height systems are not declared, or the grid that joins them is missing.
+    """The terrain of a project with its objects, in the project's CRS and the height system that the cameras
+    work in.
     """
     orientation = project.orientation
     strict = orientation.earth_curvature == "strict"
@@ -181,13 +174,7 @@ class _Undulation:
 
 
 def stamp_of(path: Path) -> tuple[int, int]:
-    """Size and time of a file.
-
-    Raises
-    ------
-    InputError
-        It cannot be read.
-    """
+    """Size and time of a file."""
     try:
         state = path.stat()
     except OSError as error:

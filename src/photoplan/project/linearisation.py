@@ -16,13 +16,7 @@ _MAX_BYTES = 8_000_000
 
 
 def linearisation_of(words: str) -> Linearisation:
-    """What ``linear``, ``srgb`` or the name of a table stand for.
-
-    Raises
-    ------
-    InputError
-        It is neither a word nor a file, or the table cannot be read or used.
-    """
+    """What ``linear``, ``srgb`` or the name of a table stand for."""
     if words in ("linear", "srgb"):
         return Linearisation("linear" if words == "linear" else "srgb")
     path = Path(words)
@@ -41,17 +35,6 @@ def read_linearisation_table(path: Path) -> NDArray[np.float64]:
     Columns are separated by spaces, tabs, semicolons or commas; empty lines, lines that begin with ``#`` and a first
     line of words are passed over. One column holds the light of the grey values 0, 1, 2 …, two hold grey value and
     light, three the light in three bands, four the grey value and the light in three bands.
-
-    Returns
-    -------
-    array
-        Shape (lines, columns).
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, holds no numbers, or a line has another number of columns than the first, or what is
-        no finite number; the message names the line.
     """
     order = tuple(f"column {n}" for n in range(1, 5))
     columns = Columns(

@@ -44,26 +44,7 @@ class Place:
 
 
 def with_objects(ground: Terrain, files: Sequence[tuple[Path, Objects]], place: Place) -> tuple[ObjectSurface, Steps]:
-    """Terrain with the objects of some files.
-
-    Parameters
-    ----------
-    files : sequence of (path, entry)
-
-    Returns
-    -------
-    surface : ObjectSurface
-    steps : tuple
-        Coordinate operations on the way, for the run record.
-
-    Raises
-    ------
-    InputError
-        A file cannot be used, its CRS is not known or none of its objects is near the terrain, or objects cannot be
-        used, since they cross themselves, have no heights, or lie below the ground or far above it; each is named.
-    HeightSystemError
-        Their heights are not declared, or cannot be joined.
-    """
+    """Terrain with the objects of some files."""
     corners, paints, owners = [], [], []
     names: list[str] = []
     entries: list[int] = []

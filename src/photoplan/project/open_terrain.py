@@ -53,15 +53,7 @@ class OpenTerrain:
         return ModelHeightErrors(self.surface) if isinstance(self.surface, HybridSurface) else None
 
     def refuse_apart(self, bounds: tuple[float, float, float, float]) -> None:
-        """Refuse bounds xmin, ymin, xmax, ymax that do not meet the terrain.
-
-        Raises
-        ------
-        UsageError
-            They are in another order or CRS.
-        GeometryError
-            They do not; the message states both.
-        """
+        """Refuse bounds xmin, ymin, xmax, ymax that do not meet the terrain."""
         if (fault := bounds_fault(bounds, self.crs, self.bounds)) is not None and turn_of(self.crs) is None:
             raise UsageError(f"{fault} ({self.path})")
         a, b = self.bounds, bounds
@@ -73,13 +65,7 @@ class OpenTerrain:
             raise GeometryError(f"bounds {asked} do not meet {self.path}, which covers {covered}")
 
     def in_crs(self, crs: str) -> tuple[OpenTerrain, tuple[CrsStep, ...]]:
-        """The same terrain with its surface in another CRS, and the coordinate operation that leads to the file's.
-
-        Raises
-        ------
-        InputError
-            The two CRSs cannot be joined exactly.
-        """
+        """The same terrain with its surface in another CRS, and the coordinate operation that leads to the file's."""
         if same_crs(self.crs, crs):
             return self, ()
         with named_by(self.path):

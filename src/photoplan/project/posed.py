@@ -21,13 +21,7 @@ from photoplan.project.image_size import check_camera_size
 
 
 def stated_pose(project: Project, image: Image) -> Pose:
-    """Exterior orientation of an image as the project states it, in the orientation's height system.
-
-    Raises
-    ------
-    InputError
-        It states none.
-    """
+    """Exterior orientation of an image as the project states it, in the orientation's height system."""
     orientation = project.orientation
     center, angles = image.pose_numbers
     radians = angle_in_radians(np.array(angles), orientation.angle_unit)
@@ -65,17 +59,7 @@ _POINTS = 5
 
 
 def view_of(image: Image, camera: CameraEntry, orientation: Orientation, center: ArrayLike) -> JudgedView:
-    """View of a project's image.
-
-    Parameters
-    ----------
-    camera : CameraEntry
-        Description of its camera.
-    orientation : Orientation
-        What its angles mean.
-    center : array_like, shape (3,)
-        Projection centre in the terrain's height system.
-    """
+    """View of a project's image."""
     interior, lens = interior_of(camera, image), lens_of(camera)
     w, h = interior.size
     part = np.linspace(0.0, 1.0, _POINTS)

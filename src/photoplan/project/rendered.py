@@ -47,13 +47,7 @@ class DrapedTexture:
 
     @classmethod
     def of(cls, path: Path, crs: str, other: SolidTexture) -> DrapedTexture:
-        """The texture of a file over a map in a CRS; `other` gets as many bands.
-
-        Raises
-        ------
-        InputError
-            The file cannot be used, has no place in that CRS, or other pixels than bytes.
-        """
+        """The texture of a file over a map in a CRS; `other` gets as many bands."""
         reader = RasterReader(path)
         if reader.info.to_map is None or reader.info.crs is None:
             raise InputError(f"{path}: a texture needs a place on the map; georeference it (`gdal_edit.py -a_srs`)")
@@ -133,27 +127,13 @@ class ProjectScene:
 
     @classmethod
     def of(cls, project: Project, raster: Path | None, grain: float, seed: int, oversampling: int) -> ProjectScene:
-        """The scene of a project; arguments as those of `SceneRequest`.
-
-        Raises
-        ------
-        InputError
-            Terrain, objects or texture cannot be used.
-        """
+        """The scene of a project; arguments as those of `SceneRequest`."""
         other = SolidTexture(grain, seed)
         texture = other if raster is None else DrapedTexture.of(raster, project.crs, other)
         return cls(project, texture, ground_of(project), oversampling)
 
     def seen_by(self, name: str) -> RenderedScene:
-        """What an image shows.
-
-        Raises
-        ------
-        InputError
-            The image is not oriented, or its size is not stated.
-        GeometryError
-            There is nothing within 30 km.
-        """
+        """What an image shows."""
         camera = camera_without_pixels(self.project, name)
         x, y, z = camera.vantage.point.tolist()
         low, high = self._heights((x - FAR, y - FAR, x + FAR, y + FAR), f"image {name!r}")
@@ -170,13 +150,7 @@ class ProjectScene:
         )
 
     def from_above(self, grid: MapGrid) -> RenderedScene:
-        """What a true orthophoto shows: objects that only hide are left out.
-
-        Raises
-        ------
-        GeometryError
-            There is nothing inside the grid.
-        """
+        """What a true orthophoto shows: objects that only hide are left out."""
         low, high = self._heights(grid.bounds, "the true orthophoto")
         above = FromAbove(grid, high + 1.0)
         return RenderedScene(
@@ -195,13 +169,7 @@ class ProjectScene:
 
 
 def ground_pixel(project: Project) -> float:
-    """Ground pixel of the project's first image, the median over it, metres.
-
-    Raises
-    ------
-    GeometryError
-        It sees nothing.
-    """
+    """Ground pixel of the project's first image, the median over it, metres."""
     name = project.images[0].name
     scene = ProjectScene(project, SolidTexture(1.0), ground_of(project), 1).seen_by(name)
     part = (np.arange(_POINTS) + 0.5) / _POINTS

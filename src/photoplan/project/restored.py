@@ -93,20 +93,7 @@ def restored(
     linearisation: Linearisation | None = None,
     out: np.dtype[Any] | None = None,
 ) -> SteppedReader:
-    """An image restored with a filter.
-
-    Parameters
-    ----------
-    linearisation : Linearisation, optional
-        How grey values become light; they are light already if it is None. After a `FallOffStep` it is the same.
-    out : dtype, optional
-        Type of the restored pixels; the image's own if it is None.
-
-    Raises
-    ------
-    InputError
-        The filter is not for an image of this size or number of bands.
-    """
+    """An image restored with a filter."""
     stored = np.dtype(source.info.dtype)
     out = stored if out is None else out
     nodata = kept_nodata(source.info, out)

@@ -76,13 +76,7 @@ class SceneAddress:
         return {**project, "image": image, "camera": camera, "linearisation": table, "files": digests}
 
     def open(self) -> Scene:
-        """The scene; kept for the next tile.
-
-        Raises
-        ------
-        InputError
-            An input has changed since the address was made.
-        """
+        """The scene; kept for the next tile."""
         return _open(self)
 
 
@@ -140,14 +134,7 @@ def input_files(project: Project) -> list[Path]:
 
 
 def open_scene(project: Project, name: str) -> Scene:
-    """Camera, surface and pixels of one image of a project.
-
-    Raises
-    ------
-    InputError
-        A file is missing or cannot be used, an image's size differs from its camera's, or height systems are not
-        declared or cannot be joined exactly.
-    """
+    """Camera, surface and pixels of one image of a project."""
     return _open(scene_address(project, name))
 
 
@@ -157,11 +144,6 @@ class Attempts:
     Each is a context that gives the project. If it ends with an error, the images that cannot be opened are left out,
     see `Project.leaving_out`; if all can be opened and the error names the file of one, those whose pixels cannot be
     read. Balance files and filters do not count: they can be corrected.
-
-    Raises
-    ------
-    InputError
-        No image can be used, or another input cannot.
     """
 
     def __init__(self, project: Project, images: Sequence[str] | None) -> None:
@@ -235,13 +217,7 @@ def _place(image: ImageEntry) -> tuple[float, ...]:
 
 
 def scene_address(project: Project, name: str) -> SceneAddress:
-    """What the scene of an image is opened by; its files are looked at, but not opened.
-
-    Raises
-    ------
-    InputError
-        A file is missing.
-    """
+    """What the scene of an image is opened by; its files are looked at, but not opened."""
     image = project.any_image(name)
     alone = project.alone([name])
     files = [project.resolve(file) for file in (image.file, image.balance) if file is not None]

@@ -25,13 +25,7 @@ class ScenesAddress:
 
     @classmethod
     def of(cls, project: Project, names: Sequence[str], part: SingleObject | None = None) -> ScenesAddress:
-        """Addresses of images of a project.
-
-        Raises
-        ------
-        InputError
-            A file is missing.
-        """
+        """Addresses of images of a project."""
         return cls(tuple(scene_address(project, name) for name in names), part)
 
     @property

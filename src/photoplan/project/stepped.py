@@ -22,13 +22,7 @@ S = TypeVar("S")
 
 @dataclass(frozen=True, eq=False)
 class SteppedReader:
-    """An image file behind the engine's `Reader`, its pixels as they are after some steps.
-
-    Raises
-    ------
-    InputError
-        When made: a step is not for such an image. When read: damaged pixels, or grey values that a step cannot use.
-    """
+    """An image file behind the engine's `Reader`, its pixels as they are after some steps."""
 
     image: RasterReader
     steps: tuple[Step, ...] = ()

@@ -50,12 +50,8 @@ _NUMBERS = {
 
 
 def _straight(scene: Scene, name: str) -> Camera:
-    """The camera of a scene, whose rays are straight on the ground and meet in a point, so that a target can follow it.
-
-    Raises
-    ------
-    GeometryError
-        They are not, or do not.
+    """The camera of a scene, whose rays are straight on the ground and meet in a point, so that a target can
+    follow it.
     """
     camera = scene.camera
     try:
@@ -74,13 +70,6 @@ def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | No
     """The frame of a target as a user states it, and the bounds that it has by itself; None: it is the map, has none.
 
     A user states heights in the system of the orientation; the frame is in that of the cameras.
-
-    Raises
-    ------
-    UsageError
-        It is none, or says too little.
-    GeometryError, InputError
-        Of an image: it cannot be a target, or cannot be opened.
     """
     kind, _, rest = text.partition(":")
     if text == "map":

@@ -37,22 +37,7 @@ _MOST_DEVIATION = 1e6
 def source_errors(
     project: Project, image: ImageEntry, ground: Ground, projection: Projection, in_image: float
 ) -> SourceErrors:
-    """Errors of an image as the project states them.
-
-    Parameters
-    ----------
-    ground : Ground
-        The project's.
-    projection : Projection
-        The image's camera.
-    in_image : float
-        Standard deviation of image coordinates, pixels.
-
-    Raises
-    ------
-    InputError
-        The project states no standard deviations of the image's orientation, or such of the camera that do not fit.
-    """
+    """Errors of an image as the project states them."""
 
     def at(change: NDArray[np.float64]) -> Projection:
         moved, cameras = image.moved(change, project.cameras)
@@ -79,13 +64,7 @@ class ScenesErrors(Mapping[int, SourceErrors]):
 
     @property
     def facts(self) -> list[object]:
-        """What decides accuracies, beside what decides pixels.
-
-        Raises
-        ------
-        InputError
-            Nothing is known of the terrain, of objects or of an image.
-        """
+        """What decides accuracies, beside what decides pixels."""
         _heights_of(self.address)
         out: list[object] = []
         for scene in self.address.scenes:
@@ -164,13 +143,7 @@ class ObjectHeightErrors:
 
 
 def object_errors(project: Project, surface: ObjectSurface, ground: DepthErrors) -> ObjectHeightErrors:
-    """Errors of the objects that a surface shows, as [[objects]] state them.
-
-    Raises
-    ------
-    InputError
-        An entry of objects that are shown states none.
-    """
+    """Errors of the objects that a surface shows, as [[objects]] state them."""
     faces = surface.shown
     assert faces is not None
     entry = np.array(surface.entries)[faces.owner]
@@ -190,13 +163,7 @@ def object_errors(project: Project, surface: ObjectSurface, ground: DepthErrors)
 
 
 def height_errors(project: Project) -> HeightErrors:
-    """Standard deviations of a project's terrain; see `known_height_errors`.
-
-    Raises
-    ------
-    InputError
-        Nothing is known.
-    """
+    """Standard deviations of a project's terrain; see `known_height_errors`."""
     found = known_height_errors(project)
     if found is None:
         raise InputError(

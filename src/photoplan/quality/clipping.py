@@ -23,16 +23,6 @@ def piled_ends(values: NDArray[Any]) -> tuple[float, float]:
 
     A sensor that is full, an amplifier or a developing program that cuts off, leaves such piles. A picture without
     noise has them at both ends and is not cut off.
-
-    Parameters
-    ----------
-    values : array
-        Grey values of valid pixels as stored, without those at the ends of the type.
-
-    Returns
-    -------
-    tuple of float
-        −inf and inf where there is no pile.
     """
     flat = values.ravel()
     flat = flat[:: max(1, flat.size // _SAMPLE)]

@@ -41,15 +41,7 @@ def nyquist(period_um: ArrayLike) -> Array:
 
 
 def transfer_modulation(product: float, signal_to_clock: ArrayLike) -> Array:
-    """Modulation that is left after shifting charges (Behr 1989, eq. 3.15).
-
-    Parameters
-    ----------
-    product : float
-        Transfer inefficiency product: inefficiency of one transfer times their number.
-    signal_to_clock : array_like
-        Signal frequency through clock frequency; 0.5 is the Nyquist frequency.
-    """
+    """Modulation that is left after shifting charges (Behr 1989, eq. 3.15)."""
     turn = 2.0 * pi * np.asarray(signal_to_clock, float)
     return np.asarray(np.exp(-product * (1.0 - np.cos(turn))))
 
@@ -82,13 +74,6 @@ def jitter_grey(jitter_s: float, grey_step: float, rise_s: float) -> float:
 
     The source's eq. 4.7, 20 ns · 255 / 100 ns, is 51 grey values; it prints 20, which a step of 100 grey values, named
     in its text, would make.
-
-    Parameters
-    ----------
-    jitter_s : float
-        Error of the time, or in pixels.
-    grey_step, rise_s : float
-        The steepest change of grey and the time (or pixels) that it takes: one period of sampling in eq. 4.7.
     """
     return jitter_s * grey_step / rise_s
 
@@ -104,13 +89,7 @@ def diffraction_cutoff(f_number: float, wavelength_nm: float) -> float:
 
 
 def diffraction_mtf(frequency: ArrayLike, cutoff: float) -> Array:
-    """MTF of a perfect lens with a circular stop in incoherent light, see `pupil_transfer`.
-
-    Raises
-    ------
-    InputError
-        The cutoff is not positive.
-    """
+    """MTF of a perfect lens with a circular stop in incoherent light, see `pupil_transfer`."""
     if not cutoff > 0.0:
         raise InputError(f"a diffraction limit of {cutoff:g} LP/mm; it is positive")
     return pupil_transfer(np.abs(np.asarray(frequency, float)) / cutoff)
@@ -233,20 +212,7 @@ def bandwidth_hz(points: float, frame_hz: float) -> float:
 
 
 def lengthened(length: float, blanking: float, period: float) -> float:
-    """A line or picture lengthened by the part of its time that is blanked (Behr 1989, eq. 3.8 to 3.10).
-
-    Parameters
-    ----------
-    length : float
-        Picture points in the line, or lines in the picture.
-    blanking, period : float
-        Time of blanking and whole time, in one unit.
-
-    Raises
-    ------
-    InputError
-        The blanking takes the whole period.
-    """
+    """A line or picture lengthened by the part of its time that is blanked (Behr 1989, eq. 3.8 to 3.10)."""
     if not 0.0 <= blanking < period:
         raise InputError(f"a blanking of {blanking:g} in a period of {period:g}; it is shorter than the period")
     return length / (1.0 - blanking / period)

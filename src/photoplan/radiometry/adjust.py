@@ -111,18 +111,7 @@ class _Normals:
 
 
 def adjust(band: Band, gauge: Gauge, prior: Prior, *, judged: bool = True) -> AdjustedBand:
-    """Tables and trends of one band.
-
-    Parameters
-    ----------
-    band : Band
-        Of cells that more than one image shows; every image is in some.
-    gauge : Gauge
-    prior : Prior
-        Its variance components are initial values.
-    judged : bool
-        Whether errors are estimated; else there are none.
-    """
+    """Tables and trends of one band."""
     images = len(gauge.parts)
     state, span = band.start(images, prior.common), float(np.ptp(band.nodes))
     H, held = _gauge(band, state, gauge)

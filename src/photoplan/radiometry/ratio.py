@@ -32,18 +32,6 @@ def factors(
     both in n cells. For more images the logarithms of the factors of all pairs are adjusted, each with the weight n.
     A slope of brightness that all images have would accumulate from pair to pair. It is an unknown of its own, with a
     standard deviation a priori; so is the exposure of each image, whose standard deviation comes from the overlaps.
-
-    Parameters
-    ----------
-    cells : Cells
-        That more than one image shows.
-    images : int
-    parts : ndarray, shape (images,)
-        Images of one number hang together; in each part the factors have the geometric mean 1.
-    fixed : int, optional
-        The image whose factor is 1 instead.
-    middles : ndarray, shape (images, 2), optional
-        Middles of the images on the map, in half diagonals of an image.
     """
     mean = np.maximum(cells.levels.mean(axis=2, dtype=float), 1e-6)
     first, second = neighbours(cells)

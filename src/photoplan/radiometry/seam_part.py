@@ -23,21 +23,7 @@ _BLIND = 50.0
 
 
 class SeamPart:
-    """What some images show of a part.
-
-    Parameters
-    ----------
-    corner : (row, column)
-        Of its upper-left pixel in the map.
-    images : ndarray of int, shape (n,)
-        Their numbers.
-    shown : sequence
-        For each its box in the map inside the part, and its pixels, see `Layer.window`.
-    weight, fixed : ndarrays, shape of the part
-        As of `find_seams`.
-    usual : float
-        Difference of two images at a pixel.
-    """
+    """What some images show of a part."""
 
     def __init__(
         self,
@@ -90,15 +76,7 @@ class SeamPart:
         return self._whole(found)
 
     def settled(self, labels: _Labels, free: _Mask, waiting: Sequence[_Box]) -> _Labels:
-        """Labels after one image after the other has taken what it gains, until a whole round has changed nothing.
-
-        Parameters
-        ----------
-        free : ndarray of bool
-            Pixels that may change.
-        waiting : sequence
-            Boxes of the part in which something has changed: images elsewhere need not be asked.
-        """
+        """Labels after one image after the other has taken what it gains, until a whole round has changed nothing."""
         mine = self._own(labels)
         free = free & (self._fixed == 0) & (mine > 0)
         asked = np.ones(len(self._images), np.bool_)

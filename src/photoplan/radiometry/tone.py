@@ -105,14 +105,6 @@ def surface(x: ArrayLike, y: ArrayLike, size: tuple[int, int], powers: Sequence[
 
     u and v are columns and rows from the image's middle in half diagonals. Without their means a trend brightens
     one part of the image and darkens another, and leaves the whole as it is.
-
-    Parameters
-    ----------
-    x, y : array_like
-        Columns and rows.
-    size : (int, int)
-        Width and height of the image.
-    powers : sequence of (i, j)
     """
     half = np.hypot(*size) / 2
     u = (np.asarray(x, float) - (size[0] - 1) / 2) / half

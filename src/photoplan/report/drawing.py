@@ -48,25 +48,7 @@ def has_matplotlib() -> bool:
 
 
 def load_matplotlib(what: str, otherwise: str = "") -> Any:
-    """Import matplotlib with the parts that plots use; it is optional, and takes a second to import.
-
-    Parameters
-    ----------
-    what : str
-        What needs it, for the message: "a report".
-    otherwise : str
-        How to do without it, for the message: "leave `report` out".
-
-    Returns
-    -------
-    module
-        ``matplotlib``.
-
-    Raises
-    ------
-    UsageError
-        It is not installed; the message names the extra.
-    """
+    """Import matplotlib with the parts that plots use; it is optional, and takes a second to import."""
     try:
         for part in _PARTS:
             importlib.import_module(f"matplotlib.{part}")

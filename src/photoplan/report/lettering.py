@@ -11,13 +11,7 @@ from photoplan.report.drawing import load_matplotlib
 
 
 def lettering(size: float) -> Lettering:
-    """What draws texts of a size in pixels, in the font of all plots.
-
-    Raises
-    ------
-    UsageError
-        matplotlib is not installed.
-    """
+    """What draws texts of a size in pixels, in the font of all plots."""
     load_matplotlib("a view with labels", "leave the labels out (label= of the lines)")
     fonts = importlib.import_module("matplotlib.ft2font")
     path = importlib.import_module("matplotlib.font_manager").findfont("DejaVu Sans")

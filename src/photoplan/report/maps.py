@@ -51,15 +51,7 @@ def _on_map(
 
 
 def draw_accuracy(raster: Path) -> Path:
-    """Draw an accuracy raster as a PNG beside it; replaces an older one.
-
-    Raises
-    ------
-    UsageError
-        matplotlib is not installed, or the folder cannot be written.
-    InputError
-        The raster cannot be read.
-    """
+    """Draw an accuracy raster as a PNG beside it; replaces an older one."""
     load_matplotlib("a picture of the accuracy", "leave `accuracy` out")
     bands, (left, bottom, right, top) = read_reduced(raster, max_side=_SIDE)
     radial = np.hypot(bands[0], bands[1])
@@ -95,18 +87,7 @@ def seams_picture(found: SeamsReport) -> bytes | None:
 
 
 def draw_regions(path: Path, shapes: Mapping[str, Any], title: str) -> Path:
-    """Draw the regions of images, the larger ones with their names, as a PNG; replaces an older one.
-
-    Parameters
-    ----------
-    shapes : mapping
-        Multipolygon of each image, in map coordinates.
-
-    Raises
-    ------
-    UsageError
-        matplotlib is not installed, or the folder cannot be written.
-    """
+    """Draw the regions of images, the larger ones with their names, as a PNG; replaces an older one."""
     load_matplotlib("a picture of the regions", "leave `sources` out")
     write_atomically(path, regions_picture(shapes, title))
     return path
@@ -129,13 +110,7 @@ def regions_picture(shapes: Mapping[str, Any], title: str) -> bytes:
 
 
 def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:
-    """Draw squares by their outer edges xmin, ymin, xmax, ymax, shape (n, 4), as a PNG; replaces an older one.
-
-    Raises
-    ------
-    UsageError
-        matplotlib is not installed, or the folder cannot be written.
-    """
+    """Draw squares by their outer edges xmin, ymin, xmax, ymax, shape (n, 4), as a PNG; replaces an older one."""
     load_matplotlib("a picture of the squares", "leave `show_quadtree` out")
     (left, bottom), (right, top) = bounds[:, :2].min(axis=0).tolist(), bounds[:, 2:].max(axis=0).tolist()
     fig, ax = axes_of(9.0, float(np.clip(9.0 * (top - bottom) / (right - left), 2.0, 14.0)))
@@ -150,22 +125,7 @@ def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:
 
 
 def draw_surface(heights: Path, picture: Path, coordinates: tuple[str, str] = ("X", "Y")) -> Path:
-    """Draw heights, grey values, standard deviations and residuals of a surface as one PNG; replaces an older one.
-
-    Parameters
-    ----------
-    heights : Path
-        NAME.tif; NAME_sigma.tif, NAME_grey.tif and NAME_fit.tif stand beside it.
-    coordinates : tuple of str
-        Names of what is along the axes.
-
-    Raises
-    ------
-    UsageError
-        matplotlib is not installed, or the folder cannot be written.
-    InputError
-        A raster cannot be read.
-    """
+    """Draw heights, grey values, standard deviations and residuals of a surface as one PNG; replaces an older one."""
     load_matplotlib("a picture of the surface", "say `no_quicklook`")
     (z,), (left, bottom, right, top) = read_reduced(heights, max_side=_SIDE_OF_FOUR)
     grey, sigma, fit = (

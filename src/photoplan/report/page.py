@@ -144,13 +144,7 @@ class ReportFile:
     path: Path
 
     def write(self, content: str | bytes) -> Path:
-        """Write it whole or not at all; its folder is made. Returns its path.
-
-        Raises
-        ------
-        UsageError, ResourceError
-            The folder cannot be written, or the disk is full.
-        """
+        """Write it whole or not at all; its folder is made. Returns its path."""
         if isinstance(content, str):
             # Pictures inside are left as they are.
             parts = re.split(r"(data:image/[^\"]*)", content)
@@ -172,22 +166,7 @@ def open_report(
     table: Path | None = None,
     project: Path | None = None,
 ) -> ReportFile | None:
-    """A report to be; None if none is asked for.
-
-    Parameters
-    ----------
-    inputs : iterable of Path
-        What it must not replace; None and words that are no files are passed over.
-    table : Path, optional
-        Another file that is written.
-    project : Path, optional
-        Project file: it and all that it names are inputs, too.
-
-    Raises
-    ------
-    UsageError
-        The file exists, is an input or the table, does not end in .html, or matplotlib is missing.
-    """
+    """A report to be; None if none is asked for."""
     if path is None:
         return None
     if table is not None and table.resolve() == path.resolve():

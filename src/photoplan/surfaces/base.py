@@ -44,23 +44,5 @@ class Terrain(Surface, Protocol):
         ...
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
-        """Where rays first come down onto the surface, from above it.
-
-        Parameters
-        ----------
-        paths : array_like, shape (n, k, 3)
-            Points X, Y, Z of each ray, straight in between, k ≥ 2, in any direction; a curved ray has more points. A
-            ray with NaN meets nothing.
-        bend : float
-            What a ray rises above its pieces, per squared distance on the map from the first point of its path, 1/m: a
-            level ray over a round earth (less what refraction takes of it).
-
-        Returns
-        -------
-        Hits
-            Exact over bilinear meshes and triangles. Places without surface let rays through; a ray that gets below the
-            surface, because it starts there or through such a place, goes on until it has come out above it. Where the
-            surface has a step the ray may end on the wall. A ray along a wall sees the heights left of the line, or,
-            where the line is a border of meshes, those of the eastern or southern mesh.
-        """
+        """Where rays first come down onto the surface, from above it."""
         ...

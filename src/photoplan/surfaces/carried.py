@@ -16,22 +16,7 @@ STEP = 32
 def carried_positions(
     grid: MapGrid, window: Window, carry: Callable[[NDArray[np.float64]], NDArray[np.float64]], tolerance: float
 ) -> NDArray[np.float64] | None:
-    """Pixel centres of a window, carried from the map to other coordinates.
-
-    Parameters
-    ----------
-    window : Window
-        Pixels of the grid; at least one.
-    carry : callable
-        Takes X, Y of the map (..., 2) to the other coordinates, the same shape.
-    tolerance : float
-        Largest error of interpolated positions, in units of the other coordinates.
-
-    Returns
-    -------
-    ndarray, shape (height, width, 2), or None
-        Positions, bilinear between nodes 32 pixels apart; None if that would err by more than the tolerance.
-    """
+    """Pixel centres of a window, carried from the map to other coordinates."""
     at_u = np.append(np.arange(0, window.width - 1, STEP), window.width - 1)
     at_v = np.append(np.arange(0, window.height - 1, STEP), window.height - 1)
     nodes = np.stack(np.meshgrid(at_u + window.col, at_v + window.row), axis=-1).astype(float)

@@ -50,28 +50,7 @@ def follow_fan(
     bend: float,
     cache: Cache,
 ) -> Shown:
-    """First hits of the rays of a picture, column by column.
-
-    Parameters
-    ----------
-    parts : Parts
-        Terrain without triangles.
-    center : ndarray, shape (3,)
-        Where all rays start.
-    ends : ndarray, shape (width, 2)
-        X, Y where the columns' rays end.
-    rise : ndarrays, shapes (height,), (width,)
-        Metres of height per metre on the map: what the rows have of it, falling, and what that is times in each column.
-    rows : (int, int)
-        The first row that is looked for, and the one after the last; the others are `LEFT`.
-    bend : float
-        See `Terrain.first_hit`.
-
-    Returns
-    -------
-    Shown
-        Pixels that are `LEFT` need rays of their own: they get below the ground somewhere, or do not belong to `rows`.
-    """
+    """First hits of the rays of a picture, column by column."""
     n, height = len(ends), len(rise[0])
     XYZ, normal, towards = np.full((3, height, n, 3), np.nan)
     shown: Shown = XYZ, normal, towards, np.full((height, n), np.nan), np.full((height, n), -1)

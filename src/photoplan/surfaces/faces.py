@@ -109,23 +109,7 @@ class Faces:
     def first_hit(
         self, paths: ArrayLike, bend: float = 0.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """The face that rays meet first, whichever way they run and whichever side of it they meet.
-
-        Parameters
-        ----------
-        paths : array_like, shape (n, k, 3)
-        bend : float
-            As for `Terrain.first_hit`.
-
-        Returns
-        -------
-        along : ndarray, shape (n,)
-            Piece of the path plus part of it, 0 to k − 1; NaN where a ray meets no face.
-        XYZ : ndarray, shape (n, 3)
-            Where; NaN where a ray meets no face.
-        face : ndarray, shape (n,)
-            Which; −1: none.
-        """
+        """The face that rays meet first, whichever way they run and whichever side of it they meet."""
         given = np.asarray(paths, float)
         fine = chords(given, bend, lambda XYZ: XYZ)[0] if bend else given
         n, pieces = len(fine), fine.shape[1] - 1

@@ -32,12 +32,8 @@ class RangeStore(Protocol):
     """What earlier runs found out of a grid."""
 
     def load(self, layout: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Numbers of parts (n,), row by row, and the lowest and highest heights of their cells (n, 2, rows, columns).
-
-        Parameters
-        ----------
-        layout : tuple of int
-            What decides the cells; its last two numbers are the rows and columns of a part.
+        """Numbers of parts (n,), row by row, and the lowest and highest heights of their cells (n, 2, rows,
+        columns).
         """
         ...
 

@@ -50,21 +50,7 @@ def intersect(
 
 
 def ray_paths(camera: Rays, xy: ArrayLike, height_range: tuple[float, float]) -> NDArray[np.float64]:
-    """Rays of image points through the heights of a scene, whichever way they run: paths for `Terrain.first_hit`.
-
-    Parameters
-    ----------
-    xy : array_like, shape (n, 2)
-        Image points in pixels.
-    height_range : (float, float)
-        Heights between which the scene lies, metres; for curved rays the upper one is below the camera.
-
-    Returns
-    -------
-    ndarray, shape (n, k, 3)
-        From where a ray starts, or enters these heights, to where it leaves them, or 30 km further. NaN where there is
-        no ray, or it does not reach them; curved rays also where they do not go down.
-    """
+    """Rays of image points through the heights of a scene, whichever way they run: paths for `Terrain.first_hit`."""
     low, high = height_range[0] - _MARGIN, height_range[1] + _MARGIN
     xy = np.asarray(xy, float)
     origin, direction = camera.rays(xy, high)

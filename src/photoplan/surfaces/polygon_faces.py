@@ -42,20 +42,6 @@ def filled(
     Inside a plane polygon the height is that of the plane; inside another one that of a constrained Delaunay
     triangulation of its vertices, seen along its mean normal (Newell's), so that upright and overhanging polygons are
     as good as level ones.
-
-    Parameters
-    ----------
-    polygons : sequence of `Rings`
-    names : sequence of str
-        Of the polygons, for what is wrong with them.
-
-    Returns
-    -------
-    corners : ndarray, shape (n, 3, 3)
-    polygon : ndarray, shape (n,)
-        Place of the polygon of each triangle.
-    faults : dict
-        By name, what is wrong with polygons that have no triangles, see `cannot_be_used`.
     """
     flat: list[Any] = []
     bases: list[_Base | None] = []

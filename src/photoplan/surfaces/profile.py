@@ -26,28 +26,6 @@ def profile(
 
     There is a point at every vertex of the polyline and wherever it crosses a grid line, a line element or the edge of
     a triangle. Over a bilinear mesh the surface is a parabola: points are added until it is met to the tolerance.
-
-    Parameters
-    ----------
-    surface : HybridSurface or RasterSurface
-        In the CRS of the polyline.
-    polyline : array_like, shape (k, 2)
-        X, Y of its vertices, metres; at least two different ones.
-    tolerance : float
-        Largest distance in height of the profile from the surface, metres.
-
-    Returns
-    -------
-    distance, X, Y, Z : ndarray, shape (n,)
-        Distance along the polyline, ascending, position and height, metres. At a wall two points have one distance:
-        the height before and the height after. Where there is no surface, a first and a last point have Z = NaN.
-        A profile along a wall shows the heights on its left.
-
-    Raises
-    ------
-    UsageError
-        The polyline has no length or a point that is not finite, the tolerance is not positive, or the surface is
-        carried from another CRS, where straight lines are not straight.
     """
     line = _polyline(polyline)
     if not tolerance > 0:

@@ -42,22 +42,6 @@ def decompose(polygon: Any, corner: tuple[float, float], mesh: float, levels: in
 
     Meshes that lie inside stay as they are, those outside are dropped, all others are divided by four; the smallest
     belong to the polygon if their middles do.
-
-    Parameters
-    ----------
-    polygon : shapely Polygon or MultiPolygon
-        On the map; holes are kept free.
-    corner : (float, float)
-        X, Y of a corner of the meshes.
-    mesh : float
-        Their side, metres: what a camera took at once, here what is worth a square.
-    levels : int
-        How often they may be divided; Behr stops where they are no larger than a pixel.
-
-    Raises
-    ------
-    UsageError
-        There would be more squares than `MOST_SQUARES`.
     """
     xmin, ymin, xmax, ymax = polygon.bounds
     col = np.arange(np.floor((xmin - corner[0]) / mesh), np.ceil((xmax - corner[0]) / mesh))

@@ -127,22 +127,7 @@ class TerrainParts(Protocol):
 
 
 def chords(paths: NDArray[np.float64], bend: float, carry: Carry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Paths cut into pieces so short that in other coordinates they are straight, to a quarter of `STRAIGHT`.
-
-    Parameters
-    ----------
-    paths : ndarray, shape (n, k, 3)
-        Map coordinates and heights.
-    bend : float
-        See `Terrain.first_hit`.
-    carry : callable
-        Takes points (..., 3) to the other coordinates.
-
-    Returns
-    -------
-    fine, carried : ndarrays, shape (n, (k − 1)·m + 1, 3)
-        The points that cut them, here and there.
-    """
+    """Paths cut into pieces so short that in other coordinates they are straight, to a quarter of `STRAIGHT`."""
     # What a metre to the east and one to the north are there.
     corner = carry(paths[:, :1])
     metres = np.stack([(carry(paths[:, :1] + step) - corner)[:, 0, :2] for step in np.eye(3)[:2]], axis=-1)
@@ -170,12 +155,8 @@ def bent(paths: NDArray[np.float64], bend: float) -> NDArray[np.float64]:
 
 
 def follow(parts: TerrainParts, paths: ArrayLike, bend: float = 0.0, cache: Cache | None = None) -> Hits:
-    """First hits of rays over terrain in parts, with parts that are kept from the last time; see `Terrain.first_hit`.
-
-    Raises
-    ------
-    UsageError
-        The paths have another shape, or fewer than two points each.
+    """First hits of rays over terrain in parts, with parts that are kept from the last time; see
+    `Terrain.first_hit`.
     """
     at = np.asarray(paths, float)
     if at.ndim != 3 or at.shape[1] < 2 or at.shape[2] != 3:

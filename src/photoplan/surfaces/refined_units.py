@@ -54,28 +54,6 @@ def refine_units(
     coarse heights, so that nothing changes outside. Inside the polygons the lines of the fine model count, their
     heights blended like the surface; outside those of the coarse one. Units around get new triangles only where the
     finer posts that adjoin do not lie on their edge.
-
-    Parameters
-    ----------
-    coarse, fine : LinedUnits
-        Both in one CRS and height system; their layouts may differ.
-    polygons : shapely polygon or multipolygon
-    transition : float
-        Width of the band inside the border of the polygons in which the difference is blended in, metres.
-    width : float
-        Largest grid width of the units that the polygons touch, metres.
-
-    Returns
-    -------
-    units : dict of (column, row) to Unit
-        Those of the coarse layout that are new; all others stay as they are.
-    lines : tuple of LineElement
-        All lines of the refined model.
-
-    Raises
-    ------
-    InputError
-        The width is not positive or absurdly small, or what `RefinedSurface` and `build_faces` refuse.
     """
     layout = coarse.units.layout
     if not (width > 0 and layout.side / width <= MOST_MESHES):

@@ -45,16 +45,6 @@ def representation(
     The error of linear interpolation in the middle between two posts is half the second difference at half the mesh
     width. Its mean square is extrapolated from those at one and at two mesh widths: by a power law of the distance if
     the ground has kinks at all scales, and towards the law of smooth ground if it has none.
-
-    Parameters
-    ----------
-    heights : ndarray, shape (n + 1, n + 1)
-        Posts; NaN = no height.
-    vertices : ndarray, shape (k, 2), optional
-        Vertices of triangles, x and y in meshes. No difference is taken over a side of a mesh with a vertex inside:
-        there a line crosses it, and a step beside a breakline is no curvature.
-    triangled : ndarray of bool, shape (n, n), optional
-        Meshes with triangles. A post amid such meshes alone may lie on a line, and no difference is taken with it.
     """
     Z = heights.astype(float)
     across, along = _uncut(vertices, Z.shape[0] - 1)

@@ -219,14 +219,6 @@ def best_photos(cameras: Sequence[CentralCamera], seen: Seen, surface: SeenSurfa
     """The camera, counted from one, that sees the ground of each pixel best; 0: none sees it.
 
     Best is the one that is nearest, counted in its own pixels: the pixel in its middle, at that distance, is smallest.
-
-    Parameters
-    ----------
-    cameras : sequence of CentralCamera
-    seen : Seen
-        Shape (height, width, …).
-    surface : SeenSurface
-        What may be in the way.
     """
     shape = seen.owner.shape
     there = np.flatnonzero(seen.owner.ravel() >= 0)

@@ -21,13 +21,6 @@ def skyline_of(target: ViewTarget, surface: SeenSurface, beyond: int = 0) -> See
 
     A column that shows no sky, or no ground, has none. Terrain without overhangs has one border between ground and
     sky in a vertical plane: it is found by halving.
-
-    Parameters
-    ----------
-    target : ViewTarget
-    surface : SeenSurface
-    beyond : int
-        Columns to the left and to the right of the picture, and rows above and below it, that are looked at, too.
     """
 
     def hit(x: _Floats, y: _Floats) -> NDArray[np.bool_]:

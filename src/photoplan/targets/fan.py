@@ -37,13 +37,7 @@ class Fan:
 
 
 def fan_of(target: ViewTarget, window: Window, reach: float, tolerance: float) -> Fan | None:
-    """Rays of a window as planes; None: they are none, or bent otherwise than `ViewTarget.bend`.
-
-    Parameters
-    ----------
-    reach, tolerance : float
-        See `ViewTarget.rays`.
-    """
+    """Rays of a window as planes; None: they are none, or bent otherwise than `ViewTarget.bend`."""
     if not target.upright:
         return None
     # Of the whole picture, so that all windows have the same numbers.

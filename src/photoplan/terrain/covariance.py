@@ -57,13 +57,7 @@ class Neighbours:
 
     @classmethod
     def of(cls, xy: NDArray[np.float64], points: int, order: NDArray[np.int64]) -> Neighbours:
-        """Trees of data xy (n, 2), of which the first `points` are points.
-
-        Parameters
-        ----------
-        order : ndarray, shape (points,)
-            Points in an order in which neighbours follow each other: thinned, they still cover the area evenly.
-        """
+        """Trees of data xy (n, 2), of which the first `points` are points."""
         near, far = [], []
         for numbers, most in ((order, POINTS), (np.arange(points, len(xy)), LINES)):
             if len(numbers):
@@ -162,11 +156,6 @@ def estimate_all(
     """The covariance function of the whole area, from blocks of some of its units; of the family that predicts best.
 
     Where that is the smoothest of several, the next one follows: a few blocks may not meet the crests of an area.
-
-    Parameters
-    ----------
-    members : iterable of ndarray
-        Numbers of the points of each unit that may be looked at.
     """
     parts = [_blocks(seen, neighbours, points) for points in _some(list(members))]
     size = min(part.b.shape[1] for part in parts)

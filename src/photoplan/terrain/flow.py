@@ -127,13 +127,7 @@ def _numbered(order: NDArray[np.int32], leaves: NDArray[np.bool_]) -> NDArray[np
 
 
 def snapped(area: NDArray[np.float64], row: float, column: float, reach: float) -> tuple[int, int]:
-    """The cell with the largest upstream area within `reach` cells of a place; the cell itself for reach 0.
-
-    Raises
-    ------
-    InputError
-        There is no terrain within reach.
-    """
+    """The cell with the largest upstream area within `reach` cells of a place; the cell itself for reach 0."""
     rows, columns = area.shape
     j, i = np.mgrid[
         max(0, round(row - reach)) : min(rows, round(row + reach) + 1),

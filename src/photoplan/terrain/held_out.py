@@ -32,15 +32,7 @@ _ASKED = 24
 
 
 def calibrated(found: TerrainFit, places: NDArray[np.float64], meshes: int, run: Map = map) -> TerrainFit:
-    """The fit with standard deviations calibrated by blocks of its own data.
-
-    Parameters
-    ----------
-    places : ndarray, shape (n, 2)
-        Some of where the model will have a surface: gaps as wide as theirs are held out.
-    meshes : int
-        Meshes along a unit's side.
-    """
+    """The fit with standard deviations calibrated by blocks of its own data."""
     seen = found.seen
     gaps = cKDTree(seen.xyz[:, :2]).query(places)[0] / seen.spacing if len(places) else np.ones(1)
     rng = np.random.default_rng(len(seen.xyz))
@@ -98,15 +90,7 @@ def _bends(seen: Observations, some: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def without(found: TerrainFit, held: NDArray[np.bool_], meshes: int) -> TerrainFit:
-    """The same stochastic model for fewer data, of which no patch has chosen yet.
-
-    Parameters
-    ----------
-    held : ndarray, shape (n,)
-        Data that are left out.
-    meshes : int
-        Meshes along a unit's side.
-    """
+    """The same stochastic model for fewer data, of which no patch has chosen yet."""
     seen, kept = found.seen, ~held
     some = kept[: seen.points]
     vertices = seen.lines.xyz[:, :2]

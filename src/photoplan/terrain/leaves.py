@@ -38,15 +38,7 @@ class Leaves:
 
 
 def quadtree(xy: NDArray[np.float64], layout: UnitLayout, meshes: int) -> Leaves:
-    """Quarter each unit until a leaf holds at most `CAPACITY` points or is two meshes wide.
-
-    Parameters
-    ----------
-    xy : ndarray, shape (n, 2)
-        Points inside the layout, in its coordinates.
-    meshes : int
-        Meshes along a unit's side, a power of two.
-    """
+    """Quarter each unit until a leaf holds at most `CAPACITY` points or is two meshes wide."""
     deepest = max(0, int(np.log2(meshes / _SMALLEST)))
     place = np.stack([xy[:, 0] - layout.left, layout.top - xy[:, 1]], axis=1) / layout.side
     column = np.clip(place[:, 0].astype(np.int64), 0, layout.columns - 1)

@@ -90,19 +90,6 @@ def monoplot(
 
     whose solution carries the covariances of image point, orientation and terrain over to the ground point. The slope
     is that between points half a mesh away on both sides.
-
-    Parameters
-    ----------
-    xy : array_like, shape (n, 2)
-        Image points, pixels.
-    height_range : (float, float)
-        Lowest and highest terrain that the image can show, metres.
-    mesh : float
-        Mesh width of the terrain, metres: slopes are taken over it.
-
-    Returns
-    -------
-    MonoplotPoints
     """
     xy = np.asarray(xy, float).reshape(-1, 2)
     reasons = _before(camera, xy, terrain, height_range)

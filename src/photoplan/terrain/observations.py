@@ -113,17 +113,7 @@ def lines_apart(seen: Observations) -> float:
 def _variances(
     given: NDArray[np.float64], share: NDArray[np.float64], points: int
 ) -> tuple[NDArray[np.float64], float | None]:
-    """Variances as `Observations.parts` has them, and the known noise of mass points.
-
-    Parameters
-    ----------
-    given : ndarray, shape (n,)
-        Standard deviations that are known, metres; NaN: the share of the mass points' is used.
-    share : ndarray, shape (n,)
-        Standard deviation as a part of that of mass points.
-    points : int
-        Data that are points.
-    """
+    """Variances as `Observations.parts` has them, and the known noise of mass points."""
     unknown = np.isnan(given)
     fixed, factor = np.where(unknown, 0.0, given) ** 2, np.where(unknown, share, 0.0) ** 2
     mass = given[:points][share[:points] == 1]
@@ -138,13 +128,7 @@ def _variances(
 
 
 def observe(measured: MeasuredTerrain, settings: BuildSettings) -> Observations:
-    """Arrays of clean measurements.
-
-    Raises
-    ------
-    GeometryError
-        There are fewer than three points, or all lie on one line.
-    """
+    """Arrays of clean measurements."""
     lines = [line for line in measured.lines if line.kind == "breakline"]
     others = [line for line in measured.lines if line.kind != "breakline"]
     stacks = [group.xyz for group in measured.points] + [line.xyz for line in lines + others]

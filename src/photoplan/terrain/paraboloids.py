@@ -11,18 +11,6 @@ def paraboloids(step: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
 
     The coefficients are the height, the slopes and the second derivatives at the place: divide slopes by the unit and
     second derivatives by its square.
-
-    Parameters
-    ----------
-    step : ndarray, shape (n, k, 2)
-        From n places to the k heights around each, metres.
-
-    Returns
-    -------
-    ndarray, shape (n, k, 6)
-        The matrices.
-    ndarray, shape (n,)
-        The units, metres; 1 where all heights lie at the place itself.
     """
     unit = np.abs(step).max(axis=(1, 2))
     unit = np.where(unit > 0, unit, 1.0)

@@ -94,14 +94,7 @@ class Domain:
 def heights_at(
     fit: TerrainFit, unit: int, xy: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Predicted heights of places (n, 2) in or near a unit.
-
-    Returns
-    -------
-    heights, sigmas, distances : ndarrays, shape (n,)
-        Relative to the observations' origin; standard deviation; distance to the nearest datum; metres. NaN where
-        nothing can be predicted.
-    """
+    """Predicted heights of places (n, 2) in or near a unit."""
     raw = raw_at(fit, unit, xy)
     # Residuals that are smaller than rounding do not show that the surface is better known.
     sigma = np.maximum(
@@ -125,13 +118,7 @@ class Raw:
 
 
 def raw_at(fit: TerrainFit, unit: int, xy: NDArray[np.float64], chosen: bool = True) -> Raw:
-    """What the covariance functions say at places (n, 2) in or near a unit.
-
-    Parameters
-    ----------
-    chosen : bool
-        Whether patches have chosen their functions; else those that are needed do now.
-    """
+    """What the covariance functions say at places (n, 2) in or near a unit."""
     sums = np.zeros((len(xy), 6))
     sums[:, 3] = np.inf
     low, high = xy.min(axis=0), xy.max(axis=0)

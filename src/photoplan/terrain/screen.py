@@ -122,13 +122,7 @@ class Screened:
 
 
 def screen(seen: Observations, around: Neighbourhoods, limit: float) -> Screened:
-    """Look for gross errors by robust planes and broken borders.
-
-    Parameters
-    ----------
-    limit : float
-        Misfit of a gross error in units of its neighbours' misfits.
-    """
+    """Look for gross errors by robust planes and broken borders."""
     planes = np.full((seen.points, 3), np.nan)
     used = np.ones(len(seen.xyz), bool)
     fit_planes(seen.xyz, around.near, used, np.arange(seen.points), planes)
@@ -186,17 +180,7 @@ def supported(
     some: NDArray[np.int64],
     within: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Whether the planes of several neighbours meet a point: it lies on one side of an edge that no line describes.
-
-    Parameters
-    ----------
-    near : ndarray, shape (n, k)
-        Neighbours of each point that is asked for; −1: none.
-    slopes : ndarray, shape (points, 2)
-        Of the plane at every point; NaN: not known.
-    some, within : ndarrays, shape (n,)
-        Points that are asked for, and to what a plane meets each of them, metres.
-    """
+    """Whether the planes of several neighbours meet a point: it lies on one side of an edge that no line describes."""
     xyz = seen.xyz
     step = xyz[some, None] - xyz[near]
     off = step[..., 2] - (step[..., :2] * slopes[near]).sum(axis=2)

@@ -135,13 +135,7 @@ def _steepness(slopes: Slopes) -> NDArray[np.float32]:
 
 
 def slope_classes(values: NDArray[np.float32], limits: tuple[float, ...]) -> NDArray[np.uint8]:
-    """Number of each value's class: 1 below the first limit, 2 from there to the second …; 0 for NaN.
-
-    Raises
-    ------
-    UsageError
-        The limits do not rise, or there are more than 254.
-    """
+    """Number of each value's class: 1 below the first limit, 2 from there to the second …; 0 for NaN."""
     if not limits or len(limits) > 254 or not (np.diff(limits) > 0).all() or not np.isfinite(limits).all():
         raise UsageError(f"class limits {limits}; one to 254 rising numbers are needed")
     classes = 1 + np.searchsorted(np.array(limits), values, side="right")
@@ -213,22 +207,7 @@ class Ramp:
 
 
 def built_in_ramp(name: str, low: float, high: float, steps: int | None = None) -> Ramp:
-    """A ramp of `RAMPS` between two heights.
-
-    Parameters
-    ----------
-    name
-        One of `RAMPS`.
-    low, high
-        Metres.
-    steps
-        Number of classes of equal height; None: interpolated.
-
-    Raises
-    ------
-    UsageError
-        The name is unknown, or the range is empty.
-    """
+    """A ramp of `RAMPS` between two heights."""
     if name not in RAMPS:
         raise UsageError(f"colour ramp {name!r}; built in are {', '.join(RAMPS)}, anything else is the name of a file")
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
@@ -246,22 +225,7 @@ def built_in_ramp(name: str, low: float, high: float, steps: int | None = None) 
 
 
 def parse_ramp(text: str, name: str, classed: bool = False) -> Ramp:
-    """A ramp of a text: lines `height red green blue`, separated by blanks, commas or tabs; `#` begins a remark.
-
-    Parameters
-    ----------
-    text
-        The lines, in any order.
-    name
-        Of the file, for messages.
-    classed
-        See `Ramp`.
-
-    Raises
-    ------
-    InputError
-        A line is no entry (its number is named), there are none, or a height comes twice.
-    """
+    """A ramp of a text: lines `height red green blue`, separated by blanks, commas or tabs; `#` begins a remark."""
     rows: list[list[float]] = []
     for number, line in enumerate(text.lstrip("\ufeff").splitlines(), 1):
         words = line.split("#")[0].replace(",", " ").replace(";", " ").split()
@@ -289,19 +253,7 @@ def parse_ramp(text: str, name: str, classed: bool = False) -> Ramp:
 def shaded(
     colours: NDArray[np.float32], shade: NDArray[np.float32], level: float, strength: float = 0.6
 ) -> NDArray[np.float32]:
-    """Colours darkened and lightened by a hillshade; flat ground keeps its colour.
-
-    Parameters
-    ----------
-    colours
-        Shape (3, h, w), 0 to 255.
-    shade
-        Light, 0 to 1, shape (h, w); NaN leaves the colour as it is.
-    level
-        Light on flat ground.
-    strength
-        How much of the hillshade is taken, 0 to 1.
-    """
+    """Colours darkened and lightened by a hillshade; flat ground keeps its colour."""
     shade = np.where(np.isnan(shade), np.float32(level), shade)
     dark = np.minimum(shade / level, 1)
     bright = np.maximum(shade - level, 0) / max(1 - level, 1e-6)

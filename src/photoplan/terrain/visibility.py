@@ -83,28 +83,6 @@ def needed_heights(
     Every line of sight is followed from the post to the eye and compared with bilinear terrain at all grid lines that
     it crosses; blocks of meshes that lie below it are skipped by a pyramid of their maxima, which changes no result.
     See `kernels.visibility` for what remains as error.
-
-    Parameters
-    ----------
-    heights : ndarray, shape (rows, cols), float32
-        NaN = no height; such places block nothing.
-    mesh : float
-        Distance of the posts, metres.
-    only_whether : bool
-        Ask only whether targets of the given height are seen: where they are not, the result is infinite. Several
-        times faster.
-    run : callable
-        A `map`, perhaps by threads.
-
-    Returns
-    -------
-    ndarray, shape (rows, cols), float32
-        Metres, at least the target height; NaN where there is no height, and beyond the radius.
-
-    Raises
-    ------
-    InputError
-        The grid is too small, or the observer does not stand on it.
     """
     rows, columns = heights.shape
     if rows < 2 or columns < 2:

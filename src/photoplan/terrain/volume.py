@@ -266,16 +266,6 @@ def volume_sigma(
     which is used where the region has too many cells of about L for the memory. `bias` is the standard deviation of an
     error that both surfaces' difference has everywhere alike, such as that of their height datums; F is the area.
     For cut and fill the integrals go over the area where A, or B, is the higher one.
-
-    Parameters
-    ----------
-    errors : (ErrorModel, ErrorModel)
-        How the heights of A and of B err.
-    polygon : shapely Polygon or MultiPolygon
-    cell : float
-        Side of the cells at most, metres.
-    bias : float
-        Metres.
     """
     if not (np.isfinite(bias) and bias >= 0):
         raise UsageError(f"bias {bias} m; a standard deviation of zero or more metres is needed")

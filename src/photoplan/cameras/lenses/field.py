@@ -130,13 +130,7 @@ class FieldLimited:
 
 @lru_cache(maxsize=256)
 def field_limited(lens: Lens, interior: Interior) -> FieldLimited:
-    """Limit a lens to the field of an image: the farthest point of its border and 5 % beyond.
-
-    Raises
-    ------
-    InputError
-        The lens folds back inside the image.
-    """
+    """Limit a lens to the field of an image: the farthest point of its border and 5 % beyond."""
     real = interior.tangent_to_pixel.inverse(interior.border(2))
     farthest = _farthest(lens, real)
     if math.isinf(farthest):

@@ -79,20 +79,7 @@ def solve2(J: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 def newton_inverse(
     distort: _Map, jacobian: _Map, target: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """t with distort(t) = target, to 1e-12.
-
-    Parameters
-    ----------
-    distort, jacobian : callable
-        The mapping (..., 2) → (..., 2) and its derivative (..., 2, 2).
-    target, start : ndarray, shape (..., 2)
-        What is to be reached, and where the search begins.
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
-        NaN where the search did not converge, or ended on a sheet that is folded over.
-    """
+    """t with distort(t) = target, to 1e-12."""
     t = np.array(start, float)
     with np.errstate(all="ignore"):
         for _ in range(_ITERATIONS):

@@ -74,13 +74,7 @@ class StatedFrame:
 
 
 def read_frame(path: Path) -> StatedFrame:
-    """The frame camera of an ISD.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, is of another kind of camera, or a number is missing, wrong or of unknown meaning.
-    """
+    """The frame camera of an ISD."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: not a file of a frame camera with its orientation ({', '.join(SUFFIXES)})")
     return read(read_json(path, _MAX_BYTES), path)

@@ -44,11 +44,6 @@ def _toml(path: Path) -> dict[str, CameraEntry]:
     """Cameras of the ``[cameras.NAME]`` tables of a project file, alone or in a whole project.
 
     A table ``[report]`` beside them is compared with them; see `photoplan.io.camera.usgs`.
-
-    Raises
-    ------
-    InputError
-        There is no ``[cameras.NAME]`` table, or an entry is wrong; the message names its line.
     """
     contents, text = read_toml(path)
     cameras = contents.get("cameras")
@@ -98,11 +93,6 @@ def read_cameras(path: str | Path) -> CameraFile:
     """Cameras of a file: own TOML, YAML (orthority's layout, OpenCV), JSON of OpenSfM and OpenDroneMap, Metashape's
     ``cameras.xml``, Pix4D's ``.cam`` and ``calibrated_camera_parameters.txt``, COLMAP's
     ``cameras.txt`` and ``cameras.bin``.
-
-    Raises
-    ------
-    InputError
-        The format is unknown, or the file cannot be used.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -104,13 +104,7 @@ class FrameEntry(CameraEntry):
 
 
 def frame_in_pixels(pixels: InPixels, lens: Mapping[str, Any], where: str) -> CameraEntry:
-    """The description of a camera that is known in pixels, with the entries of its lens; `where` begins messages.
-
-    Raises
-    ------
-    InputError
-        A value is not allowed.
-    """
+    """The description of a camera that is known in pixels, with the entries of its lens; `where` begins messages."""
     fx, fy = pixels.focal
     focal = fx if fx == fy else pixels.focal
     values = {"size": pixels.size, "focal_px": focal, "principal_point_px": pixels.point, "lens": dict(lens)}

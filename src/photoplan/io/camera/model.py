@@ -248,15 +248,7 @@ class FiducialSystem:
     """What they look like; None: not described."""
 
     def fit(self, measured: Fiducials | None, model: str | None = None) -> FiducialFit:
-        """Adjustment of the marks of a scan, with residuals and sigma0; `model` in place of the camera's.
-
-        Raises
-        ------
-        InputError
-            Marks are missing, exchanged, far off or mirrored.
-        GeometryError
-            The marks lie on a line.
-        """
+        """Adjustment of the marks of a scan, with residuals and sigma0; `model` in place of the camera's."""
         if not measured:
             raise InputError("the fiducial marks of its scan are not measured; `photoplan fiducials` finds them")
         return fit_marks(model or self.model, self.places_mm, measured, mirrored=self.mirrored)
@@ -295,13 +287,7 @@ class CameraEntry(Entry, ABC):
 
     @abstractmethod
     def interior_orientation(self, size: tuple[int, int], fiducials: Fiducials | None) -> Interior:
-        """Interior orientation of an image of `size` with these measured marks.
-
-        Raises
-        ------
-        InputError, GeometryError
-            The marks of a scan are not measured, or cannot be right.
-        """
+        """Interior orientation of an image of `size` with these measured marks."""
 
     @abstractmethod
     def check_fiducials(self, fiducials: Fiducials, sized: bool, name: str) -> None:
@@ -331,13 +317,7 @@ class CameraEntry(Entry, ABC):
         return self
 
     def moved(self, change: Mapping[str, float], name: str) -> Self:
-        """It, called `name`, with what its `sigma` lists changed.
-
-        Raises
-        ------
-        InputError
-            One of the names is none of its.
-        """
+        """It, called `name`, with what its `sigma` lists changed."""
         lens: dict[str, float] = {}
         entries: dict[str, object] = {}
         for key, d in change.items():

@@ -37,13 +37,7 @@ def is_opencv(path: Path) -> bool:
 
 
 def read(path: Path) -> dict[str, CameraEntry]:
-    """The camera of a calibration file; it has the name that the file states, or the file's own.
-
-    Raises
-    ------
-    InputError
-        The file is not of this kind, or a coefficient is not supported.
-    """
+    """The camera of a calibration file; it has the name that the file states, or the file's own."""
     contents = _contents(path)
     if not isinstance(contents, dict):
         raise InputError(f"{path}: no calibration of OpenCV; needed are camera_matrix and distortion_coefficients")

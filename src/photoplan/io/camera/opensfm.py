@@ -29,13 +29,7 @@ _COEFFICIENTS = {
 
 
 def read(path: Path) -> dict[str, CameraEntry]:
-    """Cameras of a JSON file by name; sizes are those that the file states.
-
-    Raises
-    ------
-    InputError
-        The file is no such JSON, or a camera's model is not supported.
-    """
+    """Cameras of a JSON file by name; sizes are those that the file states."""
     contents = read_json(path)
     if isinstance(contents, dict) and contents and all(_is_camera(c) for c in contents.values()):
         return cameras_of([{"cameras": contents}], path)
@@ -102,13 +96,7 @@ def _number(values: dict[str, Any], key: str, where: str, default: float = 0.0) 
 
 
 def resized(camera: CameraEntry, size: tuple[int, int], where: str) -> CameraEntry:
-    """The camera for images of another resolution, as normalised coordinates define it.
-
-    Raises
-    ------
-    InputError
-        The aspect ratio differs by more than rounding to whole pixels allows: the images are another crop.
-    """
+    """The camera for images of another resolution, as normalised coordinates define it."""
     if size == camera.size or camera.pixels is None:
         return camera
     given = camera.pixels

@@ -34,13 +34,7 @@ def camera_files(stem: Path) -> tuple[Path, Path]:
 
 
 def read(path: Path) -> dict[str, CameraEntry]:
-    """Cameras of a ``.cam`` file: ``camera 0``, ``camera 1`` … as the file numbers them.
-
-    Raises
-    ------
-    InputError
-        The file is not Pix4D's own, is incomplete, or the size of the images is not known.
-    """
+    """Cameras of a ``.cam`` file: ``camera 0``, ``camera 1`` … as the file numbers them."""
     text = read_text(path, MAX_BYTES)
     if not re.search(r"^\s*F\s", text, re.M):
         raise InputError(

@@ -23,20 +23,7 @@ TOLERANCE_UM = 3.0
 def distance_differences(
     fiducials_mm: Mapping[str, tuple[float, float]], distances_mm: Mapping[str, float], where: str
 ) -> dict[str, float]:
-    """Distance from the coordinates minus the printed one, micrometres, by pair.
-
-    Parameters
-    ----------
-    fiducials_mm : dict
-        Coordinates of the marks.
-    distances_mm : dict
-        Printed distances; a key is the names of two marks with a hyphen between.
-
-    Raises
-    ------
-    InputError
-        A pair does not name two of the marks, or a distance is no positive number.
-    """
+    """Distance from the coordinates minus the printed one, micrometres, by pair."""
     found = {}
     for pair, printed in distances_mm.items():
         distance = finite(printed, f"{where}: distance {pair}")
@@ -52,13 +39,7 @@ def distance_differences(
 
 
 def check_report(contents: Mapping[str, Any], cameras: Mapping[str, CameraEntry], where: str) -> None:
-    """Compare the ``[report]`` of a TOML file, if it has one, with the camera that it is about.
-
-    Raises
-    ------
-    InputError
-        The table is not of this form, or coordinates and distances differ by more than `TOLERANCE_UM`.
-    """
+    """Compare the ``[report]`` of a TOML file, if it has one, with the camera that it is about."""
     report = contents.get("report")
     if report is None:
         return

@@ -35,13 +35,7 @@ _UNSUPPORTED = ("s1", "s2", "s3", "s4", "tx", "ty")
 
 
 def read(path: Path) -> dict[str, CameraEntry]:
-    """Cameras of a YAML file by name.
-
-    Raises
-    ------
-    InputError
-        The file is no such YAML, or a camera is incomplete or of an unknown type.
-    """
+    """Cameras of a YAML file by name."""
     contents = read_yaml(path)
     if not isinstance(contents, dict):
         raise InputError(f"{path}: no cameras; needed is `name:` with `type`, `im_size` and `focal_len` below it")

@@ -30,11 +30,6 @@ def read(path: Path, layer: str | None) -> ObjectFile:
 
     Where surfaces have a meaning, ground and closure surfaces are left out. A file may be a sequence (CityJSONSeq): the
     first line states what all have in common, each other one is a feature with vertices of its own.
-
-    Raises
-    ------
-    InputError
-        The file is damaged, of another version, or holds no such objects with faces; the object is named.
     """
     data, *features = read_json_lines(path, _MOST_BYTES)
     version = str(data.get("version", "")) if isinstance(data, dict) else ""

@@ -13,20 +13,7 @@ from photoplan.io.plain_files import read_head
 
 
 def read_objects(path: Path, layer: str | None = None) -> ObjectFile:
-    """Faces of the objects of a file, which its content names, not its suffix; some may have faults.
-
-    Parameters
-    ----------
-    path : Path
-        CityJSON; GeoPackage, GeoJSON, Shapefile or DXF with polygons in space; OBJ or PLY.
-    layer : str, optional
-        Which part: a type of CityJSON's objects, a layer of a vector file or drawing.
-
-    Raises
-    ------
-    InputError
-        It cannot be used.
-    """
+    """Faces of the objects of a file, which its content names, not its suffix; some may have faults."""
     path = check_plain_file(path, "object file")
     head = read_head(path).lstrip("\x1e \t\n")
     if head.startswith("ply"):

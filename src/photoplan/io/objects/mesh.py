@@ -34,13 +34,7 @@ _HEADER = 1 << 16
 
 
 def read_obj(path: Path) -> ObjectFile:
-    """Faces of an OBJ file; those of more than three corners are cut into triangles from their first.
-
-    Raises
-    ------
-    InputError
-        A line cannot be read, or a face names a vertex that is not there.
-    """
+    """Faces of an OBJ file; those of more than three corners are cut into triangles from their first."""
     _size(path)
     vertices, faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)]
     count = first = 0
@@ -60,13 +54,7 @@ def read_obj(path: Path) -> ObjectFile:
 
 
 def _obj_lines(lines: list[bytes], before: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices and triangles of some lines, with so many vertices before them.
-
-    Raises
-    ------
-    ValueError
-        One of them is no vertex and no face.
-    """
+    """Vertices and triangles of some lines, with so many vertices before them."""
     of_v, of_f = (
         np.fromiter((line.startswith(words) for line in lines), bool, len(lines)) for words in (_VERTEX, _FACE)
     )
@@ -95,13 +83,7 @@ def _name_line(path: Path, lines: list[bytes], first: int, before: int) -> None:
 
 
 def read_ply(path: Path) -> ObjectFile:
-    """Faces of a PLY file, as `read_obj`.
-
-    Raises
-    ------
-    InputError
-        The header promises more than the file holds, or a face names a vertex that is not there.
-    """
+    """Faces of a PLY file, as `read_obj`."""
     size = _size(path)
     with path.open("rb") as file:
         head = file.read(_HEADER)
@@ -246,13 +228,7 @@ def _before_list(properties: list[_Property]) -> int:
 
 
 def _numbers(lines: list[bytes], idle: bytes = b"") -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """All numbers of some lines, one after the other, and how many each line has; what fits `idle` is left out.
-
-    Raises
-    ------
-    ValueError
-        A word is no number.
-    """
+    """All numbers of some lines, one after the other, and how many each line has; what fits `idle` is left out."""
     text = b"\n".join(line.rstrip() for line in lines)
     text = re.sub(idle, b"", text) if idle else text
     if not text:

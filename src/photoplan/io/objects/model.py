@@ -44,26 +44,7 @@ def from_polygons(
     roles: list[str | None] | None = None,
     unit: float | None = None,
 ) -> ObjectFile:
-    """Objects of polygons.
-
-    Parameters
-    ----------
-    polygons : list of `Rings`
-    objects : list of int
-        Place of the object of each polygon in `names`.
-    names : list of str
-    crs : str, optional
-        As stated, with its height system if it has one.
-    roles : list, optional
-        Of each object.
-    unit : float, optional
-        Metres in the unit of a drawing.
-
-    Raises
-    ------
-    InputError
-        There is no polygon with an inside.
-    """
+    """Objects of polygons."""
     corners, polygon, faults = filled(polygons, [names[k] for k in objects])
     if not len(corners) and not faults:
         raise InputError(f"{where}: holds no face of an object; give a file or a layer that does")

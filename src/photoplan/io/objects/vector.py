@@ -23,12 +23,6 @@ def read(path: Path, layer: str | None) -> ObjectFile:
 
     Closed lines of drawings are polygons. An attribute ``role`` says ``paint`` or ``occluder``, ``name`` what a feature
     is called.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, has several layers and none is stated, or its features are no polygons with heights;
-        they are named.
     """
     drawing = is_drawing(path)
     name, found = read_chosen(path, layer)

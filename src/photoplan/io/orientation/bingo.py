@@ -22,13 +22,7 @@ NAME = 15
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Block of a file; `form` only where it declares other conventions.
-
-    Raises
-    ------
-    InputError
-        There is no line with orientations, or one cannot be read; the message names it.
-    """
+    """Block of a file; `form` only where it declares other conventions."""
     rows = [
         (line, line.words[1] if len(line.words) > 1 else "", line.words[2:8])
         for line in word_lines(path)

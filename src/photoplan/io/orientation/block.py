@@ -23,13 +23,7 @@ LossKind = Literal["lens", "camera", "film", "crs", "height_system", "other"]
 
 
 def without_unusable(table: OrientationTable, faults: Mapping[str, UnusableCamera]) -> OrientationTable:
-    """The table without images of cameras that cannot be used, with a note; `faults` is by the camera's name.
-
-    Raises
-    ------
-    InputError
-        No image is left.
-    """
+    """The table without images of cameras that cannot be used, with a note; `faults` is by the camera's name."""
     lost = [image for image in table.images if image.camera in faults]
     if not lost:
         return table
@@ -84,13 +78,7 @@ class OrientationBlock:
             self.camera_name(image)
 
     def camera_name(self, image: OrientedImage) -> str:
-        """Name of an image's camera.
-
-        Raises
-        ------
-        InputError
-            The image names a camera that is not described, or none where there are several.
-        """
+        """Name of an image's camera."""
         known = ", ".join(map(repr, self.cameras)) or "none"
         if image.camera is None:
             if len(self.cameras) == 1:
@@ -150,13 +138,7 @@ class OrientationFormat:
 
 
 def require_map(block: OrientationBlock, path: Path) -> None:
-    """Refuse a block in a local tangential system, for formats that cannot state its origin.
-
-    Raises
-    ------
-    InputError
-        Positions and rotations refer to such a system.
-    """
+    """Refuse a block in a local tangential system, for formats that cannot state its origin."""
     if block.table.origin is not None:
         raise InputError(
             f"{path}: the orientations of {block.table.file} are in a local system that this format cannot state; "
@@ -165,13 +147,7 @@ def require_map(block: OrientationBlock, path: Path) -> None:
 
 
 def require_cameras(block: OrientationBlock, path: Path, what: str) -> None:
-    """Refuse a block without cameras, for formats that describe them; `what` names the file in the message.
-
-    Raises
-    ------
-    InputError
-        There are none.
-    """
+    """Refuse a block without cameras, for formats that describe them; `what` names the file in the message."""
     if not block.cameras:
         raise InputError(f"{path}: {what} describes the cameras, and none is given; name the file that does")
 
@@ -183,15 +159,7 @@ def without_lenses(block: OrientationBlock) -> OrientationBlock:
 
 
 def common_losses(block: OrientationBlock, *, cameras: bool, crs: bool = False, film: bool = True) -> list[Loss]:
-    """Losses of a format that holds what is True, and no lens nor height system.
-
-    Parameters
-    ----------
-    cameras, crs : bool
-        Whether the format holds cameras, a coordinate system.
-    film : bool
-        Whether a format with cameras can hold scanned film (marks and their measurement in each image).
-    """
+    """Losses of a format that holds what is True, and no lens nor height system."""
     lost: list[Loss] = []
     if block.cameras and not cameras:
         names = ", ".join(map(repr, block.cameras))

@@ -21,13 +21,7 @@ NAME = 20
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Block of a file; `form` only where it declares other conventions.
-
-    Raises
-    ------
-    InputError
-        The unit of angles is not declared, or a line does not hold a name and six numbers; the message names it.
-    """
+    """Block of a file; `form` only where it declares other conventions."""
     rows = []
     lines = word_lines(path)
     if not form.declares_angle_unit:

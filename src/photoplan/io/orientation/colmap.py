@@ -103,18 +103,7 @@ class _Model:
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Oriented images and cameras of a model; `form` is not used.
-
-    Parameters
-    ----------
-    path : Path
-        The folder, or one of its files. A file decides between text and binary if the folder has both.
-
-    Raises
-    ------
-    InputError
-        A file is missing or damaged, or rigs and frames contradict the images; the message names the file.
-    """
+    """Oriented images and cameras of a model; `form` is not used."""
     folder = path if path.is_dir() else path.parent
     forms = [s for s in ("txt", "bin") if all((folder / f"{n}.{s}").is_file() for n in ("cameras", "images"))]
     if not forms:
@@ -200,11 +189,6 @@ def read_cameras(path: Path, faults: dict[str, UnusableCamera] | None = None) ->
     """Cameras of a ``cameras.txt`` or ``cameras.bin`` by their number, as text.
 
     Those that have no form here are entered into `faults`; None: they are errors.
-
-    Raises
-    ------
-    InputError
-        A line is not of the format, or the model is not supported.
     """
     if path.suffix.lower() == ".bin":
         return _Binary(path).cameras(faults)

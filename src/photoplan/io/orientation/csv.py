@@ -51,13 +51,7 @@ _COLUMNS = Columns(
 
 
 def read(path: Path, form: TableFormat) -> OrientationTable:
-    """Orientation table of a text file.
-
-    Raises
-    ------
-    InputError
-        A line cannot be read as declared; the message names the line and the column.
-    """
+    """Orientation table of a text file."""
     dialect = Dialect(form.columns, form.delimiter, form.decimal_comma)
     table = read_table(path, _COLUMNS, dialect, MAX_BYTES)
     declared = form.columns is not None and "=" not in form.columns and table.layout.header

@@ -41,13 +41,7 @@ def rotation_from_gimbal(yaw_pitch_roll: ArrayLike) -> NDArray[np.float64]:
 
 
 def image_files(path: Path) -> list[Path]:
-    """JPEG and TIFF images of a folder by name, or the one file.
-
-    Raises
-    ------
-    InputError
-        The folder has none.
-    """
+    """JPEG and TIFF images of a folder by name, or the one file."""
     if not path.is_dir():
         return [path]
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
@@ -69,13 +63,7 @@ class Folder:
 
 
 def read_folder(path: Path) -> Folder:
-    """Metadata of the images of a folder, or of one image.
-
-    Raises
-    ------
-    InputError
-        No image states a position, or a single image cannot be read.
-    """
+    """Metadata of the images of a folder, or of one image."""
     files, found, unread = image_files(path), [], []
     for file in files:
         try:
@@ -126,13 +114,7 @@ def without_fix(names: Sequence[str]) -> str:
 
 
 def map_positions(images: Sequence[ImageMetadata], crs: str) -> NDArray[np.float64]:
-    """Positions in a projected CRS, shape (n, 3): map coordinates, and the height as the images state it.
-
-    Raises
-    ------
-    InputError
-        No exact transformation from WGS 84 is available, or a position has no place in the CRS.
-    """
+    """Positions in a projected CRS, shape (n, 3): map coordinates, and the height as the images state it."""
     places = np.array([m.position for m in images], float).reshape(-1, 3)
     step = crs_step("EPSG:4326", crs)
     step = step.near(places[0, [1, 0]]) if len(places) else step
@@ -140,13 +122,7 @@ def map_positions(images: Sequence[ImageMetadata], crs: str) -> NDArray[np.float
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Approximate orientations of a folder of drone images, or of one; `form` is not used.
-
-    Raises
-    ------
-    InputError
-        No image states position and attitude, or a file is damaged.
-    """
+    """Approximate orientations of a folder of drone images, or of one; `form` is not used."""
     folder = read_folder(path)
     stated = folder.placed
     oriented = [m for m in stated if m.yaw_pitch_roll is not None and m.position is not None]

@@ -37,13 +37,7 @@ _BY_SUFFIX = {".toml": "toml", ".json": "opensfm"}
 
 
 def orientation_format(name: str) -> OrientationFormat:
-    """The format of a name.
-
-    Raises
-    ------
-    UsageError
-        There is none.
-    """
+    """The format of a name."""
     if name not in FORMATS:
         raise UsageError(f"orientation format {name!r}; allowed are {', '.join(FORMATS)}")
     found: OrientationFormat = import_module(FORMATS[name]).FORMAT
@@ -51,13 +45,7 @@ def orientation_format(name: str) -> OrientationFormat:
 
 
 def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
-    """The one format that a file is of, by its content.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, or it may be of several formats.
-    """
+    """The one format that a file is of, by its content."""
     if form.columns is not None:
         # Only a table has columns to be declared.
         return orientation_format("csv")
@@ -74,24 +62,7 @@ def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
 def read_orientation_block(
     path: str | Path, form: TableFormat | None = None, format: str | None = None
 ) -> OrientationBlock:
-    """Oriented images of a file, with cameras where it holds them; coordinates are brought into metres.
-
-    Parameters
-    ----------
-    path : str or Path
-        A file, or the folder of a format that has several files.
-    form : TableFormat, optional
-        What a table of text does not say of itself: columns, angle unit, rotation.
-    format : str, optional
-        One of `FORMATS`; None: by the content.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used, or it may be of several formats.
-    UsageError
-        The format is unknown.
-    """
+    """Oriented images of a file, with cameras where it holds them; coordinates are brought into metres."""
     path, form = Path(path), form or TableFormat()
     chosen = choose_format(path, form) if format is None else orientation_format(format)
     block = chosen.read(path, form)
@@ -104,29 +75,7 @@ def read_orientation(path: str | Path, form: TableFormat | None = None, format: 
 
 
 def write_orientation(block: OrientationBlock, path: str | Path, format: str, *, overwrite: bool = False) -> list[Path]:
-    """Write a block in a format; each file appears complete or not at all.
-
-    Parameters
-    ----------
-    path : path
-        File, or folder of a format with several files.
-    format : str
-        One of `FORMATS`.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    UsageError
-        The format is not written, or a file exists; nothing is written then.
-    InputError
-        Something is not known that the format needs.
-    ResourceError
-        The disk is full.
-    """
+    """Write a block in a format; each file appears complete or not at all."""
     render = orientation_format(format).render
     if render is None:
         raise UsageError(f"orientation format {format} is read only; written are {', '.join(written_formats())}")

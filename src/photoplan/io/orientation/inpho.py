@@ -132,14 +132,7 @@ def _entries(text: str) -> list[_Entry]:
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Block of a file.
-
-    Raises
-    ------
-    InputError
-        There is no oriented image, an entry cannot be read (the message names its line), or the rotation matrices are
-        neither way those of the angles in `$INS`.
-    """
+    """Block of a file."""
     file = _parse(path)
     photos = [p for p in file.photos if "$EXT_ORI" in p]
     if not photos:

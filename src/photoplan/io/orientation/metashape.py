@@ -64,13 +64,7 @@ class _Similarity:
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Oriented images and cameras of a ``cameras.xml``; `form` is not used.
-
-    Raises
-    ------
-    InputError
-        The file is no such XML or is damaged; the message names sensor or camera.
-    """
+    """Oriented images and cameras of a ``cameras.xml``; `form` is not used."""
     chunk = _chunk(path)
     sensors = {s.get("id", ""): s for s in chunk.findall("./sensors/sensor")}
     shared, by_component = _component_transforms(chunk, path)
@@ -144,13 +138,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
 
 
 def read_cameras(path: Path) -> dict[str, CameraEntry]:
-    """The cameras alone: sensors with a calibration, by label.
-
-    Raises
-    ------
-    InputError
-        See `read`.
-    """
+    """The cameras alone: sensors with a calibration, by label."""
     chunk = _chunk(path)
     found = {s.get("id", ""): s for s in chunk.findall("./sensors/sensor") if s.find("calibration") is not None}
     return dict(_named(chunk, {key: _sensor(s, key, path) for key, s in found.items()}).values())

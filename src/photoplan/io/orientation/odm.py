@@ -34,13 +34,7 @@ _AGREE = 0.05
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Oriented images of a ``shots.geojson``, with the cameras of ``cameras.json``; `form` is not used.
-
-    Raises
-    ------
-    InputError
-        The file is no such GeoJSON; the message names the image.
-    """
+    """Oriented images of a ``shots.geojson``, with the cameras of ``cameras.json``; `form` is not used."""
     contents = read_json(path)
     features = contents.get("features") if isinstance(contents, dict) else None
     if not isinstance(features, list) or not features:

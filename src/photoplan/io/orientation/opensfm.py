@@ -85,13 +85,7 @@ class Shots:
 
 
 def world_of(path: Path, origin: tuple[float, float, float], shots: Shots) -> World:
-    """The world of the poses, as positions of receivers, files beside it and the reference tell.
-
-    Raises
-    ------
-    InputError
-        The poses are neither east, north, up nor UTM minus the offset, or nothing tells which of the two.
-    """
+    """The world of the poses, as positions of receivers, files beside it and the reference tell."""
     local = World(None, np.zeros(3), f"{path.name}: poses are east, north, up about reference_lla")
     utm = _utm_offset(origin)
     if utm is None:
@@ -261,13 +255,7 @@ def _tangential(
 
 
 def normalised_camera(name: str, camera: CameraEntry, path: Path) -> dict[str, Any]:
-    """Entry of a camera in ``cameras``.
-
-    Raises
-    ------
-    InputError
-        It has no form there.
-    """
+    """Entry of a camera in ``cameras``."""
     form = opencv_form(camera)
     if form is None or form.rational:
         raise InputError(f"{path}: camera {name!r} has no form in OpenSfM; write without its lens, or another format")
@@ -286,12 +274,6 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     """Oriented images of a ``reconstruction.json``, in its local system or UTM zone; `form` is not used.
 
     With the cameras of the file, where it describes them.
-
-    Raises
-    ------
-    InputError
-        The file is no such JSON, it is not georeferenced, its poses are in no known world, or a camera's model is not
-        supported.
     """
     contents = _reconstructions(path)
     origins = {_origin(r, path) for r in contents}

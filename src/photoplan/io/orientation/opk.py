@@ -35,13 +35,7 @@ _TOLERANCE = 1e-5
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Oriented images of an OPK text; `form` is not used: the format states angle unit and order.
-
-    Raises
-    ------
-    InputError
-        A line is not of the format, or its matrix is not that of its angles; the message names the line.
-    """
+    """Oriented images of an OPK text; `form` is not used: the format states angle unit and order."""
     images: list[OrientedImage] = []
     crs: str | None = None
     notes: list[str] = []

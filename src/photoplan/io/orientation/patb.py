@@ -31,13 +31,7 @@ NAME = 15
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Block of a file.
-
-    Raises
-    ------
-    InputError
-        The user did not declare what the matrix does, or a record cannot be read; the message names its line.
-    """
+    """Block of a file."""
     lines = word_lines(path)
     if not lines:
         raise InputError(f"{path}: holds no image")

@@ -35,13 +35,7 @@ _NAMES = ("_calibrated_external_camera_parameters.txt", "_calibrated_camera_para
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Oriented images, with cameras and CRS where files of the project state them; `form` is not used.
-
-    Raises
-    ------
-    InputError
-        The file is neither of the two, or a line is not of the format; the message names it.
-    """
+    """Oriented images, with cameras and CRS where files of the project state them; `form` is not used."""
     lines = read_text(path, MAX_BYTES).split("\n")
     if _FULL.match(lines[0]):
         return _read_full(lines, path)

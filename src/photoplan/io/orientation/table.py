@@ -132,13 +132,7 @@ class OrientationTable:
     and Z is as in the file."""
 
     def in_metres(self) -> OrientationTable:
-        """The table with X and Y in metres, and Z too if the file states its height system.
-
-        Raises
-        ------
-        InputError
-            The CRS or the height system is not known.
-        """
+        """The table with X and Y in metres, and Z too if the file states its height system."""
         if self.crs is None:
             return self
         system = metric_system(self.crs, f"{self.file}: CRS")
@@ -163,13 +157,7 @@ class OrientationTable:
         )
 
     def heights_in_metres(self, declared: str | None) -> OrientationTable:
-        """The table with Z in metres, by the unit that the file states, else by that of a declared height system.
-
-        Raises
-        ------
-        InputError
-            The unit of Z is not stated, or the file and the declaration contradict each other.
-        """
+        """The table with Z in metres, by the unit that the file states, else by that of a declared height system."""
         where = f"{self.file}: heights"
         word = (declared or "same").strip().casefold()
         system = None

@@ -38,44 +38,22 @@ def word_lines(path: Path) -> list[Words]:
 
 
 def numbers(words: Sequence[str], where: str, what: str, count: int) -> tuple[float, ...]:
-    """`count` numbers.
-
-    Parameters
-    ----------
-    words : sequence of str
-    where, what : str
-        File and line, and what the numbers are, for messages.
-
-    Raises
-    ------
-    InputError
-        There are more or fewer, or one is none.
-    """
+    """`count` numbers."""
     if len(words) != count:
         raise InputError(f"{where}: {what}: {len(words)} values; {count} numbers are needed")
     return tuple(number(word, f"{where}: {what}") for word in words)
 
 
 def one_word(name: str, path: Path) -> str:
-    """A name as a format without quotes can hold it.
-
-    Raises
-    ------
-    InputError
-        It holds white space.
-    """
+    """A name as a format without quotes can hold it."""
     if not name or name.split() != [name]:
         raise InputError(f"{path}: image {name!r} has a blank in its name, which this format cannot hold; rename it")
     return name
 
 
 def checked_rotation(values: ArrayLike, where: str, tolerance: float = ORTHOGONAL) -> NDArray[np.float64]:
-    """The rotation (3, 3) nearest to nine rounded numbers, row by row; `tolerance` is that of the matrix times itself.
-
-    Raises
-    ------
-    InputError
-        They are no rotation.
+    """The rotation (3, 3) nearest to nine rounded numbers, row by row; `tolerance` is that of the matrix
+    times itself.
     """
     M = np.array(values, float).reshape(3, 3)
     if not np.allclose(M @ M.T, np.eye(3), rtol=0, atol=tolerance) or np.linalg.det(M) < 0:
@@ -87,20 +65,7 @@ def checked_rotation(values: ArrayLike, where: str, tolerance: float = ORTHOGONA
 
 
 def angle_block(path: Path, form: TableFormat, rows: Sequence[tuple[Words, str, Sequence[str]]]) -> OrientationBlock:
-    """Block of lines as `angle_lines` writes them: a name, X, Y, Z and φ, ω, κ in this order.
-
-    Parameters
-    ----------
-    form : TableFormat
-        What the user declares against the format's own conventions.
-    rows : sequence of (Words, str, sequence of str)
-        Line, name and six numbers as text.
-
-    Raises
-    ------
-    InputError
-        A number is missing or is none, or an angle is more than a full circle.
-    """
+    """Block of lines as `angle_lines` writes them: a name, X, Y, Z and φ, ω, κ in this order."""
     unit, rotation, direction = form.conventions("gon", "pok", "camera-to-ground")
     images = []
     for line, name, words in rows:
@@ -117,18 +82,7 @@ def angle_block(path: Path, form: TableFormat, rows: Sequence[tuple[Words, str, 
 
 
 def angle_lines(block: OrientationBlock, path: Path, width: int) -> list[str]:
-    """A line for each image: name, X, Y, Z in metres, and φ, ω, κ in gon, φ the primary rotation.
-
-    Parameters
-    ----------
-    width : int
-        Characters that names are filled up to.
-
-    Raises
-    ------
-    InputError
-        A name holds white space.
-    """
+    """A line for each image: name, X, Y, Z in metres, and φ, ω, κ in gon, φ the primary rotation."""
     lines = []
     for image, (phi, omega, kappa) in zip(block.table.images, block.angles("pok", "gon")):
         X, Y, Z = image.center

@@ -47,12 +47,8 @@ class _File(BaseModel):
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
-    """Oriented images of a TOML file with their cameras; it states its own angle unit and rotation: `form` is not used.
-
-    Raises
-    ------
-    InputError
-        An entry is wrong; the message names its line.
+    """Oriented images of a TOML file with their cameras; it states its own angle unit and rotation: `form`
+    is not used.
     """
     contents, text = read_toml(path)
     try:

@@ -11,13 +11,7 @@ from photoplan.io.project.posed import Image
 
 
 def image_size(camera: CameraEntry, image: Image) -> tuple[int, int]:
-    """Width and height of an image as the project states it.
-
-    Raises
-    ------
-    InputError
-        Neither image nor camera states it.
-    """
+    """Width and height of an image as the project states it."""
     size = image.size or camera.size
     if size is None:
         raise InputError(f"image {image.name!r}: its size is stated neither with the image nor with its camera")
@@ -25,15 +19,7 @@ def image_size(camera: CameraEntry, image: Image) -> tuple[int, int]:
 
 
 def fiducial_fit(camera: CameraEntry, image: Image, model: str | None = None) -> FiducialFit:
-    """Adjustment of an image's fiducial marks; see `photoplan.io.camera.model.FiducialSystem.fit`.
-
-    Raises
-    ------
-    InputError
-        As there, or the camera has no marks; the image is named.
-    GeometryError
-        The marks lie on a line.
-    """
+    """Adjustment of an image's fiducial marks; see `photoplan.io.camera.model.FiducialSystem.fit`."""
     system = camera.fiducial_system
     if system is None:
         raise InputError(f"image {image.name!r}: its camera has no fiducial marks")
@@ -44,22 +30,7 @@ def fiducial_fit(camera: CameraEntry, image: Image, model: str | None = None) ->
 
 
 def interior_of(camera: CameraEntry, image: Image, size: tuple[int, int] | None = None) -> Interior:
-    """Interior orientation of an image.
-
-    Parameters
-    ----------
-    camera : CameraEntry
-        Description of its camera.
-    image : Image
-        The image; only film needs its fiducial marks.
-    size : (int, int), optional
-        Width and height of the file in pixels; as stated if it is None.
-
-    Raises
-    ------
-    InputError
-        See `fiducial_fit`.
-    """
+    """Interior orientation of an image."""
     size = size or image_size(camera, image)
     try:
         return camera.interior_orientation(size, image.fiducials)

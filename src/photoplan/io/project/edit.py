@@ -40,18 +40,6 @@ def edit_project(path: Path, changes: ProjectChanges) -> Project:
     What is kept there already stays: the next one is ``NAME.previous-2.toml`` and so on.
 
     The changed file is checked before it replaces the old one, and appears complete or not at all.
-
-    Returns
-    -------
-    Project
-        The changed project.
-
-    Raises
-    ------
-    InputError
-        The file is no project, an image or camera is not in it, or a changed entry is not allowed.
-    ResourceError, UsageError
-        The disk is full, or the folder cannot be written to.
     """
     text = read_text(path, MAX_BYTES)
     before = path.read_bytes()

@@ -16,19 +16,7 @@ SHOWN = 8
 def explain(
     error: ValidationError, data: dict[str, Any], source: str, text: str = "", below: Sequence[int | str] = ()
 ) -> str:
-    """Message for a user: every error with the path of its entry, the line, what was given and what is allowed.
-
-    Parameters
-    ----------
-    data : dict
-        The plain values that were checked.
-    source : str
-        File or place, for the beginning of each line.
-    text : str
-        TOML text in which lines are looked up.
-    below : sequence
-        Path of `data` in the text, where it is only a part of it.
-    """
+    """Message for a user: every error with the path of its entry, the line, what was given and what is allowed."""
     lines: list[str] = []
     for item in error.errors(include_url=False):
         location = [*below, *_in_data(item["loc"], data, item["type"])]

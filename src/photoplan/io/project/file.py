@@ -59,13 +59,7 @@ def _with_sizes(data: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def parse_project(data: dict[str, Any], folder: Path, source: str, text: str = "") -> Project:
-    """Project of the plain contents of a project file; `source` and `text` are for messages.
-
-    Raises
-    ------
-    InputError
-        An entry is wrong.
-    """
+    """Project of the plain contents of a project file; `source` and `text` are for messages."""
     received(folder)
     if "folder" in data:
         raise InputError(f"{source}: unknown entry 'folder'")
@@ -91,11 +85,6 @@ def write_project(path: str | Path, project: Project) -> None:
     """Write a project file with a comment for every entry; `load_project` gives an equal project again.
 
     The file appears complete or not at all.
-
-    Raises
-    ------
-    ResourceError, UsageError
-        The disk is full, or the folder cannot be written to.
     """
     write_atomically(Path(path), project_text(project).encode())
 

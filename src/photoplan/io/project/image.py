@@ -65,20 +65,7 @@ class ImageEntry(Entry, ABC):
         return ()
 
     def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
-        """Independent errors of its geometry, each one standard deviation large.
-
-        Parameters
-        ----------
-        cameras : mapping
-            The project's descriptions of cameras: errors of its own are errors of its geometry too.
-        rotation : str
-            Sequence of angles, by their letters.
-
-        Raises
-        ------
-        InputError
-            Nothing is known of them.
-        """
+        """Independent errors of its geometry, each one standard deviation large."""
         raise InputError(f"image {self.name!r}: its kind of geometry states no accuracy that a raster could be made of")
 
     def moved(

@@ -284,13 +284,7 @@ class Project(Entry):
 
     @property
     def ground(self) -> StatedTerrain:
-        """The [terrain] entry.
-
-        Raises
-        ------
-        InputError
-            The project has none: it was made to determine orientations.
-        """
+        """The [terrain] entry."""
         if self.terrain is None:
             raise InputError("the project states no [terrain]; give file or height there")
         return self.terrain
@@ -304,13 +298,7 @@ class Project(Entry):
         return resolve_input(self.folder, file)
 
     def select(self, patterns: Sequence[str] | None = None) -> list[str]:
-        """Names of the images that match one of `patterns` (``*`` and ``?`` allowed), in the project's order.
-
-        Raises
-        ------
-        UsageError
-            A pattern matches no image.
-        """
+        """Names of the images that match one of `patterns` (``*`` and ``?`` allowed), in the project's order."""
         names = [image.name for image in self.images]
         if patterns is None:
             return names
@@ -335,11 +323,6 @@ class Project(Entry):
         """The oriented ones of some images, and a line for each of the others; `approximate` ones count if asked for.
 
         Images that `leaving_out` names are listed among the others.
-
-        Raises
-        ------
-        InputError
-            None of them is oriented.
         """
         reasons = {name: self.any_image(name).unoriented for name in names}
         if approximate:
@@ -380,13 +363,7 @@ class Project(Entry):
         return self.model_copy(update={"images": images, "cameras": cameras})
 
     def image(self, name: str) -> Image:
-        """The image of this name, which has a camera and a pose.
-
-        Raises
-        ------
-        InputError
-            There is none, or its geometry is of another kind.
-        """
+        """The image of this name, which has a camera and a pose."""
         image = self.any_image(name)
         if not isinstance(image, Image):
             raise InputError(
@@ -395,13 +372,7 @@ class Project(Entry):
         return image
 
     def any_image(self, name: str) -> AnyImage:
-        """The image of this name, whatever its geometry.
-
-        Raises
-        ------
-        InputError
-            There is none.
-        """
+        """The image of this name, whatever its geometry."""
         for image in self.images:
             if image.name == name:
                 return image

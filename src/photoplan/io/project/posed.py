@@ -156,13 +156,7 @@ class Image(ImageEntry):
 
     @property
     def pose_numbers(self) -> tuple[Triple, Triple]:
-        """Projection centre and angles as stated.
-
-        Raises
-        ------
-        InputError
-            The image is not oriented.
-        """
+        """Projection centre and angles as stated."""
         if self.center is None or self.angles is None:
             raise InputError(f"image {self.name!r} {self.unoriented}")
         return self.center, self.angles

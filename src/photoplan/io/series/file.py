@@ -91,13 +91,7 @@ class Series:
 
 
 def read_series(path: Path) -> Series:
-    """Read a series file and find the frames that it names; pixels are not read, headers are.
-
-    Raises
-    ------
-    InputError
-        An entry is wrong, names no file, or its images differ in size or type; the message names the entry.
-    """
+    """Read a series file and find the frames that it names; pixels are not read, headers are."""
     entries = read_entries(path, SeriesEntry, _MAX_BYTES)
     folder = path.absolute().parent
     frames: list[SeriesFrame] = []

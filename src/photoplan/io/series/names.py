@@ -41,13 +41,7 @@ _DIGITS = {"%Y": "[0-9]{4}", "%j": "[0-9]{3}"} | {f"%{c}": "[0-9]{2}" for c in "
 
 
 def condition(name: str, text: str, where: str) -> tuple[str, float | str]:
-    """A named text as a condition in its unit, or as itself where the name is no condition.
-
-    Raises
-    ------
-    InputError
-        A condition is no finite number, or a time neither a number nor a date.
-    """
+    """A named text as a condition in its unit, or as itself where the name is no condition."""
     if name in _TIMES:
         return "time_s", number_of_time(float(text) if NUMBER.fullmatch(text) else text, where)
     if name not in FIELDS:
@@ -63,11 +57,6 @@ def read_records(path: Path) -> tuple[tuple[str, ...], list[tuple[str, dict[str,
     """Header (small letters) of a table, and place and fields by it of each line.
 
     Where the delimiter is no comma, decimal commas are read.
-
-    Raises
-    ------
-    InputError
-        There is no line of data, or a line has another number of fields than the header.
     """
     table = read_table(path, Columns(roles={}, needed=(), every=True), max_bytes=_MAX_BYTES)
     commas = table.layout.delimiter != ","
@@ -81,13 +70,7 @@ def read_records(path: Path) -> tuple[tuple[str, ...], list[tuple[str, dict[str,
 
 
 def read_conditions(path: Path) -> dict[str, Values]:
-    """Conditions of each file by its name, from a table; empty fields state nothing.
-
-    Raises
-    ------
-    InputError
-        There is no column ``file``, a file stands twice, or a condition is no number; the message names the line.
-    """
+    """Conditions of each file by its name, from a table; empty fields state nothing."""
     header, records = read_records(path)
     if "file" not in header:
         raise InputError(f"{path}: columns {', '.join(header)} given; one must be called file")
@@ -114,21 +97,7 @@ def number_of_time(value: float | str, where: str) -> float:
 
 
 def find_files(folder: Path, pattern: str, where: str) -> dict[Path, Values]:
-    """Files that fit a pattern, sorted by name, with the values of its fields.
-
-    Parameters
-    ----------
-    folder : Path
-        From which the pattern starts.
-    pattern : str
-        A path whose last part may hold ``*``, ``?`` and fields: ``{exposure_ms}`` stands for a number,
-        ``{time:%Y%m%d-%H%M%S}`` for a time in that form, any other ``{name}`` for a text.
-
-    Raises
-    ------
-    InputError
-        The pattern leads outside of plain files, has an unknown field, or a field holds no number.
-    """
+    """Files that fit a pattern, sorted by name, with the values of its fields."""
     check_input_name(re.sub(r"\{[^}]*\}", "0", pattern))
     head, name = os.path.split(pattern.replace("\\", "/"))
     if re.search(r"[*?{}]", head):

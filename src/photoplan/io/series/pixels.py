@@ -41,13 +41,7 @@ class Plane:
 
 
 def series_planes(series: Series) -> tuple[Plane, ...]:
-    """The planes of a series.
-
-    Raises
-    ------
-    InputError
-        A Bayer pattern is stated for images of several bands.
-    """
+    """The planes of a series."""
     pattern = series.camera.bayer
     if pattern is None:
         if series.bands == 1:
@@ -67,13 +61,7 @@ def series_planes(series: Series) -> tuple[Plane, ...]:
 
 
 def frame_pixels(frame: SeriesFrame, window: Window | None = None) -> NDArray[Any]:
-    """Pixels of a frame's window, all bands, shape (bands, h, w), in the type of the file.
-
-    Raises
-    ------
-    InputError
-        The file is damaged, has pixels without a value, or grey values that the stated bits cannot make.
-    """
+    """Pixels of a frame's window, all bands, shape (bands, h, w), in the type of the file."""
     window = frame.group.window if window is None else window
     if window.size > MAX_PIXELS:
         raise InputError(
@@ -109,13 +97,7 @@ def split(pixels: NDArray[Any], plane: Plane, window: Window) -> NDArray[Any]:
 
 
 def plane_mask(group: SeriesGroup, plane: Plane) -> NDArray[np.bool_] | None:
-    """Which pixels of a plane count by the group's mask, shape as `plane_pixels`; None: all of them.
-
-    Raises
-    ------
-    InputError
-        The mask leaves no pixel.
-    """
+    """Which pixels of a plane count by the group's mask, shape as `plane_pixels`; None: all of them."""
     if group.mask is None:
         return None
     pixels, valid = RasterReader(group.mask).read(group.window)

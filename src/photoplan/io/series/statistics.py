@@ -37,13 +37,7 @@ class ReducedPoint:
 
 
 def read_statistics(path: Path, entry: StatisticsEntry) -> list[ReducedPoint]:
-    """Reduced figures of a file.
-
-    Raises
-    ------
-    InputError
-        The file is not of the stated format, or holds no figure.
-    """
+    """Reduced figures of a file."""
     points = _emva(path, entry) if entry.format == "emva1288" else _csv(path, entry)
     if not points:
         raise InputError(f"{path}: holds no reduced figure")
@@ -194,13 +188,7 @@ class MeasuredPositions:
 
 
 def read_positions(path: Path, entry: PositionsEntry) -> MeasuredPositions:
-    """Positions of a table.
-
-    Raises
-    ------
-    InputError
-        A column is missing, or a field is no number; the message names the line.
-    """
+    """Positions of a table."""
     header, records = read_records(path)
     missing = [name for name in _COLUMNS[entry.kind] if name not in header]
     if missing:

@@ -76,13 +76,7 @@ class PointBlock:
 
 
 def points_layout(path: Path, lines: Sequence[str], dialect: Dialect) -> TableLayout | None:
-    """What the columns hold, from the first lines of a file; None: they hold no data.
-
-    Raises
-    ------
-    InputError, UsageError
-        The lines cannot be split into three columns, or the header or the declaration does not name X, Y and Z.
-    """
+    """What the columns hold, from the first lines of a file; None: they hold no data."""
     head = [item for item in enumerate(lines[:1000], 1) if item[1].strip()]
     data = [item for item in head if not item[1].lstrip().startswith("#")]
     if not data:
@@ -117,13 +111,7 @@ def _are_numbers_of_points(rows: Sequence[Sequence[str]]) -> bool:
 def parse_block(
     path: Path, layout: TableLayout, first: int, lines: list[str], look_up: LookUp, decimal_comma: bool
 ) -> PointBlock | None:
-    """Columns of the lines of a block that hold data; None if there are none.
-
-    Raises
-    ------
-    InputError
-        Naming the line that cannot be read.
-    """
+    """Columns of the lines of a block that hold data; None if there are none."""
     keep = [at for at, text in enumerate(lines) if text and not text.isspace() and text.lstrip()[0] != "#"]
     if keep and first + keep[0] == layout.header:
         keep = keep[1:]

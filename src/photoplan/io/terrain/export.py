@@ -42,17 +42,7 @@ class ExportFigures:
 
 @contextmanager
 def replacing(path: Path, inputs: Sequence[Path | str] = (), overwrite: bool = False) -> Iterator[Path]:
-    """A temporary name beside `path` to write to; it takes the name when the context ends well, else it is removed.
-
-    Raises
-    ------
-    UsageError
-        The output exists or is an input, or its folder cannot be written.
-    RunLocked
-        Another run is writing it.
-    ResourceError
-        The disk is full.
-    """
+    """A temporary name beside `path` to write to; it takes the name when the context ends well, else it is removed."""
     check_output(path, inputs, overwrite=overwrite)
     with FileLock(lock_of(path)):
         check_output(path, inputs, overwrite=overwrite)
@@ -77,24 +67,7 @@ def write_tin(
     crs: str | None = None,
     height_system: str | None = None,
 ) -> ExportFigures:
-    """Write the triangulation of a model.
-
-    Parameters
-    ----------
-    part
-        Where to.
-    kind
-        `.obj`, `.ply` (binary, little-endian, double coordinates) or `.xml` (LandXML 1.2; without walls, which a
-        LandXML surface cannot hold).
-    source
-        The units.
-    name
-        Name of the surface in the file.
-    events
-        Told of each unit.
-    crs, height_system
-        Stated in LandXML, the only one of the three that can; None: not.
-    """
+    """Write the triangulation of a model."""
     counts = [0, 0, 0]
 
     def parts() -> Iterator[MeshPart]:
@@ -209,21 +182,7 @@ def _word(name: str) -> str:
 def write_points(
     part: Path, kind: str, source: UnitSource, lines: Sequence[LineElement], events: Events = SILENT
 ) -> ExportFigures:
-    """Write the posts and the vertices of the lines as text.
-
-    Parameters
-    ----------
-    part
-        Where to.
-    kind
-        `.xyz` (X Y Z, no header), or `.csv` with header `x,y,z,sigma,kind,name,code,side`.
-    source
-        The units; a post on the edge of two units is written once.
-    lines
-        Line elements; a two-sided breakline gives its left and then its right heights.
-    events
-        Told of each unit.
-    """
+    """Write the posts and the vertices of the lines as text."""
     posts = points = 0
     with part.open("wb") as file:
         if kind == ".csv":

@@ -41,24 +41,6 @@ def read_measured(paths: Sequence[Path], options: ReadOptions | None = None) -> 
     The files must be in one projected CRS: what they state, or what `options.crs` declares for files that state none.
     Coordinates and heights in feet or another known unit are converted: the result is in metres. The height system is
     what the files state; where one of them states none it is None (nothing is guessed).
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Files; the same file twice is refused.
-    options : ReadOptions, optional
-        What the files do not say of themselves.
-
-    Raises
-    ------
-    UsageError
-        No file, or one file twice; LAS without laspy.
-    InputError
-        A file cannot be read, is in units that are unknown or contradict each other, or states another CRS than the
-        others; the message names file and line, point or feature. A table of codes was given, and none of its codes is
-        in the files.
-    HeightSystemError
-        Two files state different height systems.
     """
     options = options or ReadOptions()
     if not paths:

@@ -63,13 +63,7 @@ class PointColumns:
 
 
 def class_of(code: str, options: ReadOptions, default: str, where: str) -> CodeClass:
-    """Class of a code; `default` where there is no code, or no table to look it up in.
-
-    Raises
-    ------
-    InputError
-        A table of codes was given and does not know the code.
-    """
+    """Class of a code; `default` where there is no code, or no table to look it up in."""
     found = options.codes.find(code)
     if found is not None:
         return found
@@ -83,13 +77,7 @@ def class_of(code: str, options: ReadOptions, default: str, where: str) -> CodeC
 
 
 def check_matched(measured: MeasuredTerrain, options: ReadOptions) -> None:
-    """Refuse a table of codes of which the files hold none: what it says would be lost without a word.
-
-    Raises
-    ------
-    InputError
-        No code of the table (``*`` does not count) is in the files; the message names their columns.
-    """
+    """Refuse a table of codes of which the files hold none: what it says would be lost without a word."""
     named = [code for code in options.codes.classes if code != OTHER]
     if not named or any(code in measured.codes for code in named):
         return

@@ -62,13 +62,7 @@ class KnownRanges:
             return None
 
     def load(self, layout: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Numbers of parts (n,), and the lowest and highest heights of their cells (n, 2, rows, columns).
-
-        Parameters
-        ----------
-        layout : tuple of int
-            What decides the cells; its last two numbers are the rows and columns of a part.
-        """
+        """Numbers of parts (n,), and the lowest and highest heights of their cells (n, 2, rows, columns)."""
         key = hashlib.sha256(f"{self.state} {layout}".encode()).digest()
         record, head = _record(layout), _MAGIC + key
         content = b""

@@ -46,14 +46,7 @@ class _LandXmlSurface:
 
 
 def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
-    """Surfaces of a LandXML file.
-
-    Raises
-    ------
-    InputError
-        The file is damaged, holds entities or a document type, states an unknown unit, or leaves open which surface is
-        meant.
-    """
+    """Surfaces of a LandXML file."""
     if path.stat().st_size > MAX_BYTES:
         raise InputError(f"{path}: more than {MAX_BYTES >> 30} GiB of XML; export the part that is needed")
     reader = _Reader(path, options)

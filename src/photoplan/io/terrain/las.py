@@ -52,15 +52,7 @@ _OLD_VERTICAL = {5101: 5701, 5102: 7968, 5103: 5703, 5104: 5736, 5105: 5705, 510
 
 
 def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
-    """Mass points of a LAS or LAZ file.
-
-    Raises
-    ------
-    UsageError
-        laspy is not installed.
-    InputError
-        The file is damaged, promises more points than it can hold, or holds none of the wanted classes.
-    """
+    """Mass points of a LAS or LAZ file."""
     if importlib.util.find_spec("laspy") is None:
         raise UsageError(f"{path}: LAS and LAZ need laspy; install it with `pip install 'photoplan[points]'`")
     head = _check_header(path)

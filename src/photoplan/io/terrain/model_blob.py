@@ -90,13 +90,7 @@ def unit_of(buffer: NDArray[np.uint8], layout: UnitLayout, column: int, row: int
 
 
 def inflate(packed: bytes, promised: int, where: str) -> NDArray[np.uint8]:
-    """Bytes of a unit or line with every section in its plain order; nothing is expanded beyond what was promised.
-
-    Raises
-    ------
-    InputError
-        The stream is damaged, or does not hold what its head and the table promise; the message begins with `where`.
-    """
+    """Bytes of a unit or line with every section in its plain order; nothing is expanded beyond what was promised."""
     stream = zlib.decompressobj()
     try:
         head = stream.decompress(packed, _UNIT.size)
@@ -123,13 +117,7 @@ def inflate(packed: bytes, promised: int, where: str) -> NDArray[np.uint8]:
 
 
 def check_unit(unit: Unit, where: str) -> None:
-    """Refuse a unit that no computation could use safely.
-
-    Raises
-    ------
-    InputError
-        A shape is wrong, a number is infinite, triangles name vertices that do not exist or lie outside of the unit.
-    """
+    """Refuse a unit that no computation could use safely."""
     n = unit.meshes
     if not 1 <= n <= MOST_MESHES or unit.heights.shape != (n + 1, n + 1) or unit.sigmas.shape != (n + 1, n + 1):
         raise InputError(f"{where}: posts {unit.heights.shape} and their deviations {unit.sigmas.shape}; not a unit")
@@ -171,13 +159,7 @@ def pack_line(line: LineElement) -> tuple[bytes, int]:
 
 
 def unpack_line(buffer: NDArray[np.uint8], name: str, code: str, where: str) -> LineElement:
-    """A line of the bytes that `inflate` gave.
-
-    Raises
-    ------
-    InputError
-        The numbers do not make a line.
-    """
+    """A line of the bytes that `inflate` gave."""
     _, count, two_sided, kind = _LINE.unpack_from(buffer[: _LINE.size].tobytes())
     sections, size = _sections(buffer[: _UNIT.size].tobytes(), where)
     parts = _views(buffer, size, sections)

@@ -126,21 +126,7 @@ def _write(path: Path, layer: str, shapes: NDArray[Any], columns: dict[str, NDAr
 def write_heights(
     path: Path, layout: UnitLayout, meshes: int, unit: Callable[[int, int], Unit | None], crs: str
 ) -> None:
-    """Layer `heights`: the posts as a raster of one grid width, in the extension for gridded coverages.
-
-    Parameters
-    ----------
-    path
-        The file, which has another layer already.
-    layout
-        The units.
-    meshes
-        Meshes along a unit's side in the raster; units with others are interpolated.
-    unit
-        Gives the units.
-    crs
-        CRS of the layer.
-    """
+    """Layer `heights`: the posts as a raster of one grid width, in the extension for gridded coverages."""
     width, height = layout.columns * meshes + 1, layout.rows * meshes + 1
     step = layout.side / meshes
     profile = {

@@ -90,12 +90,6 @@ class ModelReader:
 
     Decoded units are kept up to `cache_bytes`, least recently used ones are forgotten first (the cache stays behind
     when the reader is pickled).
-
-    Raises
-    ------
-    InputError
-        When made: the file is missing, is no terrain model, or has a header that is damaged. When read: a unit is
-        damaged; the message names file and unit.
     """
 
     path: Path

@@ -66,13 +66,7 @@ class ModelHeader:
 
 
 def input_facts(path: Path) -> dict[str, Any]:
-    """Name, size and digest of an input, for the header.
-
-    Raises
-    ------
-    InputError
-        It cannot be read.
-    """
+    """Name, size and digest of an input, for the header."""
     found = fingerprint(path)
     return {"file": Path(path).name, "bytes": found.size, "sha256_sampled": found.digest}
 
@@ -98,13 +92,7 @@ def empty_figures(column: int, row: int) -> UnitFigures:
 
 
 def check_layout(layout: UnitLayout, where: str) -> None:
-    """Refuse more units than can be handled.
-
-    Raises
-    ------
-    InputError
-        Naming the numbers.
-    """
+    """Refuse more units than can be handled."""
     if layout.columns * layout.rows > MOST_UNITS:
         raise InputError(
             f"{where}: {layout.columns} × {layout.rows} units; at most {MOST_UNITS} are allowed: take larger units"
@@ -112,24 +100,12 @@ def check_layout(layout: UnitLayout, where: str) -> None:
 
 
 def header_to_json(header: ModelHeader) -> str:
-    """The header as text.
-
-    Raises
-    ------
-    UsageError
-        A setting or figure is nothing that JSON can say.
-    """
+    """The header as text."""
     return json_text(header, "header", indent=None)
 
 
 def header_from_json(text: str, path: Path) -> ModelHeader:
-    """The header of a file's text.
-
-    Raises
-    ------
-    InputError
-        Something is missing or of another kind; the message names the file.
-    """
+    """The header of a file's text."""
     try:
         content = json.loads(text)
         place = content["layout"]

@@ -73,16 +73,6 @@ class ModelWriter:
     Units go into a crash-safe log beside the file, so that the next run with the same `run_key` finds them in `done`.
     `finish` assembles the GeoPackage under a temporary name, opens it again, compares it with the log, and only then
     gives it its name. Leaving the context without `finish` keeps the log. `add` may be called from several threads.
-
-    Raises
-    ------
-    UsageError
-        On entry: the output exists or is an input, or its folder cannot be written. In `add`: a unit that is not of the
-        layout.
-    RunLocked
-        On entry, if another run is writing this model.
-    ResourceError
-        In `add` and `finish`, if the disk is full: no model under the name, no temporary files, units are kept.
     """
 
     path: Path
@@ -147,13 +137,7 @@ class ModelWriter:
             yield UnitFigures(*_FIGURES.unpack_from(log.read(number)))
 
     def unit(self, column: int, row: int) -> Unit | None:
-        """A finished unit, or None if it is empty.
-
-        Raises
-        ------
-        KeyError
-            It is not finished.
-        """
+        """A finished unit, or None if it is empty."""
         number = row * self.layout.columns + column
         stored = self._stored(number)
         if stored is None:
@@ -162,13 +146,7 @@ class ModelWriter:
         return unit_of(buffer, self.layout, column, row)
 
     def finish(self, parts: ModelParts) -> ModelReader:
-        """Make the file of all units and these parts, give it its name, and open it.
-
-        Raises
-        ------
-        PhotoplanError
-            Units are missing.
-        """
+        """Make the file of all units and these parts, give it its name, and open it."""
         log = self._file.log
         missing = self.layout.columns * self.layout.rows - len(log.finished)
         if missing:

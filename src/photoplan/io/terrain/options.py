@@ -115,11 +115,6 @@ def read_code_table(path: Path) -> CodeTable:
     TOML: ``121 = "breakline"`` or ``"D124" = { kind = "spot", sigma = 0.05 }``, at the top or under ``[codes]``.
     CSV (comma, semicolon or tab): code, kind and, if wanted, sigma in metres; a header is allowed. ``*`` as a code
     stands for all others.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read as such a table; the message names the line or the code.
     """
     if path.suffix.casefold() == ".toml":
         content, _ = read_toml(path, MAX_BYTES)

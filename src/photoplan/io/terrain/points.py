@@ -45,14 +45,7 @@ class PointPart:
 
 
 class PointTable:
-    """A text file of points with a header; opened by `parts`, as often as wanted.
-
-    Raises
-    ------
-    InputError
-        When made: the file cannot be read, holds no points, or its columns are not found. In `parts`: a line cannot
-        be read as declared; the message names the line and the column.
-    """
+    """A text file of points with a header; opened by `parts`, as often as wanted."""
 
     def __init__(self, path: Path, form: PointTableFormat = PointTableFormat()) -> None:
         self.path, self.form = Path(path), form

@@ -49,13 +49,6 @@ class TerrainReader:
     Nodata, alpha, mask and blocks that were never written follow the rule of `photoplan.io.validity`; NaN and values
     of ±1e30 and more are void as well. Other values that are no height on Earth (below -12 000 m or above 9 000 m), and
     the usual nodata values where none is declared, are refused with their count.
-
-    Raises
-    ------
-    InputError
-        When made: whatever `read_info` refuses; another number of bands than one, or another type than
-        `TERRAIN_TYPES`; a grid that is not georeferenced; a unit of heights that is unknown, or that contradicts the
-        height system. When read: damaged data, values that are no heights.
     """
 
     path: Path

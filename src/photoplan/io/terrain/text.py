@@ -42,13 +42,7 @@ class _Columns:
 
 
 def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
-    """Points and lines of a text file.
-
-    Raises
-    ------
-    InputError
-        A line cannot be read as declared; the message names file and line.
-    """
+    """Points and lines of a text file."""
     layout: TableLayout | None = None
     codes, ids, out = CodeIndex(), CodeIndex(), _Columns()
     notes: list[str] = []

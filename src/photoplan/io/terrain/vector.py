@@ -54,13 +54,7 @@ class _Layer:
 
 
 def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
-    """Points and lines of the layers of a vector file.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or a point or line that needs heights has none.
-    """
+    """Points and lines of the layers of a vector file."""
     drawing = is_drawing(path)
     notes: list[str] = []
     points: list[PointGroup] = []

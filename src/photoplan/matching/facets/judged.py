@@ -40,15 +40,6 @@ def grey_sigmas(block: FacetBlock, at: _Doubles, height_variances: _Doubles) -> 
     grey facets. Its squares, in units of what the pixels around a place weigh, change slowly, so that one draw and
     means over patches are enough. An error dZ of the height shows a place that lies beside by k·dZ, with k the mean of
     the images.
-
-    Parameters
-    ----------
-    block : FacetBlock
-        After its last iteration.
-    at : ndarray
-        Columns and rows of the posts.
-    height_variances : ndarray, shape (n, m)
-        Of the heights there, m².
     """
     assert block.texture is not None
     ratio, places = block.facets.ratio, at.reshape(-1, 2)
@@ -115,12 +106,6 @@ def misfit_variances(block: FacetBlock, misfit: _Doubles) -> _Doubles:
     A height that is not where it should be may be any of those around it. How probable that is: the square of the part
     of the squared residuals that noise does not explain, as a little more of it tells little (noise differs from place
     to place). So a rounded edge says so, and a region that went wrong as far as there is relief in it.
-
-    Parameters
-    ----------
-    block : FacetBlock
-    misfit : ndarray, shape (rows, columns)
-        See `fit`.
     """
     wrong = (1.0 - (_FITS / np.maximum(np.nan_to_num(misfit), _FITS)) ** 2) ** 2
     around = ndimage.maximum_filter(block.heights, _AROUND) - ndimage.minimum_filter(block.heights, _AROUND)

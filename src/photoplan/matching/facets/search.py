@@ -129,21 +129,7 @@ def search(
     start: Callable[[_Doubles], _Doubles],
     reach: float,
 ) -> Searched | None:
-    """Heights of a window of a map.
-
-    Parameters
-    ----------
-    views, grid, window, start
-        See `reconstruct`.
-    how : Search
-    reach : float
-        How far heights may lie above and below the start, metres.
-
-    Returns
-    -------
-    Searched or None
-        None: fewer than two images see any of it, or the start knows no height here.
-    """
+    """Heights of a window of a map."""
     found: Searched | None = None
     planes = how.planes
     for level in range(how.coarsest, -1, -1):

@@ -61,20 +61,7 @@ class Likeness:
 
 
 def likeness_of(block: Block, base: Adjusted) -> Likeness | None:
-    """Weigh image errors that are alike, with covariance exp(−(d/L)²) over distances d, against other accuracies.
-
-    Parameters
-    ----------
-    block : Block
-        With the observations that take part, as it was adjusted.
-    base : Adjusted
-        By plain least squares.
-
-    Returns
-    -------
-    Likeness or None
-        None: neither makes the misfits much more likely, or there are too few of them.
-    """
+    """Weigh image errors that are alike, with covariance exp(−(d/L)²) over distances d, against other accuracies."""
     model, K, w = _contrasts(_part(block, base), base)
     if len(w) < _FEW:
         return None

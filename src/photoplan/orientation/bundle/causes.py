@@ -52,12 +52,6 @@ def weighed_causes(block: Block, result: Adjusted) -> tuple[Cause, ...]:
     Each is an adjustment of the block with other unknowns, all control and positions included. It is named where
     unknowns without meaning would hardly lower the sum of squares as much (F-test). What the best of them leaves is
     weighed as errors of image points that are alike, and as other accuracies than stated, by their likelihood.
-
-    Parameters
-    ----------
-    block : Block
-        As it was adjusted.
-    result : Adjusted
     """
     if not doubtful(result):
         return ()

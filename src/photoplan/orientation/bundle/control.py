@@ -59,16 +59,7 @@ class Misclosures:
 
 
 def misclosures(model: Model, state: State, weight: _Floats, loose: float) -> Misclosures | None:
-    """Misclosures of all control at a state; None where there is none, or the block is not determined.
-
-    Parameters
-    ----------
-    weight : ndarray, shape (rows,)
-        Weights of all rows; those of control are not used.
-    loose : float
-        Standard deviation that control gets instead, so that the block lies somewhere, metres: some hundred times that
-        of image points on the ground.
-    """
+    """Misclosures of all control at a state; None where there is none, or the block is not determined."""
     names, of = np.unique(model.ground, return_inverse=True)
     if not len(names):
         return None
@@ -133,14 +124,6 @@ def agreeing(found: Misclosures, ground: _Mask, critical: float) -> Agreeing:
     Where less than half of the points agree, or the set fits worse than its standard deviations allow, these are taken
     as stated too well, not the points as wrong. Where another set is as large, nothing tells which holds the wrong
     point, and all stay.
-
-    Parameters
-    ----------
-    found : Misclosures
-    ground : ndarray of bool, shape (g, 3)
-        Coordinates of all ground points; those of `found` are decided anew.
-    critical : float
-        Normalised residual of one coordinate from which it counts as wrong; points are judged at the same chance.
     """
     kept = ground.copy()
     wide, sets = 1.0, []

@@ -29,19 +29,6 @@ def correlation_of(model: Model, normalised: _Floats, used: NDArray[np.bool_]) -
 
     Orientations are smooth functions of the image's points, so errors that are alike over some distance d do not
     average out: of n measurements, n / effect count, with effect = 1 + Σ ρ(d) over the neighbours of each.
-
-    Parameters
-    ----------
-    model : Model
-    normalised : ndarray, shape (k, 2)
-        Normalised residuals of the model's measurements; NaN counts as 0.
-    used : ndarray of bool, shape (k,)
-        Measurements that take part.
-
-    Returns
-    -------
-    tuple of Correlation
-        Of each camera whose measurements are clearly correlated.
     """
     v = np.nan_to_num(normalised)
     found = []

@@ -31,16 +31,7 @@ class OfPoints(NamedTuple):
 
 
 def by_prior(model: Model, state: State, rows: Rows, points: OfPoints) -> tuple[str, ...]:
-    """Motions of the block of which only what corrections are known to beforehand says anything.
-
-    Parameters
-    ----------
-    model : Model
-    state : State
-    rows : Rows
-        Equations at `state`.
-    points : OfPoints
-    """
+    """Motions of the block of which only what corrections are known to beforehand says anything."""
     count = model.columns.count
     if not model.sets or not 0 < count <= _MANY:
         return ()

@@ -93,16 +93,7 @@ class BlockFrame:
         return Pose(center, R)
 
     def ground(self, ground: GroundPoints, near: _Floats) -> GroundPoints:
-        """Ground points in the block's system.
-
-        Parameters
-        ----------
-        ground : GroundPoints
-            In map coordinates; not known coordinates NaN.
-        near : ndarray, shape (n, 3)
-            Where each point about lies in the map: with strict earth curvature a height alone is one of a place, and
-            a horizontal position one at a height.
-        """
+        """Ground points in the block's system."""
         if self.local is None:
             return ground
         known = np.isfinite(ground.XYZ)

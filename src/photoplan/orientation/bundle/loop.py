@@ -50,14 +50,7 @@ _FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
 
 
 class Loop:
-    """Iterations to the minimum; counts them over all rounds of an adjustment.
-
-    Parameters
-    ----------
-    most : int
-        Most iterations of a round.
-    progress : Progress
-    """
+    """Iterations to the minimum; counts them over all rounds of an adjustment."""
 
     def __init__(self, most: int, progress: Progress) -> None:
         self.count = 0
@@ -77,13 +70,7 @@ class Loop:
     def run(
         self, model: Model, state: State, base: _Floats, robust: bool = False, watch: _Watch | None = None
     ) -> State:
-        """The state where the sum of squares with weights `base` (rows,) is least.
-
-        Raises
-        ------
-        GeometryError
-            No step makes the residuals smaller, or the iterations do not settle.
-        """
+        """The state where the sum of squares with weights `base` (rows,) is least."""
         if robust:
             base = base * softened(model, state)
         descent, cost, gains = _Descent(model, state), np.inf, [np.inf] * _FLAT_STEPS

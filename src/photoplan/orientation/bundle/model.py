@@ -156,13 +156,7 @@ class Model:
 
 
 def check_free(name: str, camera: BlockCamera) -> None:
-    """Refuse parameters that a camera's lens does not have.
-
-    Raises
-    ------
-    UsageError
-        A parameter is unknown, or the lens is not described by such coefficients.
-    """
+    """Refuse parameters that a camera's lens does not have."""
     unknown = [p for p in camera.free if p not in PARAMETERS]
     if unknown:
         raise UsageError(f"camera {name!r}: parameter {unknown[0]!r}; allowed are {', '.join(PARAMETERS)}")
@@ -181,18 +175,7 @@ def check_free(name: str, camera: BlockCamera) -> None:
 
 
 def build_model(block: Block, images: list[int], measured: _Index, points: list[str]) -> Model:
-    """Arrays of a block.
-
-    Parameters
-    ----------
-    block : Block
-    images : list of int
-        Images that take part, indices into `block.images`, and beyond these into `block.projections`.
-    measured : ndarray
-        Measurements that take part, indices into `block.observations`.
-    points : list of str
-        Points that take part.
-    """
+    """Arrays of a block."""
     seen = block.observations
     chosen = [block.images[k] for k in images if k < len(block.images)]
     projections = tuple(block.projections[k - len(block.images)] for k in images if k >= len(block.images))

@@ -63,13 +63,7 @@ class Reduced:
 
     @cached_property
     def factor(self) -> SuperLU:
-        """Factorisation without pivoting.
-
-        Raises
-        ------
-        GeometryError
-            The equations are exactly singular.
-        """
+        """Factorisation without pivoting."""
         try:
             return splu(self.S, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError:
@@ -85,16 +79,7 @@ class Reduced:
 
 
 def reduce_normals(rows: Rows, points: int, damping: float = 0.0) -> Reduced:
-    """Form the normal equations and eliminate the points.
-
-    Parameters
-    ----------
-    rows : Rows
-    points : int
-        Number of points.
-    damping : float
-        Part of the diagonal that is added to it (Levenberg–Marquardt).
-    """
+    """Form the normal equations and eliminate the points."""
     at, P = _on_points(rows)
     V = np.empty((points, 3, 3))
     for k in range(3):
@@ -191,13 +176,7 @@ def _pattern(reduced: Reduced, order: NDArray[np.int64]) -> sparse.csc_matrix:
 
 
 def check_rank(model: Model, state: State, reduced: Reduced) -> None:
-    """Refuse equations that leave unknowns undetermined.
-
-    Raises
-    ------
-    DatumDefect, GeometryError
-        The message names the combinations of unknowns that nothing determines, or whose equations are no numbers.
-    """
+    """Refuse equations that leave unknowns undetermined."""
     wrong = ~np.isfinite(np.asarray(reduced.S.sum(axis=1)).ravel())
     if wrong.any():
         owners = dict.fromkeys(

@@ -113,18 +113,7 @@ class Solution:
 def solution_of(
     model: Model, state: State, weight: _Floats, covariance: bool, effects: _Floats | None = None
 ) -> Solution:
-    """Equations, redundancy numbers and cofactors at a converged state.
-
-    Parameters
-    ----------
-    weight : ndarray, shape (rows,)
-        Weights of the rows, each by itself.
-    covariance : bool
-        Whether cofactors and redundancy numbers are wanted.
-    effects : ndarray, shape (rows,), optional
-        How many rows of image points count as one for what they have in common: orientations and cameras. Points, and
-        residuals of image points, go by the rows' own weights.
-    """
+    """Equations, redundancy numbers and cofactors at a converged state."""
     rows, found = linearise(model, state, np.sqrt(weight))
     reduced = reduce_normals(rows, len(model.point_names))
     e = whitened(model, found)
@@ -185,12 +174,6 @@ def refitted_sigmas(solution: Solution, stated: _Floats) -> ImagePoints:
     Matching states what noise makes of a patch's place; what it does not know of (relief inside of the patch, shutter,
     moving leaves) comes to all points alike. If it were scaled as well, a few points would get nearly all the weight,
     and formal accuracies would be too good. The median keeps its stated value: factors of the groups show the size.
-
-    Parameters
-    ----------
-    solution : Solution
-    stated : ndarray, shape (k, 2)
-        Standard deviations s of the block's measurements as they were stated, pixels.
     """
     model, seen = solution.model, solution.model.block.observations
     kinds = kinds_of_measurements(model)

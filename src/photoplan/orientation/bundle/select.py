@@ -34,16 +34,7 @@ class Selection:
 
 
 def select(block: Block, active: Active, undetermined: frozenset[str] = frozenset()) -> Selection:
-    """Choose images and points with enough measurements.
-
-    Parameters
-    ----------
-    block : Block
-    active : Active
-        Observations that are not taken out as gross errors.
-    undetermined : frozenset of str
-        Points that are known to have parallel rays only.
-    """
+    """Choose images and points with enough measurements."""
     seen = block.observations
     names = [*(b.name for b in block.images), *(p.name for p in block.projections)]
     index = {name: k for k, name in enumerate(names)}

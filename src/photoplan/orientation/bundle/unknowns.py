@@ -200,13 +200,7 @@ def layout_of(
     strips: tuple[str, ...],
     sets: Sequence[Corrections] = (),
 ) -> Layout:
-    """The unknowns of a block: orientations, what is free of cameras, lever arm, boresight and drift, corrections.
-
-    Raises
-    ------
-    UsageError
-        There is no such drift.
-    """
+    """The unknowns of a block: orientations, what is free of cameras, lever arm, boresight and drift, corrections."""
     width = {"none": 0, "shift": 3, "linear": 6}.get(block.drift)
     if width is None:
         raise UsageError(f"drift {block.drift!r}; allowed are none, shift, linear")

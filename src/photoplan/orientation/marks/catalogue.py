@@ -55,28 +55,7 @@ def cross(
     bright: bool = True,
     margin: float | None = None,
 ) -> MarkPattern:
-    """Four arms.
-
-    Parameters
-    ----------
-    arm : float
-        From the centre to an arm's end, millimetres.
-    width : float
-        Of an arm, millimetres.
-    free : float
-        From the centre to where the arms begin, millimetres.
-    rotation : float
-        Anticlockwise, degrees; 45: a diagonal cross.
-    bright : bool
-        Bright on dark, else dark on bright.
-    margin : float, optional
-        Ground that is compared beyond the arms, millimetres; default: a fifth of the arm, at least twice the width.
-
-    Raises
-    ------
-    InputError
-        The sizes are not those of a cross.
-    """
+    """Four arms."""
     _positive("cross", arm=arm, width=width)
     if not 0 <= free < arm or width >= 2 * arm:
         raise InputError(f"cross: arm {arm}, width {width}, free {free} mm; free < arm and width < 2 arm are needed")
@@ -105,24 +84,7 @@ def ring_cross(
     bright: bool = True,
     margin: float | None = None,
 ) -> MarkPattern:
-    """A ring with a cross in it or through it.
-
-    Parameters
-    ----------
-    diameter, width : float
-        Outer diameter of the ring and width of its line, millimetres.
-    arm : float
-        From the centre to the end of the cross's arms, millimetres.
-    cross_width : float, optional
-        Width of the arms, default that of the ring.
-    free, rotation, bright, margin
-        As for `cross`; default of the margin: an eighth of the diameter, at least twice the width.
-
-    Raises
-    ------
-    InputError
-        The sizes are not those of a ring and a cross.
-    """
+    """A ring with a cross in it or through it."""
     parts = _ring("ring_cross", diameter, width)
     wide = width if cross_width is None else cross_width
     _positive("ring_cross", arm=arm, cross_width=wide)
@@ -142,22 +104,7 @@ def dot_cross(
     bright: bool = True,
     margin: float | None = None,
 ) -> MarkPattern:
-    """A disc in the middle of a cross.
-
-    Parameters
-    ----------
-    diameter : float
-        Of the disc, millimetres.
-    arm, width, rotation, bright, margin
-        As for `cross`.
-    free : float
-        Where the arms begin, so that ground shows between them and the disc; millimetres from the centre.
-
-    Raises
-    ------
-    InputError
-        The arms do not show outside the disc, or a size is not positive.
-    """
+    """A disc in the middle of a cross."""
     _positive("dot_cross", diameter=diameter, arm=arm, width=width)
     if not 0 <= free < arm or diameter >= 2 * arm:
         raise InputError(f"dot_cross: diameter {diameter}, arm {arm}, free {free} mm; the arms must show outside")
@@ -173,24 +120,7 @@ def polygon(
     rotation: float = 0.0,
     name: str = "polygon",
 ) -> MarkPattern:
-    """Anything: polygons (n, 2) in millimetres about the reference point with tones from 0 dark to 1 bright.
-
-    Parameters
-    ----------
-    parts : sequence of (outline, tone)
-        Each covers those before it; tone NaN: not compared.
-    background : float
-        Tone elsewhere; NaN: not compared.
-    window : (xmin, ymin, xmax, ymax), optional
-        What is compared, millimetres, before the rotation; default: all parts and a tenth of their size around them.
-    rotation : float
-        Anticlockwise, degrees.
-
-    Raises
-    ------
-    InputError
-        An outline has fewer than three vertices, a tone is outside 0 to 1, or nothing differs from its ground.
-    """
+    """Anything: polygons (n, 2) in millimetres about the reference point with tones from 0 dark to 1 bright."""
     made = []
     for number, (outline, tone) in enumerate(parts, 1):
         vertices = np.asarray(outline, np.float64)

@@ -121,28 +121,7 @@ def fit_edges(
     search_px: float = 6.0,
     sigmas: tuple[float, float] = (0.035, 0.02),
 ) -> MarkEdge | None:
-    """Place of a mark from its edges.
-
-    Parameters
-    ----------
-    image : ndarray, shape (h, w)
-        Grey values; NaN: not compared.
-    mm_to_pixel : (2, 2)
-        From millimetres (x right, y up) to columns and rows, about.
-    at : (float, float)
-        Column and row of the reference point, about.
-    negative : bool
-        Whether dark and bright are exchanged.
-    search_px : float
-        How far edges may lie from where they are expected, pixels.
-    sigmas : (float, float)
-        How well rotation (radians) and scale (a part of it) are known: observations of the adjustment.
-
-    Returns
-    -------
-    EdgeFit or None
-        None: too few edges are seen, or they do not determine the place.
-    """
+    """Place of a mark from its edges."""
     matrix = np.array(mm_to_pixel, np.float64)
     spacing = _STEP / math.sqrt(abs(np.linalg.det(matrix)))
     edges = pattern_edges(pattern, spacing)

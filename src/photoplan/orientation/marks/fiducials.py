@@ -68,13 +68,6 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
 
     If they are not found, crosses are tried in other directions. If none is found though the scan's resolution is
     known, marks of neighbouring sizes are tried, and then both together.
-
-    Raises
-    ------
-    MarksNotFound
-        Fewer than three marks are found; the message names the others.
-    GeometryError
-        The marks that were found lie on a line.
     """
     try:
         found = _find(scan, layout, known)

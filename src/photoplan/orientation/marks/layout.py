@@ -44,13 +44,7 @@ class MarkLayout:
     def of(
         cls, marks: Mapping[str, tuple[float, float]], patterns: Mapping[str, MarkPattern | MarkExample]
     ) -> MarkLayout:
-        """From tables by name.
-
-        Raises
-        ------
-        InputError
-            A mark has no pattern.
-        """
+        """From tables by name."""
         bare = [name for name in marks if name not in patterns]
         if bare:
             raise InputError(f"fiducial mark {', '.join(map(repr, bare))}: what it looks like is not described")
@@ -152,17 +146,6 @@ def combine(
 
     Every pair of candidates of every pair of marks gives one; it is dropped where scale or rotation are impossible,
     and scored by what the other marks have near the places that it predicts.
-
-    Parameters
-    ----------
-    candidates : sequence of (k, 3) arrays
-        Column, row and correlation for each mark, best first; may be empty.
-    turn, negative
-        Taken over into the result; `turn` says which rotations are near.
-    px_per_mm, scale_tolerance
-        Expected scale, and by which part of it the true one may differ.
-    blunt : float
-        Uncertainty of a candidate's place, pixels.
     """
     best: tuple[float, int, int, int, int] | None = None
     gate = FILM * layout.extent * px_per_mm + blunt

@@ -44,20 +44,7 @@ class Peak:
 
 
 def paraboloid_peak(correlation: NDArray[np.floating], row: int, column: int) -> Peak | None:
-    """Top of the paraboloid through the 5 × 5 neighbourhood of a maximum (Behr 1989, eq. 4.2–4.4).
-
-    Parameters
-    ----------
-    correlation : ndarray, shape (h, w)
-        Correlation coefficients; NaN: none.
-    row, column : int
-        Place of their maximum.
-
-    Returns
-    -------
-    Peak or None
-        None where the neighbourhood leaves the array or holds NaN, or the paraboloid has no top within two pixels.
-    """
+    """Top of the paraboloid through the 5 × 5 neighbourhood of a maximum (Behr 1989, eq. 4.2–4.4)."""
     top, left = row - _HALF, column - _HALF
     if top < 0 or left < 0:
         return None
@@ -110,20 +97,7 @@ class Location:
 def correlation_surface(
     image: NDArray[np.floating], template: Template, least_share: float = LEAST_SHARE
 ) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """Correlation coefficients of a template at all places of an image.
-
-    Returns
-    -------
-    surface : ndarray, shape (h', w')
-        Coefficients; NaN: too few valid pixels, or no variation of grey values.
-    origin : (float, float)
-        Column and row of the reference point in the image for surface[0, 0].
-
-    Raises
-    ------
-    InputError
-        The image is smaller than the template.
-    """
+    """Correlation coefficients of a template at all places of an image."""
     h, w = image.shape
     a, b = template.values.shape
     if h < a or w < b:
@@ -148,28 +122,7 @@ def locate_mark(
     blur_px: float = 0.7,
     near: tuple[float, float, float] | None = None,
 ) -> Location:
-    """Place of a mark in a window whose scale and rotation are known.
-
-    Parameters
-    ----------
-    image : ndarray, shape (h, w)
-        Grey values; NaN: not compared. It reaches half a mark beyond where the mark may be.
-    pattern : MarkPattern or MarkExample
-        What the mark looks like.
-    mm_to_pixel : (2, 2)
-        From millimetres (x right, y up) to columns and rows.
-    negative : bool
-        Whether dark and bright are exchanged.
-    blur_px : float
-        Standard deviation of the scan's blur, pixels.
-    near : (x, y, radius), optional
-        Search only there, pixels.
-
-    Raises
-    ------
-    InputError
-        The image is smaller than the mark.
-    """
+    """Place of a mark in a window whose scale and rotation are known."""
     surface, (ox, oy) = correlation_surface(image, draw(pattern, mm_to_pixel, negative=negative, blur_px=blur_px))
     if near is not None:
         rows, columns = np.indices(surface.shape)
@@ -230,15 +183,7 @@ def best_blur(
     at: tuple[float, float],
     negative: bool,
 ) -> NDArray[np.float64]:
-    """Highest correlation within a pixel of a place, for each of `BLURS`; NaN where the image is too small.
-
-    Parameters
-    ----------
-    image, pattern, mm_to_pixel, negative
-        As for `locate_mark`.
-    at : (float, float)
-        Column and row of the reference point in the image.
-    """
+    """Highest correlation within a pixel of a place, for each of `BLURS`; NaN where the image is too small."""
     found = []
     for blur in BLURS:
         template = draw(pattern, mm_to_pixel, negative=negative, blur_px=blur)

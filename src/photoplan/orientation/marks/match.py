@@ -58,19 +58,7 @@ class Match:
 def fine_template(
     pattern: MarkPattern | MarkExample, mm_to_pixel: NDArray[np.float64], blur_px: float, negative: bool
 ) -> FineTemplate:
-    """A mark as the scan's optics blur it and its pixels gather it, sampled more densely than these.
-
-    Parameters
-    ----------
-    pattern : MarkPattern or MarkExample
-        What it looks like.
-    mm_to_pixel : (2, 2)
-        From millimetres (x right, y up) to columns and rows.
-    blur_px : float
-        Standard deviation of the blur, pixels.
-    negative : bool
-        Whether dark and bright are exchanged.
-    """
+    """A mark as the scan's optics blur it and its pixels gather it, sampled more densely than these."""
     coarse = draw(pattern, mm_to_pixel, negative=negative, blur_px=0.0)
     over = 4 if max(coarse.values.shape) < 400 else 2 if max(coarse.values.shape) < 800 else 1
     # An area and a Gaussian of the same variance do not differ by more than a thousandth once they are blurred.
@@ -93,18 +81,6 @@ def match_template(image: NDArray[np.floating], template: FineTemplate, x: float
     The image's grey values are observations as they are; the template is moved and sampled, so that noise is not
     smoothed by interpolation. The covariance follows from the normal equations; where residuals resemble those of
     their neighbours (grain, compression, a mark unlike its description) by their correlation up to 3 pixels.
-
-    Parameters
-    ----------
-    image : ndarray, shape (h, w)
-        Grey values; NaN: not compared.
-    x, y : float
-        Approximate place of the reference point, to a pixel or two.
-
-    Returns
-    -------
-    Match or None
-        None if the iteration does not converge near the start, or too little of the template lies on the image.
     """
     grey = np.asarray(image, np.float64)
     start = (x, y)

@@ -67,13 +67,7 @@ class _Look:
 
 
 def measure_marks(scan: Scan, layout: MarkLayout, placement: MarkPlacement, least: float) -> Measured:
-    """Measure all marks: as the placement draws them, then as the affine transformation and blur so found do.
-
-    Parameters
-    ----------
-    least : float
-        A place that correlates less is no mark.
-    """
+    """Measure all marks: as the placement draws them, then as the affine transformation and blur so found do."""
     scale = 1.0 / placement.pixel_mm
     wide = FILM * layout.extent * scale + _NEAR_PX
     start = dict.fromkeys(placement.found, _NEAR_MM * scale + _NEAR_PX)

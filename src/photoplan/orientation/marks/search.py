@@ -75,13 +75,7 @@ def pixel_sizes(layout: MarkLayout, size: tuple[int, int]) -> tuple[float, ...]:
 
 
 def search_placements(search: MarkSearch, pixels_mm: Sequence[float]) -> list[MarkPlacement]:
-    """The best placement for every turn and tone, best first.
-
-    Parameters
-    ----------
-    pixels_mm : sequence of float
-        Sides of a pixel that are tried, millimetres; not all, if one fits all marks very well.
-    """
+    """The best placement for every turn and tone, best first."""
     best: dict[tuple[ScanTurn, bool], MarkPlacement] = {}
     for pixel_mm in pixels_mm:
         search._surfaces.clear()

@@ -61,27 +61,7 @@ def block(
     slit_length: float | None = None,
     style: Style | None = None,
 ) -> MarkPattern:
-    """A stepped trapezoid: the inner corner of its step is the reference point.
-
-    Parameters
-    ----------
-    ledge : float
-        Length of the ledge, that runs from the reference point to the right.
-    depth : float
-        How much further into the image the part left of the reference point reaches.
-    tip : float
-        Width of that part's end.
-    height : float
-        From the frame's edge to the ledge.
-    flanks : (float, float)
-        Angles of the left and the right flank against the frame's edge, degrees.
-    slit : float
-        Width of the bright line that prolongs the step's edge into the frame; 0: none. Its middle is then x = 0.
-    slit_length : float, optional
-        Default `height`.
-    style : Style, optional
-        Band, corners, side.
-    """
+    """A stepped trapezoid: the inner corner of its step is the reference point."""
     made = style or Style()
     _check("block", ledge=ledge, depth=depth, tip=tip, height=height)
     left, right = (math.tan(math.radians(a)) for a in flanks)
@@ -112,19 +92,7 @@ def block(
 
 
 def curve(ledge: float, depth: float, rise: float, run: float, *, style: Style | None = None) -> MarkPattern:
-    """A step on the left and a circular arc on the right: the corner of the step is the reference point.
-
-    Parameters
-    ----------
-    ledge : float
-        Length of the ledge, that runs from the reference point to the left.
-    depth : float
-        How far the edge reaches from the reference point into the image, to the tip where the arc begins.
-    rise, run : float
-        From the tip to where the arc meets the frame's edge and is parallel to it: across and along the edge.
-    style : Style, optional
-        Band, corners, side.
-    """
+    """A step on the left and a circular arc on the right: the corner of the step is the reference point."""
     made = style or Style()
     _check("curve", ledge=ledge, depth=depth, rise=rise, run=run)
     bow = _arc((0.0, -depth), (run, rise - depth))
@@ -135,26 +103,7 @@ def curve(ledge: float, depth: float, rise: float, run: float, *, style: Style |
 
 
 def notch(reach: float, tip: float, shoulder: float, *, angle: float = 45.0, style: Style | None = None) -> MarkPattern:
-    """A tooth of frame right and a tooth of image left of one edge: the middle of this edge is the reference point.
-
-    Parameters
-    ----------
-    reach : float
-        From the reference point along the edge to where the flanks prolonged meet it.
-    tip : float
-        From the reference point to the ends of the teeth, that are rounded.
-    shoulder : float
-        From the reference point across to where the flanks end.
-    angle : float
-        Between edge and flanks, degrees.
-    style : Style, optional
-        Band, corners, side.
-
-    Raises
-    ------
-    InputError
-        The sizes are not those of a notch.
-    """
+    """A tooth of frame right and a tooth of image left of one edge: the middle of this edge is the reference point."""
     made = style or Style()
     _check("notch", reach=reach, tip=tip, shoulder=shoulder)
     slope = 1 / math.tan(math.radians(angle))
@@ -171,25 +120,7 @@ def notch(reach: float, tip: float, shoulder: float, *, angle: float = 45.0, sty
 def triangle(
     flanks: tuple[float, float], near: float, far: float, *, inside_bright: bool = False, style: Style | None = None
 ) -> MarkPattern:
-    """A wedge between two straight flanks: its vertex is the reference point.
-
-    Parameters
-    ----------
-    flanks : (float, float)
-        Directions from the vertex along the flanks, degrees anticlockwise from x; the wedge lies between the first and
-        the second.
-    near, far : float
-        The part of each flank that is compared, millimetres from the vertex.
-    inside_bright : bool
-        A bright wedge in the dark frame, else a dark one on bright ground.
-    style : Style, optional
-        Band and side; `bright` exchanges the tones.
-
-    Raises
-    ------
-    InputError
-        The flanks enclose no angle below 180°, or nothing of them is compared.
-    """
+    """A wedge between two straight flanks: its vertex is the reference point."""
     made = style or Style()
     _check("triangle", far=far)
     if not 0 <= near < far or not 0 < (flanks[1] - flanks[0]) % 360 < 180:
@@ -211,21 +142,7 @@ def triangle(
 def arc(
     arm: float, width: float, tip: float, depth: float, rise: float, run: float, *, style: Style | None = None
 ) -> MarkPattern:
-    """A cusp of two arcs with a bright cross in it: the middle of the cross is the reference point.
-
-    Parameters
-    ----------
-    arm, width : float
-        From the centre to an arm's end, and width of the arms.
-    tip : float
-        Width of the cusp's end.
-    depth : float
-        From the cross to that end.
-    rise, run : float
-        From a corner of the end to where the arc meets the frame's edge: across and along the edge.
-    style : Style, optional
-        Band, corners, side.
-    """
+    """A cusp of two arcs with a bright cross in it: the middle of the cross is the reference point."""
     made = style or Style()
     _check("arc", arm=arm, width=width, tip=tip, depth=depth, rise=rise, run=run)
     right = _arc((tip / 2, -depth), (tip / 2 + run, rise - depth))

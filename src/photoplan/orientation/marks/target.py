@@ -40,18 +40,6 @@ def locate_target(image: NDArray[np.floating], *, bright: bool = True) -> MarkTa
     columns, is the diameter. A disc of this size is then drawn, with the edge as wide as it fits best, and located by
     correlation, paraboloid and least-squares matching. Unlike the source, only the largest connected piece beyond the
     threshold is measured: a bright grain elsewhere would enlarge the target.
-
-    Parameters
-    ----------
-    image : ndarray, shape (h, w)
-        Grey values; NaN: not compared.
-    bright : bool
-        Whether the target is brighter than its surroundings.
-
-    Raises
-    ------
-    InputError
-        The window shows no variation, the target touches its border or is too small, or nothing correlates.
     """
     grey = np.asarray(image, float) if bright else -np.asarray(image, float)
     if grey.ndim != 2 or not np.isfinite(grey).any() or np.nanmax(grey) <= np.nanmin(grey):

@@ -40,20 +40,7 @@ class Template:
 
 
 def coverage(outline: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Share of each pixel's area that a polygon covers, exact.
-
-    Parameters
-    ----------
-    outline : (n, 2) float64
-        Column and row of the vertices, pixel centres at whole numbers; either direction, not crossing itself.
-    shape : (int, int)
-        Rows and columns.
-
-    Returns
-    -------
-    (rows, columns) float64
-        0 outside to 1 inside.
-    """
+    """Share of each pixel's area that a polygon covers, exact."""
     total = np.empty((shape[0], shape[1] + 1))
     cover(np.asarray(outline, np.float64) + 0.5, total)
     return np.clip(np.abs(total[:, :-1]), 0.0, 1.0)

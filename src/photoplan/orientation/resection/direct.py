@@ -240,20 +240,7 @@ def tangent_derivatives(pose: Pose, X: Array) -> tuple[Array, Array, Array, Arra
 
 
 def polished_pose(pose: Pose, t: Array, X: Array, use: NDArray[np.bool_], iterations: int = 8) -> Pose:
-    """Least squares over some points, all of one weight; the pose itself where that gets worse.
-
-    Parameters
-    ----------
-    pose : Pose
-        Start value.
-    t : ndarray, shape (n, 2)
-        Tangent coordinates.
-    X : ndarray, shape (n, 3)
-        Their points, in the system of the pose.
-    use : ndarray of bool, shape (n,)
-    iterations : int
-        Most steps.
-    """
+    """Least squares over some points, all of one weight; the pose itself where that gets worse."""
     t, X = t[use], X[use]
 
     def equations(pose: Pose) -> tuple[Array, Array] | None:

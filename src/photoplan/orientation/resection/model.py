@@ -138,14 +138,7 @@ class ResectionUnknowns:
 
 
 def refuse_undetermined(A: Array, sigma0: float, unknowns: ResectionUnknowns) -> Array:
-    """Inverse normal equations of whitened equations (m, u) in natural units.
-
-    Raises
-    ------
-    GeometryError
-        A combination of unknowns is not determined: control on a line, cameras on the dangerous cylinder through three
-        points, flat terrain with free camera constant. The message spells it.
-    """
+    """Inverse normal equations of whitened equations (m, u) in natural units."""
     s, Vt = np.linalg.svd(A, full_matrices=False)[1:]
     worst = Vt[-1]
     if len(A) >= A.shape[1] and s[-1] > _ROUNDING * s[0] and max(1.0, sigma0) / s[-1] <= UNDETERMINED:

@@ -27,20 +27,6 @@ def three_point_poses(tangents: ArrayLike, XYZ: ArrayLike) -> tuple[Array, Array
     A cubic equation gives the degenerate conic of their pencil, a pair of lines, and each line meets the other conics
     in two points: the formulation of Persson & Nordberg 2018 ("Lambda Twist: an accurate fast robust perspective three
     point (P3P) solver", ECCV), here for many triples at once.
-
-    Parameters
-    ----------
-    tangents : array_like, shape (n, 3, 2)
-        Ideal tangent coordinates (x, y) / c, x right, y up.
-    XYZ : array_like, shape (n, 3, 3)
-        The points, in Cartesian ground coordinates.
-
-    Returns
-    -------
-    R_ground_camera : ndarray, shape (n, 4, 3, 3)
-        Rotations; NaN where there are fewer than four solutions, or the points lie on a line.
-    center : ndarray, shape (n, 4, 3)
-        Projection centres. All three points lie in front of the camera.
     """
     j = bearings(tangents)
     X = np.asarray(XYZ, float)

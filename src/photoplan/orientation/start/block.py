@@ -132,13 +132,7 @@ def _grow(net: Net, block: StartModel, how: dict[int, str], loose: float) -> Non
 def _placed(
     net: Net, model: StartModel, block: StartModel, images: Sequence[StartImage], positions: ObservedPositions | None
 ) -> Similarity:
-    """Transformation of a free model into the ground system.
-
-    Raises
-    ------
-    GeometryError
-        Nothing determines it; the message counts what there is.
-    """
+    """Transformation of a free model into the ground system."""
     of_model = np.isfinite(model.XYZ[:, 0])
     control = of_model & np.isfinite(net.control[:, 0])
     tied = of_model & np.isfinite(block.XYZ[:, 0])

@@ -88,19 +88,7 @@ def _related(net: Net, a: int, b: int) -> RelativeOrientation:
 
 
 def grown(net: Net, model: StartModel, images: Iterable[int], loose: float, fixed: bool = True) -> list[int]:
-    """Add images until none has enough known points; the numbers of those that were added.
-
-    Parameters
-    ----------
-    net, model
-        `model` is filled.
-    images : iterable of int
-        Images that may be added.
-    loose : float
-        Factor of the standard deviations that poses which are only approximate need.
-    fixed : bool
-        Whether control points keep their coordinates: the model is in the ground system.
-    """
+    """Add images until none has enough known points; the numbers of those that were added."""
     waiting = [k for k in images if k not in model.poses]
     added: list[int] = []
     refused: dict[int, int] = {}
@@ -234,18 +222,7 @@ def net_of(
     ground: GroundPoints,
     sigma: float,
 ) -> Net:
-    """Measurements of the block's images; those for which a lens has no ray are dropped.
-
-    Parameters
-    ----------
-    cameras : mapping of str to BlockCamera
-    images : sequence
-        With name, camera and transformation from image plane to pixels.
-    ground : GroundPoints
-        Check points and points without all three coordinates are no control here.
-    sigma : float
-        Standard deviation of a measurement that states none, pixels.
-    """
+    """Measurements of the block's images; those for which a lens has no ray are dropped."""
     number = {image.name: k for k, image in enumerate(images)}
     of_block = np.array([number.get(name, -1) for name in observations.images], np.int64)
     image = of_block[observations.image] if len(observations) else np.empty(0, np.int64)

@@ -220,16 +220,6 @@ def five_point_essentials(first: ArrayLike, second: ArrayLike) -> Array:
     problem", IEEE PAMI 26). They are solved by the eigenvectors of the 10 × 10 action matrix of x on the quotient ring
     (Stewénius, Engels & Nistér 2006, "Recent developments on direct relative orientation", ISPRS Journal 60). Points
     on a plane are no special case.
-
-    Parameters
-    ----------
-    first, second : array_like, shape (n, 5, 3)
-        Directions in camera axes of each image.
-
-    Returns
-    -------
-    ndarray, shape (n, 10, 3, 3)
-        Real solutions of unit norm; NaN in place of complex ones.
     """
     a, b = np.asarray(first, float), np.asarray(second, float)
     a, b = a.reshape(-1, 5, 3), b.reshape(-1, 5, 3)

@@ -70,17 +70,6 @@ def robust_similarity(source: ArrayLike, target: ArrayLike, tolerance: float) ->
     """Similarity that less than half of the points being wrong does not disturb, and the points that agree (n,).
 
     Three points each make a transformation; the one with the least median of distances decides which points agree.
-
-    Parameters
-    ----------
-    source, target : array_like, shape (n, 3)
-    tolerance : float
-        Distance that is always allowed, in units of the target; more where the median is larger.
-
-    Raises
-    ------
-    GeometryError
-        As `fit_similarity`.
     """
     a, b = np.asarray(source, float), np.asarray(target, float)
     if len(a) < 4:

@@ -82,23 +82,7 @@ class MapResult:
 
 
 def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Prepared:
-    """The block of a project in its Cartesian system.
-
-    Parameters
-    ----------
-    inputs : AdjustInputs
-    starts : mapping
-        Map pose of every image.
-    free : Free
-        Parameters of cameras that are unknowns, with what is known of them beforehand.
-
-    Raises
-    ------
-    InputError
-        An interior orientation cannot be made (fiducial marks missing), or height systems cannot be joined.
-    UsageError
-        A parameter cannot be free.
-    """
+    """The block of a project in its Cartesian system."""
     project = inputs.project
     centers = np.array([starts[image.name].center for image in inputs.images]).reshape(-1, 3)
     frame = block_frame(project, np.concatenate([centers, _about(inputs), inputs.ground.XYZ]))

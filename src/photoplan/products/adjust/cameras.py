@@ -69,11 +69,6 @@ def parse_calibrate(options: Sequence[str], cameras: Sequence[str]) -> Free:
     """Free parameters from options ``CAMERA=c:5,x0,y0,k1``; the name may be left out where there is one camera.
 
     A number after a colon is the standard deviation with which the parameter is known beforehand.
-
-    Raises
-    ------
-    UsageError
-        A camera is not in the project, a parameter is unknown, or a standard deviation is not positive.
     """
     found: Free = {}
     for option in options:
@@ -109,26 +104,7 @@ def _prior(option: str, colon: str, text: str) -> float | None:
 def block_camera(
     name: str, camera: CameraEntry, interior: Interior, free: Mapping[str, float | None] | None = None
 ) -> BlockCamera:
-    """A camera of the block.
-
-    Parameters
-    ----------
-    name : str
-        For messages.
-    camera : CameraEntry
-        Its description in the project.
-    interior : Interior
-        Interior orientation of one of its images.
-    free : mapping, optional
-        Parameters that are unknowns, by the names that the project's lens gives them, each with the standard deviation
-        with which it is known beforehand (None: not at all): c, x0, y0 in the project's unit, coefficients of the lens
-        for image coordinates divided by c.
-
-    Raises
-    ------
-    UsageError
-        The lens is not described by the coefficients that should be free.
-    """
+    """A camera of the block."""
     free = free or {}
     lens = lens_of(camera)
     own = [p for p in free if p not in INTERIOR]

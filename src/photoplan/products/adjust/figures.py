@@ -185,12 +185,6 @@ def residual_fields(result: MapResult, used: NDArray[np.bool_]) -> tuple[Residua
 
     Residuals are turned from pixels into the image plane (x right, y up), where the images of a film camera agree, and
     scaled back so that their length stays in pixels.
-
-    Parameters
-    ----------
-    result : MapResult
-    used : ndarray, shape (k,)
-        Measurements that take part.
     """
     points, block = result.prepared.inputs.points, result.prepared.block
     of = {image.name: image for image in block.images}

@@ -16,20 +16,7 @@ _Floats = NDArray[np.float64]
 
 
 def block_frame(project: Project, XYZ: _Floats) -> BlockFrame:
-    """The system of a project's block.
-
-    Parameters
-    ----------
-    project : Project
-    XYZ : ndarray, shape (n, 3)
-        Projection centres and ground points, from which the middle of the block is taken; metres, NaN is left out.
-
-    Raises
-    ------
-    HeightSystemError
-        Earth curvature is strict and the orientation's height system is not stated, or cannot be joined to the
-        ellipsoid.
-    """
+    """The system of a project's block."""
     if project.orientation.earth_curvature != "strict":
         same = height_step("same", "same", project.crs)
         return BlockFrame(project.crs, None, same, same)
@@ -49,13 +36,7 @@ def block_frame(project: Project, XYZ: _Floats) -> BlockFrame:
 
 
 def orientation_system(project: Project) -> str:
-    """Height system of orientations and control.
-
-    Raises
-    ------
-    HeightSystemError
-        It is not stated, or cannot be known.
-    """
+    """Height system of orientations and control."""
     stated = project.height_system
     if stated is None:
         raise HeightSystemError(

@@ -59,20 +59,7 @@ class AdjustInputs:
 
 
 def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
-    """Read all files that [observations] names.
-
-    Parameters
-    ----------
-    project : Project
-    names : sequence of str
-        The images that are wanted, by their names in the project.
-
-    Raises
-    ------
-    InputError
-        There are no image points, a file cannot be read, control has no stated accuracy, or no image of the files is
-        in the project.
-    """
+    """Read all files that [observations] names."""
     observations = project.observations
     if not observations.image_points and not any(is_gcp_list(project.resolve(f)) for f in observations.control):
         raise InputError(

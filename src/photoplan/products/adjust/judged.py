@@ -25,13 +25,7 @@ _WORSE = 2.0
 
 
 def refuse_impossible(result: MapResult) -> None:
-    """Refuse a block of which images lie under the ground, or most measurements do not fit.
-
-    Raises
-    ------
-    GeometryError
-        The message says what of the measurements read otherwise would fit.
-    """
+    """Refuse a block of which images lie under the ground, or most measurements do not fit."""
     adjusted, inputs = result.adjusted, result.prepared.inputs
     _refuse_corrections(result)
     points, row = inputs.points, {name: k for k, name in enumerate(adjusted.points)}
@@ -88,13 +82,7 @@ def _refuse_corrections(result: MapResult) -> None:
 
 
 def refuse_cause(causes: Sequence[Cause]) -> None:
-    """Refuse a block that only another camera constant makes one.
-
-    Raises
-    ------
-    GeometryError
-        The likeliest cause is a camera constant that is far off.
-    """
+    """Refuse a block that only another camera constant makes one."""
     if causes and abs(causes[0].change) > _FAR and causes[0].explains > _ALL:
         cause = causes[0]
         raise GeometryError(

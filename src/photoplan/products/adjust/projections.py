@@ -46,16 +46,7 @@ def geometry_of(image: ImageEntry) -> Geometry:
 def block_projections(
     project: Project, images: Sequence[ImageEntry], frame: BlockFrame, level: float | None
 ) -> tuple[BlockProjection, ...]:
-    """The images without poses of a block.
-
-    Parameters
-    ----------
-    project : Project
-    images : sequence of ImageEntry
-    frame : BlockFrame
-    level : float, optional
-        Mean height of control; None: there is none.
-    """
+    """The images without poses of a block."""
     return tuple(_projection(project, image, frame, level) for image in images)
 
 

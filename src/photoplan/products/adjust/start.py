@@ -51,13 +51,6 @@ def started(
     """A map pose for every image; images that cannot be oriented are taken out, with a note that names them.
 
     Without `known`, orientations that are stated are not used; with `earlier`, its poses and cameras are used instead.
-
-    Raises
-    ------
-    GeometryError
-        No image can be oriented.
-    InputError
-        An interior orientation cannot be made (fiducial marks missing), or height systems cannot be joined.
     """
     poses = dict(earlier.poses) if earlier is not None else known_poses(inputs) if known else {}
     _refuse_far(inputs, poses)

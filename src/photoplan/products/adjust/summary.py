@@ -35,17 +35,7 @@ _SOUND, _CONTRADICTED = 30.0, 1.4
 
 
 def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: float) -> AdjustFigures:
-    """The figures of a block.
-
-    Parameters
-    ----------
-    title : str
-    result : MapResult
-    settings : AdjustSettings
-        How it was adjusted.
-    seconds : float
-        How long that took.
-    """
+    """The figures of a block."""
     prepared, adjusted = result.prepared, result.adjusted
     inputs, project = prepared.inputs, prepared.inputs.project
     used = np.isfinite(adjusted.residuals).all(axis=1) & ~adjusted.rejected

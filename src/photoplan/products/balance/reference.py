@@ -55,13 +55,7 @@ class Reference:
 
 
 def open_reference(path: Path, grid: MapGrid, bands: int, dtype: np.dtype[Any]) -> Reference:
-    """A reference for images of some bands and type, compared on a map.
-
-    Raises
-    ------
-    InputError
-        It has other bands or another type of pixels, or lies nowhere on the map.
-    """
+    """A reference for images of some bands and type, compared on a map."""
     reader = RasterReader(path)
     if reader.bands != bands or reader.dtype != dtype:
         raise InputError(

@@ -73,15 +73,7 @@ class Survey:
 
 
 def survey(project: Project, names: Sequence[str], resolution: float | None, events: Events) -> Survey:
-    """Look at images, and choose the map; no pixel is read.
-
-    Raises
-    ------
-    InputError
-        Images differ in bands or type of pixels.
-    GeometryError
-        No two images see terrain, or an orientation cannot be right.
-    """
+    """Look at images, and choose the map; no pixel is read."""
     events.begin("planning", len(names), "images")
     looked, blind = look_at(project, names, False, events)
     if len(looked) < 2:

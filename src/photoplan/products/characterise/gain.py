@@ -24,13 +24,7 @@ def missing(data: SeriesData) -> str | None:
 
 
 def analyse(data: SeriesData) -> Findings:
-    """Every transition, and bright-dark against dark-bright; one that cannot be used is named, and left out.
-
-    Raises
-    ------
-    InputError
-        None can be used.
-    """
+    """Every transition, and bright-dark against dark-bright; one that cannot be used is named, and left out."""
     parts: list[Findings] = []
     found: dict[str, list[GainControl]] = {}
     unfit: dict[str, InputError] = {}

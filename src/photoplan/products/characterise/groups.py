@@ -39,13 +39,7 @@ class FrameGroup:
         return self.group.entry.name or f"entry {self.group.index + 1}"
 
     def times(self) -> NDArray[np.float64]:
-        """Time of each frame, seconds since the first.
-
-        Raises
-        ------
-        InputError
-            A frame has no time, or one that does not come after the frame before.
-        """
+        """Time of each frame, seconds since the first."""
         for frame in self.frames:
             if frame.time_s is None:
                 raise InputError(
@@ -73,13 +67,7 @@ class FrameGroup:
             yield {name: part if (mask := masks[name]) is None else part[mask] for name, part in parts.items()}
 
     def number(self, key: str, default: float, low: float, high: float) -> float:
-        """A number among the entry's values.
-
-        Raises
-        ------
-        InputError
-            It is no number, or outside of what is allowed.
-        """
+        """A number among the entry's values."""
         value = self.group.entry.values.get(key, default)
         if isinstance(value, str) or not low <= value <= high:
             raise InputError(
@@ -88,13 +76,7 @@ class FrameGroup:
         return float(value)
 
     def word(self, key: str, allowed: tuple[str, ...]) -> str:
-        """A word among the entry's values; the first allowed one where it has none.
-
-        Raises
-        ------
-        InputError
-            It is another word.
-        """
+        """A word among the entry's values; the first allowed one where it has none."""
         value = self.group.entry.values.get(key, allowed[0])
         if value not in allowed:
             raise InputError(f"{self.group.label}: values.{key} is {value!r}; allowed are {', '.join(allowed)}")
@@ -118,14 +100,7 @@ class WindowMeans:
 
 
 def window_means(data: SeriesData, group: FrameGroup, window: Window, advice: str) -> dict[str, WindowMeans]:
-    """Means of a window in every frame of an entry, by plane.
-
-    Raises
-    ------
-    InputError
-        Over 1 % of the window is saturated in a frame: at the largest grey value, or at a smaller one where the frames
-        of the entry are cut off; the message ends with the advice.
-    """
+    """Means of a window in every frame of an entry, by plane."""
     means: dict[str, list[float]] = {p.name: [] for p in data.planes}
     variances: dict[str, list[float]] = {p.name: [] for p in data.planes}
     last: dict[str, NDArray[np.float64]] = {}
@@ -175,13 +150,7 @@ def _natural(frame: SeriesFrame, number: str) -> tuple[tuple[int, str | float], 
 
 
 def central_window(window: Window, side: int, where: str) -> Window:
-    """A square in the middle of a window.
-
-    Raises
-    ------
-    InputError
-        The window is smaller.
-    """
+    """A square in the middle of a window."""
     if side > min(window.width, window.height):
         raise InputError(
             f"{where}: a window of {side} × {side} pixels in an area of {window.width} × {window.height}; state "

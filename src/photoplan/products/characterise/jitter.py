@@ -50,13 +50,7 @@ class Edge:
 
 
 def measured_edge(data: SeriesData, frame: SeriesFrame, entry: EdgeEntry, degree: int | None) -> Edge:
-    """An edge of a frame by least squares and by correlation, and the jitter of both.
-
-    Raises
-    ------
-    InputError
-        The edge's window leaves the image, or holds no clean edge.
-    """
+    """An edge of a frame by least squares and by correlation, and the jitter of both."""
     window = Window(*entry.roi)
     assert data.series.size is not None
     if window.stop[0] > data.series.size[0] or window.stop[1] > data.series.size[1]:

@@ -40,13 +40,7 @@ def targets_of(group: FrameGroup) -> tuple[TargetEntry, ...]:
 
 
 def locate_targets(data: SeriesData, group: FrameGroup) -> dict[str, list[Located]]:
-    """Every target in every frame, by correlation, paraboloid and matching (Behr 1989, eq. 4.1 to 4.4).
-
-    Raises
-    ------
-    InputError
-        A window leaves the image or is far too large, or a target is lost in many frames.
-    """
+    """Every target in every frame, by correlation, paraboloid and matching (Behr 1989, eq. 4.1 to 4.4)."""
     found: dict[str, list[Located]] = {t.name: [] for t in targets_of(group)}
     for frame in group.frames:
         for target in targets_of(group):

@@ -70,19 +70,6 @@ def choose_patches(
 
     Places where objects stand are not taken: whether the orthophoto shows them there or beside is not known.
     Squares are the `grid`-th part of a footprint. Patches are of the coarser resolution of orthophoto and photos.
-
-    Returns
-    -------
-    settings : (float, int, int, float)
-        Resolution (metres), radius (cells), search (cells), search (metres).
-    patches : list of OrthoPatch
-
-    Raises
-    ------
-    GeometryError
-        No image sees the ground.
-    UsageError
-        The search has too many cells.
     """
     seen = [_seen(scene) for scene in scenes]
     areas = [s for s in seen if s is not None]

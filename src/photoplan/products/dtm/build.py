@@ -80,15 +80,7 @@ class BuildReport:
 
 
 def load(request: BuildRequest) -> tuple[MeasuredTerrain, tuple[Finding, ...], str, str | None]:
-    """Clean measurements, what cleaning found, their CRS and their height system.
-
-    Raises
-    ------
-    InputError
-        A file cannot be used, or the CRS is not known.
-    HeightSystemError
-        The declared height system is none, or contradicts the files.
-    """
+    """Clean measurements, what cleaning found, their CRS and their height system."""
     raw = read_measured(request.inputs, replace(request.options, height_system=request.height_system))
     if raw.crs is None:
         names = ", ".join(path.name for path in request.inputs)

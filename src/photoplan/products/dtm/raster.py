@@ -84,38 +84,6 @@ def write_grid(
     Windows are computed in threads; no more than two for each worker are held at once. The file appears under its name
     only when it is complete and has been read again (see `ProductFile`). A run that was killed is continued by the
     next one with the same inputs, settings and version.
-
-    Parameters
-    ----------
-    path
-        The file.
-    placement
-        Its size, and where its pixels are.
-    dtype, bands
-        uint8, uint16, int16 or float32; number of bands.
-    nodata
-        A value, `mask` for a mask band, or `auto`: 0 for unsigned integers, -32768 for int16, NaN for float32.
-    tiles
-        Computes a window. Where it gives values alone, a pixel is invalid if all of its bands are nodata (for floats:
-        NaN); with `mask` all are then valid. A valid value that equals nodata becomes its neighbour.
-    options
-        See `GridOptions`.
-
-    Returns
-    -------
-    ProductFacts
-        Path, size, share of valid pixels.
-
-    Raises
-    ------
-    UsageError
-        The output exists, is an input, or lies in a folder that cannot be written; before any window is computed.
-    RunLocked
-        Another run is writing it.
-    ResourceError
-        The disk has too little space, before any window is computed; or it became full.
-    TilesFailed
-        A window failed again and again; nothing stays under the name then.
     """
     path, dtype, times = Path(path), np.dtype(dtype), run_times()
     check_output(path, options.inputs, overwrite=options.overwrite)

@@ -173,13 +173,7 @@ def shade_picture(light: Lighting) -> Callable[[OpenTerrain, MapGrid], Picture]:
 
 
 def slope_picture(unit: str = "degrees", classes: tuple[float, ...] = ()) -> Callable[[OpenTerrain, MapGrid], Picture]:
-    """Slope in `degrees` or `percent` as float32; or the numbers of its classes, with colours.
-
-    Raises
-    ------
-    UsageError
-        The unit is unknown, or the limits of the classes do not rise.
-    """
+    """Slope in `degrees` or `percent` as float32; or the numbers of its classes, with colours."""
     if unit not in ("degrees", "percent"):
         raise UsageError(f"slope in {unit!r}; allowed are degrees and percent")
     measure = shading.slope_degrees if unit == "degrees" else shading.slope_percent
@@ -236,22 +230,7 @@ def tint_picture(
     light: Lighting | None = None,
     strength: float = 0.6,
 ) -> Callable[[OpenTerrain, MapGrid], Picture]:
-    """Height tints, red, green, blue, with a mask.
-
-    Parameters
-    ----------
-    ramp
-        A name of `shading.RAMPS`, or a text file with lines `height red green blue`.
-    span
-        Heights of a built-in ramp's ends; None: those of the terrain inside the grid.
-    steps
-        Number of classes of a built-in ramp; 0 with a file: each height has the colour of the entry below it.
-        None: colours are interpolated.
-    light
-        Combine the tints with this hillshade.
-    strength
-        How much of it, 0 to 1.
-    """
+    """Height tints, red, green, blue, with a mask."""
     if not 0 <= strength <= 1:
         raise UsageError(f"strength {strength} of the hillshade; 0 to 1 are allowed")
 

@@ -186,13 +186,7 @@ def _places(request: VisibleRequest, terrain: OpenTerrain) -> list[Place]:
 
 
 def named_points(path: Path, crs: str, height: float = 0.0) -> list[Place]:
-    """Points of a table (x, y and optionally name, h) or of a vector file in a CRS; `height` where none is stated.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, states another CRS, or holds several points in one.
-    """
+    """Points of a table (x, y and optionally name, h) or of a vector file in a CRS; `height` where none is stated."""
     if path.suffix.lower() in (".csv", ".txt", ".tsv", ".xyz", ".dat"):
         table = read_table(path, COLUMNS)
         eyes, xy = table.numbers("h", empty=True), table.numbers("x", "y")

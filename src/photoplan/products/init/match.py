@@ -24,13 +24,7 @@ class Unoriented:
 
 
 def image_files(patterns: tuple[str, ...]) -> list[Path]:
-    """Files of all patterns, each once, in the order of the patterns and sorted within.
-
-    Raises
-    ------
-    InputError
-        No file matches.
-    """
+    """Files of all patterns, each once, in the order of the patterns and sorted within."""
     found: dict[Path, None] = {}
     for pattern in patterns:
         check_input_name(pattern)
@@ -51,11 +45,6 @@ def match_images(
     """Image files with their orientation, files without, and names without a file.
 
     See `photoplan.io.names.ImageNames` for how names are compared.
-
-    Raises
-    ------
-    InputError
-        Nothing matches, or a file fits several lines equally well.
     """
     by_name = {image.name: image for image in table.images}
     try:
@@ -75,13 +64,7 @@ def match_images(
 
 
 def camera_by_size(file: Path, size: tuple[int, int], cameras: CameraFile) -> str:
-    """Name of the camera of an image of which no table tells: the only one, or the only one of its size.
-
-    Raises
-    ------
-    InputError
-        Several cameras are described, and the size does not decide.
-    """
+    """Name of the camera of an image of which no table tells: the only one, or the only one of its size."""
     if len(cameras.cameras) == 1:
         return next(iter(cameras.cameras))
     of_size = [n for n, c in cameras.cameras.items() if c.size == size and c.fiducial_system is None]
@@ -96,13 +79,7 @@ def camera_by_size(file: Path, size: tuple[int, int], cameras: CameraFile) -> st
 
 
 def camera_name(image: OrientedImage, cameras: CameraFile, table: Path) -> str:
-    """Name of an image's camera: as the table states it, or the only one.
-
-    Raises
-    ------
-    InputError
-        The table names a camera that is not described, or none where there are several.
-    """
+    """Name of an image's camera: as the table states it, or the only one."""
     known = ", ".join(map(repr, cameras.cameras))
     if image.camera is not None:
         if image.camera in cameras.cameras:

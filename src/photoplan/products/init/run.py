@@ -81,13 +81,7 @@ def project_names(files: Sequence[Path]) -> dict[Path, str]:
 
 
 def own_geometry(files: Iterable[Path], folder: Path, names: Mapping[Path, str]) -> dict[Path, OwnGeometry]:
-    """Those of the files that have rational polynomials; tags and files beside the image must agree.
-
-    Raises
-    ------
-    InputError
-        Polynomials that there are cannot be used.
-    """
+    """Those of the files that have rational polynomials; tags and files beside the image must agree."""
     found = {}
     for file in files:
         rpc, beside = rpc_in(file), None
@@ -277,13 +271,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
 
 
 def _readable(files: Sequence[Path]) -> tuple[dict[Path, RasterInfo], list[str]]:
-    """Facts of the images that can be opened, and why others cannot.
-
-    Raises
-    ------
-    InputError
-        None can be opened.
-    """
+    """Facts of the images that can be opened, and why others cannot."""
     infos: dict[Path, RasterInfo] = {}
     unusable: list[str] = []
     for file in files:
@@ -347,13 +335,7 @@ def _judge_area(
 
 
 def _described(request: InitRequest, pairs: Sequence[tuple[Path, object]]) -> CameraFile:
-    """Cameras of the images that need one.
-
-    Raises
-    ------
-    UsageError
-        No file of cameras is given.
-    """
+    """Cameras of the images that need one."""
     if request.camera is not None:
         return read_cameras(request.camera)
     if pairs:

@@ -89,13 +89,7 @@ def _terrain_facts(file: Path) -> TerrainSource:
 
 
 def terrain_entry(request: Systems) -> tuple[StatedTerrain | None, TerrainSource | None]:
-    """The terrain entry (height system still open) and the facts of its file.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used, or its CRS is not known.
-    """
+    """The terrain entry (height system still open) and the facts of its file."""
     if request.terrain is None:
         return None, None
     text = request.terrain.strip()
@@ -124,12 +118,8 @@ def project_crs(
     terrain: TerrainSource | None,
     place: tuple[float, float] | None = None,
 ) -> tuple[str, str]:
-    """The project's CRS and where it comes from; `place` is the latitude and longitude of a satellite image, degrees.
-
-    Raises
-    ------
-    InputError
-        It is not stated, or not projected in metres.
+    """The project's CRS and where it comes from; `place` is the latitude and longitude of a satellite image,
+    degrees.
     """
     if request.crs is not None:
         crs, source = request.crs, "as given"
@@ -173,13 +163,6 @@ def height_systems(
     """Height systems of terrain and orientation (with that of control): as declared, else as the files state.
 
     That of images which bring their geometry along is `ellipsoidal`.
-
-    Raises
-    ------
-    HeightSystemError
-        One of them is not known.
-    UsageError
-        Declared is another one than both files state.
     """
     stated_terrain = terrain.vertical_crs if terrain is not None else None
     stated_table = table.height_system if table is not None else "ellipsoidal" if ellipsoidal else None
@@ -211,13 +194,7 @@ def height_systems(
 
 
 def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS.
-
-    Raises
-    ------
-    InputError
-        The positions are in a CRS to whose axes angles cannot refer.
-    """
+    """Projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS."""
     if table.origin is not None:
         with named_by(table.file):
             centers, axes = topocentric_poses(table.origin, crs, table.centers)
@@ -241,20 +218,7 @@ def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDAr
 def in_declared_unit(
     request: Systems, table: OrientationTable | None, others: Sequence[Path]
 ) -> OrientationTable | None:
-    """The orientation with heights in metres, by the unit of its file or of the height system that is declared for it.
-
-    Parameters
-    ----------
-    others : sequence of Path
-        Files of control and positions, which the same declaration concerns.
-
-    Raises
-    ------
-    InputError
-        The unit of heights is not stated, or the file and the declaration contradict each other.
-    HeightSystemError
-        Heights of `others` would be in another unit than metres, and no file beside them states it.
-    """
+    """The orientation with heights in metres, by the unit of its file or of the height system declared for it."""
     own = None if table is None else table.height_system
     declared = request.orientation_height_system or (request.height_system if own is None else None)
     if declared is not None and declared.strip().casefold() not in ("same", "ellipsoidal"):

@@ -32,18 +32,7 @@ Lab = tuple[NDArray[np.float64], NDArray[np.float64]]
 def group_edges(
     edges: Sequence[MeasuredEdge], size: tuple[int, int] | None, grid: int, lab: Lab | None
 ) -> list[EdgeGroup]:
-    """Means of every channel: all edges, each direction, and both for every cell of the field that has edges.
-
-    Parameters
-    ----------
-    edges : sequence of MeasuredEdge
-    size : tuple of int, optional
-        Width and height of the images; None: they differ, there are no cells.
-    grid : int
-        Cells in each direction; 0 or 1: none.
-    lab : tuple of array, optional
-        Cycles per pixel and modulation of a laboratory.
-    """
+    """Means of every channel: all edges, each direction, and both for every cell of the field that has edges."""
     groups: list[EdgeGroup] = []
     for channel in sorted({edge.channel for edge in edges}):
         own = [edge for edge in edges if edge.channel == channel]

@@ -48,13 +48,7 @@ class LightImage:
 
     @classmethod
     def open(cls, path: Path, linearisation: Linearisation) -> LightImage:
-        """Open a file; its pixels are not read yet.
-
-        Raises
-        ------
-        InputError
-            The file cannot be used.
-        """
+        """Open a file; its pixels are not read yet."""
         return cls(RasterReader(path), linearisation, {}, {})
 
     @property
@@ -69,13 +63,7 @@ class LightImage:
         return f"band {channel}"
 
     def channels(self, band: str | None) -> tuple[int, ...]:
-        """Channels that an option asks for: None: luminance or the first band, a number, or all.
-
-        Raises
-        ------
-        UsageError
-            There is no such band.
-        """
+        """Channels that an option asks for: None: luminance or the first band, a number, or all."""
         bands = self.reader.bands
         if band is None:
             return (LUMINANCE,) if bands >= 3 or bands == 1 else (1,)
@@ -86,13 +74,7 @@ class LightImage:
         return (int(band),)
 
     def picture(self, window: Window, channel: int) -> EdgePicture:
-        """Light of a channel in a window, with the range of values of the whole image.
-
-        Raises
-        ------
-        InputError
-            The pixels are damaged, or the table of the linearisation does not hold their values.
-        """
+        """Light of a channel in a window, with the range of values of the whole image."""
         # First the samples of the whole image: they tell whether an end of a window is one of the image.
         span = self._span(channel)
         grey, valid, saturated = self._light(window, channel)

@@ -45,13 +45,7 @@ class Measuring:
     """Cycles per pixel, and modulation."""
 
     def areas(self, image: LightImage) -> list[Window]:
-        """Windows that are searched.
-
-        Raises
-        ------
-        UsageError
-            A given one is empty or leaves the image.
-        """
+        """Windows that are searched."""
         width, height = image.size
         if not self.rois:
             return [Window(0, 0, width, height)]
@@ -70,24 +64,7 @@ class Measuring:
 
 
 def measure_image(name: str, path: Path, image: LightImage, how: Measuring, advance: Advance) -> ImageMtf:
-    """Find and measure the edges of an image.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    path : Path
-        Its file as it was given.
-    advance : callable
-        Called with (tiles, pixels) as they are done.
-
-    Raises
-    ------
-    InputError
-        No edge can be measured, with the reasons; or the pixels are damaged.
-    UsageError
-        A window leaves the image, or it has no such band.
-    """
+    """Find and measure the edges of an image."""
     channels = image.channels(how.band)
     chosen, count, rejected = _regions(image, channels[0], how, advance)
     edges, refusals = _measure_all(image, channels, chosen, how, advance)

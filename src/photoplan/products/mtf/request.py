@@ -16,19 +16,7 @@ ENCODED = (
 
 
 def check_files(images: Sequence[Path], tables: Sequence[Path | str | None], csv: Path | None, overwrite: bool) -> None:
-    """Refuse images, inputs and outputs that cannot be meant together.
-
-    Parameters
-    ----------
-    images : sequence of Path
-    tables : sequence
-        Other inputs; None and the words ``linear`` and ``srgb`` are no files.
-
-    Raises
-    ------
-    UsageError
-        Naming the option.
-    """
+    """Refuse images, inputs and outputs that cannot be meant together."""
     if not images:
         raise UsageError("no image is given; give one or more images")
     files = [str(path) for path in images]

@@ -157,13 +157,7 @@ def _opened(
 
 
 def _check(request: MtfRequest) -> None:
-    """Refuse what cannot be meant before any work.
-
-    Raises
-    ------
-    UsageError
-        Naming the option.
-    """
+    """Refuse what cannot be meant before any work."""
     if not 1 <= request.grid <= MOST_CELLS:
         raise UsageError(f"`grid` {request.grid}; 1 to {MOST_CELLS} cells are allowed")
     if not 1 <= request.most_edges <= MOST_EDGES:

@@ -54,25 +54,7 @@ def search_edges(
     rules: EdgeRules,
     advance: Callable[[int, int], None] = lambda tiles, pixels: None,
 ) -> FoundEdges:
-    """Edges in a part of an image; pixels outside that part are not used.
-
-    Parameters
-    ----------
-    area : Window
-        Inside the image.
-    advance : callable
-        Called with (1, pixels) after each tile.
-
-    Returns
-    -------
-    FoundEdges
-        In pixel coordinates of the image.
-
-    Raises
-    ------
-    InputError
-        Pixels are damaged.
-    """
+    """Edges in a part of an image; pixels outside that part are not used."""
     found, open_lines = FoundEdges(), []
     margin = max(rules.halves) + 4
     for tile in tiles_of(area):

@@ -24,13 +24,7 @@ from photoplan.targets.map import MapTarget
 
 
 def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: SingleObject | None = None) -> str:
-    """Key of a product of a project, or of what it shows of a single object.
-
-    Raises
-    ------
-    InputError
-        A file is missing, or nothing is known of errors that are asked for.
-    """
+    """Key of a product of a project, or of what it shows of a single object."""
     address = ScenesAddress.of(project, plan.sources, part)
     facts = address.facts if not settings.accuracy else [address.facts, known_errors(address, plan, settings).facts]
     drawn = None
@@ -88,14 +82,6 @@ def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions
     """Hash of what decides a product's pixels, and of nothing else.
 
     Another key means that finished tiles are of no use.
-
-    Parameters
-    ----------
-    scenes : plain value
-        What moves a pixel of its images, see `SceneAddress.facts`.
-    plan, settings
-    regions : str, optional
-        Digest of the file of drawn regions.
     """
     facts = {
         **_common(plan, settings),

@@ -144,13 +144,7 @@ def _meet(bounds: tuple[float, float, float, float] | None, grid: MapGrid) -> bo
 def drawn_regions(
     project: Project, settings: OrthoSettings, images: tuple[str, ...], grid: MapGrid, known: Sequence[str] = ()
 ) -> Regions | None:
-    """Regions of the choice's file; None: it has none. Those of `known` images that are no sources are left out.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used, see `read_regions`.
-    """
+    """Regions of the choice's file; None: it has none. Those of `known` images that are no sources are left out."""
     if settings.choice is None or settings.choice.seams is None:
         return None
     return read_regions(project.resolve(settings.choice.seams), images, grid, known)

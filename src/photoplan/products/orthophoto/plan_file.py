@@ -86,14 +86,7 @@ class PlanFigures:
 
 
 def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
-    """Compile relief and anchors of every tile, keep the figures, forget the rest.
-
-    Parameters
-    ----------
-    plan : OrthoPlan
-    events : Events
-        Told of each tile.
-    """
+    """Compile relief and anchors of every tile, keep the figures, forget the rest."""
     counts = [len(p.plan.tiles) for p in plan.products]
     events.begin("compiling tiles", sum(counts))
     product = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
@@ -121,28 +114,7 @@ def write_plan(
     overwrite: bool = False,
     squares: PlanSquares | None = None,
 ) -> None:
-    """Write a plan as a GeoPackage with the layers `tiles` and `footprints`, and `quadtree` if there are squares.
-
-    Parameters
-    ----------
-    path : Path
-    plan : OrthoPlan
-    figures : PlanFigures
-        Of this plan, from `compile_figures`.
-    output : Path
-        Folder for the products when the plan is executed.
-    overwrite : bool
-        Whether an existing file may be replaced.
-    squares : PlanSquares, optional
-        Objects of this plan, from `plan_squares`.
-
-    Raises
-    ------
-    UsageError
-        The file exists and `overwrite` is False, is an input or the project, or cannot be written.
-    ResourceError
-        The disk is full.
-    """
+    """Write a plan as a GeoPackage with the layers `tiles` and `footprints`, and `quadtree` if there are squares."""
     check_plan_path(path, plan, overwrite)
     counts = np.bincount(figures.product, minlength=len(plan.products))
     header = {
@@ -196,13 +168,7 @@ def write_plan(
 
 
 def check_plan_path(path: Path, plan: OrthoPlan, overwrite: bool = False) -> None:
-    """Refuse a place for a plan before the work of compiling it.
-
-    Raises
-    ------
-    UsageError
-        The name is not that of a GeoPackage, the file exists and `overwrite` is False, or it is an input.
-    """
+    """Refuse a place for a plan before the work of compiling it."""
     if path.suffix.lower() != ".gpkg":
         raise UsageError(f"{path}: a plan is a GeoPackage; give it a name that ends in .gpkg")
     check_output(path, input_files(plan.project), overwrite=overwrite)

@@ -39,11 +39,6 @@ class PlanSquares:
 def plan_squares(plan: OrthoPlan) -> PlanSquares:
     """Objects decomposed in the way of Behr: a mesh is a tile, and is divided until its squares are no larger than a
     pixel.
-
-    Raises
-    ------
-    UsageError
-        No product of the plan shows an object, or there would be too many squares.
     """
     bounds, counts = [np.empty((0, 4))], []
     columns: dict[str, list[NDArray[Any]]] = {name: [] for name in ("product", "object", "level", "side", "height")}

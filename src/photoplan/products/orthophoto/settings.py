@@ -172,13 +172,7 @@ class OrthoSettings:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> OrthoSettings:
-        """Settings from plain values, by name.
-
-        Raises
-        ------
-        UsageError
-            A name is unknown or a value not allowed.
-        """
+        """Settings from plain values, by name."""
         known = {f.name for f in fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:

@@ -49,13 +49,6 @@ class Sheet:
 def drawn_sheets(grid: MapGrid, path: Path) -> list[Sheet]:
     """Polygons of a file that touch a grid, each on whole pixels of it; a pixel belongs to the polygon that holds its
     centre, so that sheets with a common line share none.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used, see `read_features`, or two polygons have one name.
-    UsageError
-        There are too many polygons.
     """
     found: list[Sheet] = []
     names: dict[str, str] = {}
@@ -85,11 +78,6 @@ def drawn_sheets(grid: MapGrid, path: Path) -> list[Sheet]:
 def sheets_of(grid: MapGrid, size: float) -> list[Sheet]:
     """Squares between multiples of a size that touch a grid, from north to south; their names end with the coordinates
     of their south-west corner.
-
-    Raises
-    ------
-    UsageError
-        The size is no multiple of the pixels, or gives too many sheets.
     """
     if not (math.isfinite(size) and size > 0):
         raise UsageError(f"`sheets` {size:g}; the side of a sheet in metres is needed")

@@ -43,17 +43,7 @@ class Pair:
 
 
 def open_pair(first: Path, second: Path) -> Pair:
-    """Open two images.
-
-    Raises
-    ------
-    UsageError
-        Both are the same file.
-    InputError
-        One cannot be used, or they lie in different reference systems, or have different sizes and lie nowhere.
-    GeometryError
-        They have nothing in common.
-    """
+    """Open two images."""
     if first.exists() and second.exists() and first.samefile(second):
         raise UsageError(f"{second}: is the first image, too; give two images")
     readers = RasterReader(first), RasterReader(second)

@@ -150,13 +150,7 @@ class RestoreJob:
 
 
 def restoration(job: Job, how: RestoreRequest, events: Events) -> Work[RestoredImage | None]:
-    """What there is to do for an image, or for what an earlier run has left of it.
-
-    Raises
-    ------
-    UsageError
-        Its pixels cannot be stored.
-    """
+    """What there is to do for an image, or for what an earlier run has left of it."""
     reader = job.reader
     for note in reader.info.warnings:
         events.talk(f"note: {note}")

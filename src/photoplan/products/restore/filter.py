@@ -53,20 +53,7 @@ class FoundFilter:
 
 
 def requested_filter(request: FilterRequest, events: Events = SILENT) -> FoundFilter:
-    """The filter that is asked for.
-
-    Parameters
-    ----------
-    events : Events
-        Told how far a measurement is, and what was found.
-
-    Raises
-    ------
-    UsageError
-        The aperture is not understood, or the images cannot have one filter.
-    InputError
-        The file is no filter, the aperture cannot be undone, or the images do not determine a filter.
-    """
+    """The filter that is asked for."""
     if request.none:
         return FoundFilter(RestorationFilter((FilterKernel(np.ones((1, 1))),), description=NO_FILTER), "")
     if request.file is not None:
@@ -81,13 +68,7 @@ def requested_filter(request: FilterRequest, events: Events = SILENT) -> FoundFi
 
 
 def keep_filter(path: Path, filter_: RestorationFilter, *, overwrite: bool = False) -> Path:
-    """Write a filter beside its results, unless the file holds the very same one already.
-
-    Raises
-    ------
-    UsageError
-        The file exists with another content and `overwrite` is False, or its folder cannot be written.
-    """
+    """Write a filter beside its results, unless the file holds the very same one already."""
     try:
         if path.read_text(encoding="utf-8") == filter_text(entries_of(filter_)):
             return path

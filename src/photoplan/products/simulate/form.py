@@ -84,13 +84,7 @@ class Forming:
         return ResultLog.place(self.output).exists()
 
     def planned(self) -> SimulateReport:
-        """What would be made.
-
-        Raises
-        ------
-        UsageError
-            An output exists.
-        """
+        """What would be made."""
         for path, _ in self.frames:
             check_output(path, self.inputs, overwrite=self.overwrite)
         return self._report(
@@ -98,15 +92,7 @@ class Forming:
         )
 
     def form(self, events: Events) -> SimulateReport:
-        """Form and write the images, and their record.
-
-        Raises
-        ------
-        UsageError
-            An output exists.
-        ResourceError
-            There is too little memory.
-        """
+        """Form and write the images, and their record."""
         times, key = run_times(), self.key
         with ResultLog.beside(self.output, key, locked=False) as log:
             for frame, (path, _) in enumerate(self.frames):
@@ -141,13 +127,7 @@ class Forming:
 
 
 def stated_model(path: Path | None, seed: int | None, dtype: str | None) -> tuple[ImageModel, str]:
-    """The model of a file with another seed and type of pixels, where these are given, and the type of the files.
-
-    Raises
-    ------
-    InputError, UsageError
-        The file cannot be used, the seed is none, or the type does not hold the model's grey values.
-    """
+    """The model of a file with another seed and type of pixels, where these are given, and the type of the files."""
     model = ImageModel() if path is None else read_model(path)
     if seed is not None:
         if not 0 <= seed < 2**62:
@@ -164,12 +144,7 @@ def stated_model(path: Path | None, seed: int | None, dtype: str | None) -> tupl
 
 
 def check_fit(scene: LightScene, name: str, model: ImageModel, described: Path | None) -> None:
-    """Refuse scenes that are too large, or lack a band that a model, with the file that describes it, speaks of.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse scenes that are too large, or lack a band that a model, with the file that describes it, speaks of."""
     if scene.size[0] * scene.size[1] * scene.bands > MOST_PIXELS:
         raise InputError(
             f"{name}: {scene.bands} × {scene.size[0]} × {scene.size[1]} pixels; at most {MOST_PIXELS:,} are "

@@ -60,14 +60,7 @@ def _strict(kind: Any) -> Any:
 
 
 def read_model(path: Path) -> ImageModel:
-    """Model of a description.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, an entry is unknown or of a wrong type (the message names its line), or a value is
-        outside its range.
-    """
+    """Model of a description."""
     return model_of(read_entries(path, entry_of(ImageModel), _MAX_BYTES), str(path))
 
 
@@ -123,18 +116,7 @@ def form_frames(
     run: Steps,
     store: Store,
 ) -> list[SimulatedImage]:
-    """Form frames one after the other, since automatic gain runs through them, and write each.
-
-    Parameters
-    ----------
-    model, scene
-    frames : sequence of (Path, float)
-        File and exposure of each.
-    dtype, tags
-        Type of the pixels, and tags of the files.
-    run, store
-        Make the parts, and keep them.
-    """
+    """Form frames one after the other, since automatic gain runs through them, and write each."""
     images: list[SimulatedImage] = []
     gain, light = 1.0, None
     for n, (path, exposure) in enumerate(frames):

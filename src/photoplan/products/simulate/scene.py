@@ -62,13 +62,7 @@ def true_orthophoto(
     path: Path,
     options: GridOptions,
 ) -> TruthRaster:
-    """The scene's own colours on the map: means over the pixels of what lies uppermost.
-
-    Raises
-    ------
-    UsageError
-        No bounds are given, and the terrain has none.
-    """
+    """The scene's own colours on the map: means over the pixels of what lies uppermost."""
     bounds = bounds or scene.ground.bounds
     if bounds is None:
         raise UsageError("the terrain has no bounds; give `bounds` of the true orthophoto")

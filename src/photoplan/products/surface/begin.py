@@ -31,15 +31,7 @@ class StartGap:
 def start_gap(
     start: str, reach: float, bounds: Bounds, crs: str, looked: Sequence[SeenTarget], ground: Ground
 ) -> StartGap:
-    """Compare a start with the project's terrain, place by place inside the bounds.
-
-    Raises
-    ------
-    UsageError
-        Fewer than two images can see its lowest height from above.
-    InputError
-        Its file cannot be used.
-    """
+    """Compare a start with the project's terrain, place by place inside the bounds."""
     if start == "terrain":
         return StartGap()
     x0, y0, x1, y1 = bounds

@@ -33,19 +33,7 @@ def findings(
     correction: float,
     astray: float,
 ) -> tuple[str, ...]:
-    """Lines about a surface that should not be trusted as it is; none if nothing speaks against it.
-
-    Parameters
-    ----------
-    plan : SurfacePlan
-    sigma0 : dict
-        Standard deviation of a grey value by image.
-    contrast : float
-        Standard deviation of the surface's grey values.
-    sigma_px, misfit_share, correction, astray
-        Of the heights: see `SurfaceResult`; the last correction of the finest level; the part of the posts that has
-        none since it went too far from the start.
-    """
+    """Lines about a surface that should not be trusted as it is; none if nothing speaks against it."""
     return (
         *filter(None, [plan.gap_text]),
         *_of_images(plan, sigma0, contrast),
@@ -60,11 +48,6 @@ def contradicted(plan: SurfacePlan, totals: Mapping[str, Any]) -> str:
 
     They do if heights are hardly better known than the reach says (images agree at none of them) although there is
     texture: residuals are larger than what the pixels of each image show to be noise, or than noise of any camera.
-
-    Parameters
-    ----------
-    totals : mapping
-        Figures of all tiles: see `SurfaceJob`.
     """
     sigma, (squares, redundancy) = median(totals["sigmas"]), (np.array(totals[k]) for k in ("squares", "redundancy"))
     noise = np.reshape(totals["noise"], (-1, 3))

@@ -156,11 +156,6 @@ def _start(
 ) -> Callable[[_Doubles], _Doubles]:
     """Heights with which a surface begins, in the system of the cameras; those of a user are in the one that their file
     states, or in the orientation's.
-
-    Raises
-    ------
-    InputError
-        They are those of a file that has changed since it was planned.
     """
     if begun is not None:
         path, digest = begun

@@ -55,28 +55,7 @@ def scheme_of(
     gsd: float,
     pixels_there: NDArray[np.float64],
 ) -> tuple[Scheme, float]:
-    """The scheme of a surface, and what one pixel of parallax between the outermost images is in height, metres.
-
-    Parameters
-    ----------
-    settings : SurfaceSettings
-    looked : sequence of SeenTarget
-    grid : MapGrid
-        Its pixels are the height posts.
-    frame : Frame or None
-        Of the target; None: the map.
-    gsd : float
-        Of the images, metres.
-    pixels_there : ndarray
-        See `pixels_of_places`.
-
-    Raises
-    ------
-    GeometryError
-        Images see everything from the same direction.
-    UsageError
-        The reach goes beyond what there can be.
-    """
+    """The scheme of a surface, and what one pixel of parallax between the outermost images is in height, metres."""
     pixels = settings.resolution / gsd
     ratio, base = _facets(pixels, MOST_RATIO, _pixels_beyond_two(pixels_there))
     height_error, usual = _heights_of_a_pixel(looked, gsd)

@@ -58,15 +58,7 @@ class SurfaceSettings:
 
 
 def check_start(project: Project, settings: SurfaceSettings) -> None:
-    """Refuse a start that is none.
-
-    Raises
-    ------
-    UsageError
-        It is no height and no file, or a reach or name makes no sense.
-    InputError
-        The file cannot be used.
-    """
+    """Refuse a start that is none."""
     if settings.reach is not None and not 0 < settings.reach <= MOST_HEIGHT:
         raise UsageError(f"reach {settings.reach}; a positive number of metres is needed, {MOST_HEIGHT:g} at most")
     name = settings.name

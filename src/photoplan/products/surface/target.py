@@ -74,13 +74,7 @@ def over_map(project: Project, names: Sequence[str], force: bool, events: Events
 def over_frame(
     project: Project, names: Sequence[str], frame: Frame, bounds: Bounds, height: float, events: Events
 ) -> tuple[list[SeenTarget], list[str]]:
-    """Images that see a part of a target at a height, and a line for each that sees none.
-
-    Raises
-    ------
-    GeometryError
-        All images stand behind the target.
-    """
+    """Images that see a part of a target at a height, and a line for each that sees none."""
     u, v = (np.linspace(bounds[k], bounds[k + 2], _POINTS) for k in (0, 1))
     uvh = np.stack([*np.meshgrid(u, v), np.full((_POINTS, _POINTS), height)], axis=-1).reshape(-1, 3)
     names, blind = project.oriented(names)

@@ -94,13 +94,7 @@ class TieImage:
 
 
 def open_images(project_: Project, names: Sequence[str], use_orientation: bool) -> tuple[list[TieImage], list[str]]:
-    """The images of a project, and notes on what is not known of some.
-
-    Raises
-    ------
-    InputError
-        An image cannot be read, or has another size than its camera.
-    """
+    """The images of a project, and notes on what is not known of some."""
     images = [project_.image(name) for name in names]
     positions = _positions(project_, use_orientation)
     cameras, levels = _placed(project_, images) if use_orientation else ([None] * len(images), [np.nan] * len(images))
@@ -182,19 +176,7 @@ def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[CentralCam
 
 
 def chosen_pairs(images: Sequence[TieImage], how: str) -> tuple[list[tuple[int, int]] | None, str]:
-    """Pairs to look at and how they were chosen; None: the features must tell.
-
-    Parameters
-    ----------
-    images : sequence of TieImage
-    how : str
-        ``"auto"``, ``"all"``, or a file with the names of two images in each line.
-
-    Raises
-    ------
-    InputError
-        The file names an image that is not among these.
-    """
+    """Pairs to look at and how they were chosen; None: the features must tell."""
     if how == "all":
         return all_pairs(len(images)), "all pairs"
     if how != "auto":

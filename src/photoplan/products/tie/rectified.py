@@ -126,15 +126,7 @@ class MapView:
 
 
 def open_rectified(project_: Project, names: Sequence[str], use_orientation: bool) -> tuple[list[TieImage], list[str]]:
-    """The images of a project on the map, at the coarsest of their resolutions, and a note of that.
-
-    Raises
-    ------
-    UsageError
-        Orientations are not to be used.
-    InputError
-        The project has no terrain, or an image cannot be read or sees nothing of it.
-    """
+    """The images of a project on the map, at the coarsest of their resolutions, and a note of that."""
     if not use_orientation:
         raise UsageError("satellites and strips are matched on the map, by the orientation that they come with; use it")
     scenes = [open_scene(project_, name) for name in names]
@@ -162,16 +154,7 @@ def open_rectified(project_: Project, names: Sequence[str], use_orientation: boo
 
 
 def carried_back(tracks: Tracks, images: Sequence[TieImage], points: ImagePoints) -> ImagePoints:
-    """Points that were found on the map, where they lie in the images; tracks that keep fewer than two places go.
-
-    Parameters
-    ----------
-    tracks : Tracks
-        On the map.
-    images : sequence of TieImage
-    points : ImagePoints
-        The same by names.
-    """
+    """Points that were found on the map, where they lie in the images; tracks that keep fewer than two places go."""
     xy, sigma = np.full_like(points.xy, np.nan), np.full_like(points.xy, np.nan)
     good = np.zeros(len(points), bool)
     for k in np.unique(tracks.image):

@@ -179,22 +179,7 @@ class ViewCamera:
 
 
 def view_camera(request: CameraRequest, ground: ViewGround, force: bool = False) -> ViewCamera:
-    """Put a camera on the ground.
-
-    Parameters
-    ----------
-    request : CameraRequest
-    ground : ViewGround
-    force : bool
-        Also where the point of view lies below the ground.
-
-    Raises
-    ------
-    InputError
-        The project has no such image, or the ground has no height where one is needed.
-    GeometryError
-        The point of view lies below the ground, or an exaggeration finds no height to leave as it is.
-    """
+    """Put a camera on the ground."""
     made = _of_image(request, ground) if request.image is not None else _of_standpoint(request, ground)
     if made.above_ground < 0 and not force:
         x, y, z = made.target.center

@@ -73,11 +73,6 @@ class ContentRequest:
     def parse(cls, text: str) -> ContentRequest:
         """Read ``WHAT`` or ``WHAT@OPACITY``: ``shade``, ``slope``, ``photos``, ``photo:NAME``, ``tint``,
         ``tint:RAMP``, ``tint:RAMP:LOW:HIGH``, or the file of a raster, with ``@classes`` if its values are classes.
-
-        Raises
-        ------
-        UsageError
-            It is none of these.
         """
         opacity, classes = 1.0, False
         while "@" in text and not Path(text).exists():
@@ -236,24 +231,7 @@ def illumination(normal: NDArray[np.float64], light: Lighting) -> NDArray[np.flo
 def open_layers(
     requests: Sequence[ContentRequest], ground: ViewGround, light: Lighting, heights: tuple[float, float]
 ) -> tuple[ViewLayer, ...]:
-    """Contents, ready to paint.
-
-    Parameters
-    ----------
-    requests
-    ground
-    light
-        For shades.
-    heights : (float, float)
-        Of what is seen, for tints whose range is not stated.
-
-    Raises
-    ------
-    InputError
-        A file cannot be used, or lies nowhere.
-    UsageError
-        A ramp is unknown, or there is no such photo.
-    """
+    """Contents, ready to paint."""
     return tuple(_layer(request, k == 0, ground, light, heights) for k, request in enumerate(requests))
 
 

@@ -42,36 +42,14 @@ class ViewGround:
 
     @property
     def named(self) -> Project:
-        """The project.
-
-        Raises
-        ------
-        UsageError
-            There is only a terrain model.
-        """
+        """The project."""
         if self.project is None:
             raise UsageError("a terrain model has no images; give a project, or a standpoint `position`")
         return self.project
 
 
 def open_view_ground(path: Path, crs: str | None = None, water: float | None = None) -> ViewGround:
-    """The ground of a project file (``.toml``) or of a terrain model.
-
-    Parameters
-    ----------
-    path : Path
-    crs : str, optional
-        CRS of a terrain model that does not state its own.
-    water : float, optional
-        Height of water that covers what is lower, or has no height, metres.
-
-    Raises
-    ------
-    UsageError
-        The water lies higher than any on earth.
-    InputError
-        The file cannot be used.
-    """
+    """The ground of a project file (``.toml``) or of a terrain model."""
     ground = _dry_ground(path, crs)
     if water is None:
         return ground

@@ -92,13 +92,7 @@ class ViewAddress:
     """Path and content digest of each input file."""
 
     def open(self) -> OpenView:
-        """The view; kept for the next tile.
-
-        Raises
-        ------
-        InputError
-            An input has changed since it was planned.
-        """
+        """The view; kept for the next tile."""
         return _open(self)
 
 

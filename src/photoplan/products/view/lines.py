@@ -50,13 +50,7 @@ class LinesRequest:
 
     @classmethod
     def parse(cls, text: str) -> LinesRequest:
-        """From ``FILE``, ``FILE:LAYER`` or ``contours:INTERVAL``, each with ``@KEY=VALUE,KEY=VALUE``.
-
-        Raises
-        ------
-        UsageError
-            It is none of these.
-        """
+        """From ``FILE``, ``FILE:LAYER`` or ``contours:INTERVAL``, each with ``@KEY=VALUE,KEY=VALUE``."""
         head, _, tail = text.rpartition("@") if "=" in text.rpartition("@")[2] else (text, "", "")
         pairs = [tuple(part.strip() for part in each.split("=", 1)) for each in tail.split(",")] if tail else []
         wrong = [each for each in pairs if len(each) != 2 or each[0] not in KEYS]
@@ -104,22 +98,7 @@ class Drawing:
 
 
 def open_drawing(requests: Sequence[LinesRequest], ground: ViewGround, reach: float, center: Any) -> Drawing:
-    """All layers, one after the other.
-
-    Parameters
-    ----------
-    requests
-    ground
-    reach : float
-        Contours are traced so far around the standpoint, metres.
-    center : array_like
-        The standpoint.
-
-    Raises
-    ------
-    InputError
-        A file cannot be used, or an attribute holds what is no value.
-    """
+    """All layers, one after the other."""
     made = [
         _contours(each, ground, reach, np.asarray(center)) if each.path is None else _features(each, ground)
         for each in requests

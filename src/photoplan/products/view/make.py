@@ -203,15 +203,7 @@ def plan_view(request: ViewRequest) -> ViewPlan:
 
 
 def camera_request(request: ViewRequest) -> CameraRequest:
-    """The camera that is stated, or that of the matrix.
-
-    Raises
-    ------
-    UsageError
-        There is neither.
-    InputError
-        The matrix does not say it.
-    """
+    """The camera that is stated, or that of the matrix."""
     if request.camera is not None:
         return request.camera
     if request.matrix is None:

@@ -180,17 +180,7 @@ def dashed(piece: NDArray[np.float64], dash: tuple[float, ...]) -> list[NDArray[
 
 
 def overlay(drawing: Drawing, sight: LinesOfSight, lettering: Lettering | None, text_size: float) -> Overlay:
-    """Find what is seen of a drawing, and places for labels.
-
-    Parameters
-    ----------
-    drawing
-    sight
-    lettering : callable or None
-        Draws a text; None: there are no labels.
-    text_size : float
-        Pixels.
-    """
+    """Find what is seen of a drawing, and places for labels."""
     seen = sight.lines(drawing.lines)
     layers = [
         Stroke(style, tuple(simpler(seen, np.flatnonzero(drawing.style[seen.line] == k))))

@@ -22,26 +22,7 @@ MOST_FRAMES = 100_000
 
 
 def stations(path: Path, layer: str | None, step: float | None, ground: ViewGround) -> _Floats:
-    """Places (n, 3) along a path; NaN height: none is stated.
-
-    Parameters
-    ----------
-    path : Path
-        ``.csv`` or ``.txt``: a table of columns x, y and optionally z; else points in their order, or one line.
-    layer : str, optional
-        Of a file with several.
-    step : float, optional
-        Between stations of a line, metres; of points and tables None.
-    ground : ViewGround
-        Its CRS is that of the stations.
-
-    Raises
-    ------
-    InputError
-        The file cannot be used, or holds neither two stations nor one line.
-    UsageError
-        A line without `step`, or stations with one, or too many of them.
-    """
+    """Places (n, 3) along a path; NaN height: none is stated."""
     if path.suffix.lower() in (".csv", ".txt"):
         roles = {"x": ("x", "e", "east", "easting"), "y": ("y", "n", "north", "northing"), "z": ("z", "h", "height")}
         table = read_table(path, Columns(roles=roles, needed=("x", "y"), row="station"))

@@ -36,13 +36,7 @@ class PhotoRequest:
 
     @classmethod
     def parse(cls, text: str) -> PhotoRequest:
-        """From ``FILE``, ``FILE@OPACITY``, ``FILE@squares`` or ``FILE@beside``.
-
-        Raises
-        ------
-        UsageError
-            It is none of these.
-        """
+        """From ``FILE``, ``FILE@OPACITY``, ``FILE@squares`` or ``FILE@beside``."""
         head, _, tail = text.rpartition("@")
         if not head or Path(text).is_file():
             return cls(text)
@@ -63,12 +57,7 @@ class ViewPhoto:
 
     @classmethod
     def open(cls, request: PhotoRequest, size: tuple[int, int]) -> ViewPhoto:
-        """
-        Raises
-        ------
-        InputError
-            The file cannot be used, or has another size than the picture.
-        """
+        """"""
         reader = RasterReader(Path(request.path))
         if reader.size != size:
             own, asked = (" × ".join(map(str, each)) for each in (reader.size, size))

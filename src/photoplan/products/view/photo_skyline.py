@@ -125,17 +125,7 @@ class PhotoMatch:
 def against_photo(
     request: PhotoSkylineRequest, camera: ViewCamera, find: Finder
 ) -> tuple[PhotoMatch, PhotoMatch | None]:
-    """Both lines with the camera as it is, and with the one that the skyline asks for; None: that was not asked for.
-
-    Raises
-    ------
-    UsageError
-        A turn of what is no plane picture, or of raised heights.
-    InputError
-        The photograph or the control cannot be used.
-    GeometryError
-        The skyline does not determine the camera.
-    """
+    """Both lines with the camera as it is, and with the one that the skyline asks for; None: that was not asked for."""
     target, size = camera.target, camera.target.bundle.size
     if camera.request.exaggeration != 1.0:
         raise UsageError("a photograph shows heights as they are; leave `exaggeration` away")

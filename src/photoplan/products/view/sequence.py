@@ -158,13 +158,7 @@ def _path_of(work: Work[Any]) -> Any:
 
 
 def write_film(path: Path, folder: Path, rate: float, count: int) -> None:
-    """Join the first `count` pictures of a folder by ffmpeg (H.264; sides are made even).
-
-    Raises
-    ------
-    PhotoplanError
-        ffmpeg could not; its last words are told.
-    """
+    """Join the first `count` pictures of a folder by ffmpeg (H.264; sides are made even)."""
     pictures = str(folder / "frame_%05d.png")
     words = ["ffmpeg", "-y", "-loglevel", "error", "-framerate", f"{rate:g}", "-i", pictures, "-pix_fmt", "yuv420p"]
     words += ["-frames:v", str(count), "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"]

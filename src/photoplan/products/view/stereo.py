@@ -55,13 +55,7 @@ class Stereo:
 
 
 def eyes(camera: ViewCamera, base: float) -> tuple[CameraRequest, CameraRequest]:
-    """The left and the right camera: moved by half the base along the rows of the picture, axes parallel.
-
-    Raises
-    ------
-    UsageError
-        It is a panorama: it has no rows to move along.
-    """
+    """The left and the right camera: moved by half the base along the rows of the picture, axes parallel."""
     request, target = camera.request, camera.target
     if not isinstance(target.bundle, FrameBundle):
         raise UsageError("a stereo pair needs a plane picture; panoramas have one place only")

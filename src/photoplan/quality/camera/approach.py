@@ -71,13 +71,7 @@ class Approach:
 
 
 def check_times(times: Array, what: str) -> Array:
-    """Times as finite, increasing numbers.
-
-    Raises
-    ------
-    InputError
-        A time is missing, or does not come after the one before; the message numbers it.
-    """
+    """Times as finite, increasing numbers."""
     t = np.asarray(times, float)
     if t.ndim != 1:
         raise InputError(f"{what}: times of shape {t.shape}; one per measurement is needed")
@@ -95,21 +89,7 @@ def check_times(times: Array, what: str) -> Array:
 
 
 def fit_approach(times: Array, values: Array, what: str = "series") -> Approach:
-    """Exponential by least squares, tested against a constant.
-
-    Parameters
-    ----------
-    times : ndarray, shape (n,)
-        Increasing.
-    values : ndarray, shape (n,)
-    what : str
-        What is measured, for messages.
-
-    Raises
-    ------
-    InputError
-        Less than `LEAST_VALUES` values, a value that is not finite, times that do not increase.
-    """
+    """Exponential by least squares, tested against a constant."""
     t, y = _checked(times, values, what)
     t = t - t[0]
     mean, n = float(y.mean()), len(y)

@@ -60,27 +60,7 @@ def find_blooming(
     saturation: float,
     step: float = 1.0,
 ) -> Blooming:
-    """Onset and extent of blooming around the brightest object.
-
-    Parameters
-    ----------
-    exposures : sequence of float
-        Increasing.
-    images : sequence of array, each of shape (h, w)
-        Mean images at these exposures.
-    black : float or sequence of float
-        Grey value without light, of all images or of each.
-    saturation : float
-        Grey value of full pixels.
-    step : float
-        Distance of neighbouring grey values.
-
-    Raises
-    ------
-    InputError
-        There are fewer than four exposures, no two of them leave the object unsaturated, there is no dark surrounding,
-        or nothing blooms and no exposure would saturate the object.
-    """
+    """Onset and extent of blooming around the brightest object."""
     if len(exposures) < 4 or (np.diff(exposures) <= 0).any():
         raise InputError(f"{len(exposures)} exposures; blooming needs four that increase")
     blacks = np.broadcast_to(np.asarray(black, float), len(exposures))

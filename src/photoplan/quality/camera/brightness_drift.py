@@ -87,24 +87,7 @@ class BrightnessDrift:
 def brightness_drift(
     times: Array, values: Array, pixel_noise: float | None = None, name: str = "series"
 ) -> BrightnessDrift:
-    """Figures of repeated measurements of one constant brightness.
-
-    Parameters
-    ----------
-    times : ndarray, shape (n,)
-        Seconds, increasing.
-    values : ndarray, shape (n,)
-        Mean grey value of the window in each frame.
-    pixel_noise : float, optional
-        Standard deviation that pixel noise leaves in the mean of the window.
-    name : str
-        Of the series, for messages.
-
-    Raises
-    ------
-    InputError
-        Less than `LEAST_MEASUREMENTS`, a value that is not finite, times missing or backwards, or all values equal.
-    """
+    """Figures of repeated measurements of one constant brightness."""
     t, y = check_times(times, name), np.asarray(values, float)
     if y.shape != t.shape or not np.isfinite(y).all():
         raise InputError(f"{name}: {y.size} finite grey values at {t.size} times are needed, one per frame")

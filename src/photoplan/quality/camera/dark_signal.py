@@ -43,13 +43,7 @@ class DoublingTemperature:
 
 
 def dark_current(exposures_ms: Sequence[float], levels: Sequence[Level]) -> DarkCurrent:
-    """Line of the mean dark grey value over the exposure.
-
-    Raises
-    ------
-    InputError
-        Black is cut off at zero, a level is saturated, or there are fewer than three different exposures.
-    """
+    """Line of the mean dark grey value over the exposure."""
     cut = cut_off(levels, " of the dark frames")
     if cut:
         raise InputError(
@@ -78,20 +72,7 @@ def dark_current(exposures_ms: Sequence[float], levels: Sequence[Level]) -> Dark
 def doubling_temperature(
     temperatures_c: Sequence[float], currents: Sequence[float], sigmas: Sequence[float]
 ) -> DoublingTemperature:
-    """Doubling temperature from dark currents at two temperatures or more.
-
-    Parameters
-    ----------
-    temperatures_c : sequence of float
-        Of the sensor, °C.
-    currents, sigmas : sequence of float
-        Dark currents and their standard deviations, in one unit.
-
-    Raises
-    ------
-    InputError
-        There are fewer than two temperatures, a current is not significantly positive, or the current does not grow.
-    """
+    """Doubling temperature from dark currents at two temperatures or more."""
     t, i, s = (np.array(v, float) for v in (temperatures_c, currents, sigmas))
     if len(set(t.tolist())) < 2:
         raise InputError(f"{len(set(t.tolist()))} temperature; the doubling temperature needs two or more")

@@ -82,28 +82,6 @@ def find_defects(
 ) -> DefectList:
     """Pixels that differ from their surroundings.
 
-    Parameters
-    ----------
-    mean : array, shape (h, w)
-        Mean image of dark or flat frames; NaN: the pixel does not count.
-    temporal_variance : float
-        Of one sample; NaN: unknown.
-    frames : int
-        Frames of the mean.
-    kinds : tuple
-        ``hot`` (brighter), ``dark`` (darker), or both.
-    share : float
-        A pixel must differ by this part of its surroundings' grey value, whatever the scatter.
-    step : float
-        Distance of neighbouring grey values.
-    cut : bool
-        Black is cut off, so that only brighter pixels show how they scatter.
-
-    Raises
-    ------
-    InputError
-        The image is smaller than 16 × 16 pixels.
-
     Notes
     -----
     The threshold is the number of scatters that Gaussian noise exceeds once in a hundred images; the scatter is at
@@ -154,20 +132,7 @@ def _strongest(
 
 
 def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0) -> DefectList:
-    """Pixels whose grey value changes from frame to frame far more than that of most.
-
-    Parameters
-    ----------
-    variance : array, shape (h, w)
-        Temporal variance of every pixel over `frames` frames; NaN: it does not count.
-    step : float
-        Distance of neighbouring grey values.
-
-    Raises
-    ------
-    InputError
-        There are fewer than four frames, or most pixels never change, so that there is no noise to compare with.
-    """
+    """Pixels whose grey value changes from frame to frame far more than that of most."""
     if frames < 4:
         raise InputError(f"{frames} frames at a setting; blinking pixels need four or more")
     usual = float(np.nanmedian(variance)) * (frames - 1) / float(special.chdtri(frames - 1, 0.5))

@@ -93,13 +93,7 @@ class EmvaSheet:
 
 
 def emva_sheet(points: EmvaPoints, step: float = 1.0) -> EmvaSheet:
-    """The sheet of a measurement, whose grey values have a distance of `step`.
-
-    Raises
-    ------
-    InputError
-        There are fewer than five levels, or the variance does not grow with the signal.
-    """
+    """The sheet of a measurement, whose grey values have a distance of `step`."""
     p = points.sorted()
     refused: dict[str, str] = {}
     signal, variance = p.mean - p.dark_mean, p.variance - p.dark_variance

@@ -121,18 +121,6 @@ def fit_fall_off(flat: NDArray[np.floating], settings: FallOffSettings | None = 
     The image is reduced to blocks, each the mean of the middle half of its values, and adjusted with weights that
     leave out dirt. Terms that are not significant are dropped. Where an estimated camera constant cannot be told from
     the polynomial, it is not stated: the whole is then modelled by the terms alone, and `rank` says so.
-
-    Parameters
-    ----------
-    flat : ndarray, shape (h, w)
-        Mean of flat frames, dark frame subtracted; NaN: pixels not to be used.
-
-    Raises
-    ------
-    InputError
-        The image is too small or dark, mostly unknown, or shows a structure.
-    GeometryError
-        Nothing of what was asked can be estimated.
     """
     settings = settings or FallOffSettings()
     blocks = _checked(flat)

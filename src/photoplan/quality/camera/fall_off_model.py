@@ -99,27 +99,7 @@ def surface_terms(degree: int) -> tuple[tuple[int, int], ...]:
 
 
 def correct_fall_off(pixels: NDArray[Any], window: Window, model: FallOffModel) -> tuple[NDArray[Any], int]:
-    """Apply the gain, 1 / relative brightness, to the pixels of a window.
-
-    Parameters
-    ----------
-    pixels : ndarray, shape (h, w) or (bands, h, w)
-        Grey values proportional to light, but for the model's `dark`; NaN stays.
-    window : Window
-        Where they lie in the image.
-
-    Returns
-    -------
-    ndarray
-        Corrected pixels in the same type; whole numbers are rounded.
-    int
-        How many values were clipped at the end of the type's range.
-
-    Raises
-    ------
-    InputError
-        Pixels and window differ in size, the window leaves the image, or the model gives no brightness somewhere.
-    """
+    """Apply the gain, 1 / relative brightness, to the pixels of a window."""
     if pixels.ndim not in (2, 3) or pixels.shape[-2:] != (window.height, window.width):
         raise InputError(f"pixels of shape {pixels.shape} for a window of {window.width} × {window.height}")
     if window.col < 0 or window.row < 0 or window.stop[0] > model.size[0] or window.stop[1] > model.size[1]:
@@ -164,13 +144,7 @@ def gain_image(model: FallOffModel, factor: int = 1) -> NDArray[np.float32]:
 
 
 def largest_gain(model: FallOffModel) -> float:
-    """The largest gain, 1 / relative brightness, of 65 × 65 places over the image, its corners among them.
-
-    Raises
-    ------
-    InputError
-        The model gives no brightness somewhere.
-    """
+    """The largest gain, 1 / relative brightness, of 65 × 65 places over the image, its corners among them."""
     x, y = (np.linspace(0.0, side - 1.0, 65) for side in model.size)
     return float(_gain(model, x[None, :], y[:, None]).max())
 

@@ -46,25 +46,7 @@ class PatternVariance:
 def pattern_variance(
     mean: NDArray[np.float64], temporal_variance: float, frames: int, *, filtered: bool = False
 ) -> PatternVariance:
-    """Spatial variances of the mean image of several frames.
-
-    Parameters
-    ----------
-    mean : array, shape (h, w)
-        Mean of the frames.
-    temporal_variance : float
-        Of one sample.
-    frames : int
-        How many were averaged.
-    filtered : bool
-        Take the slow variation out (uneven light) by the high pass of EMVA 1288; what it takes from white noise is
-        given back.
-
-    Raises
-    ------
-    InputError
-        The image is smaller than 16 × 16 pixels, or the temporal variance is unknown.
-    """
+    """Spatial variances of the mean image of several frames."""
     height, width = mean.shape
     if min(height, width) < _LEAST_SIDE:
         raise InputError(f"image of {width} × {height} pixels; the fixed pattern needs {_LEAST_SIDE} × {_LEAST_SIDE}")
@@ -111,20 +93,7 @@ def signed_root(variance: float, sigma: float) -> tuple[float, float]:
 
 
 def prnu_percent(bright: PatternVariance, dark: PatternVariance | float = 0.0) -> tuple[float, float]:
-    """Photo response non-uniformity in percent of the signal, and its sigma.
-
-    Parameters
-    ----------
-    bright : PatternVariance
-        Of flat frames, at half of saturation by the standard.
-    dark : PatternVariance or float
-        Of dark frames at the same exposure; a number: black is this grey value and has no pattern.
-
-    Raises
-    ------
-    InputError
-        The bright frames are not brighter than the dark ones.
-    """
+    """Photo response non-uniformity in percent of the signal, and its sigma."""
     below, of_dark, of_dark_sigma = (
         (dark.mean, dark.total, dark.total_sigma) if isinstance(dark, PatternVariance) else (dark, 0.0, 0.0)
     )

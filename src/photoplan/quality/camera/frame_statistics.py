@@ -83,13 +83,7 @@ def cut_off(levels: Iterable[Level], of: str = "") -> str:
 
 
 def check_level(level: Level) -> None:
-    """Refuse a level that says nothing: too few pixels, or frames that are copies of each other.
-
-    Raises
-    ------
-    InputError
-        It is one.
-    """
+    """Refuse a level that says nothing: too few pixels, or frames that are copies of each other."""
     if level.pixels < LEAST_PIXELS:
         raise InputError(f"{level.pixels} pixels count; {LEAST_PIXELS} or more are needed: give a larger roi or mask")
     if level.frames > 1 and not level.temporal_variance > 0 and level.saturated_share < 0.5 and level.zero_share < 0.5:
@@ -117,15 +111,7 @@ class FrameStack:
 
 
 class StackSums:
-    """Gathers frames one after the other: memory holds two images, however many frames there are.
-
-    Parameters
-    ----------
-    saturation : float
-        Grey value from which on a sample is saturated.
-    counted : array of bool, optional
-        Pixels that the summary counts.
-    """
+    """Gathers frames one after the other: memory holds two images, however many frames there are."""
 
     def __init__(self, saturation: float, counted: NDArray[np.bool_] | None = None) -> None:
         self._saturation, self._counted = saturation, counted
@@ -136,13 +122,7 @@ class StackSums:
         self._squares: NDArray[np.float64] | None = None
 
     def add(self, frame: NDArray[Any]) -> None:
-        """One more frame, shape (h, w).
-
-        Raises
-        ------
-        InputError
-            Its size differs from the others', or no pixel counts.
-        """
+        """One more frame, shape (h, w)."""
         seen = frame if self._counted is None else frame[self._counted]
         if not seen.size:
             raise InputError("no pixel of the frame counts")
@@ -163,13 +143,7 @@ class StackSums:
         self._squares += difference * (values - self._mean)
 
     def stack(self) -> FrameStack:
-        """What the frames say.
-
-        Raises
-        ------
-        InputError
-            There was no frame.
-        """
+        """What the frames say."""
         count = len(self._means)
         if self._mean is None or self._squares is None:
             raise InputError("no frame given")

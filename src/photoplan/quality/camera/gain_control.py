@@ -79,22 +79,6 @@ def gain_control(times: Array, values: Array, *, step_time: float | None = None,
     """Follow the grey values after a step of brightness.
 
     The scene is the same in all frames after the step, so a change of the grey values is the camera's.
-
-    Parameters
-    ----------
-    times : ndarray, shape (n,)
-        Seconds, increasing.
-    values : ndarray, shape (n,)
-        Mean grey values of the same window.
-    step_time : float, optional
-        From which time on frames are after the step; None: the largest difference of two frames is the step.
-    name : str
-        Of the series, for messages.
-
-    Raises
-    ------
-    InputError
-        Too few frames after the step, no step that stands out, times missing or backwards.
     """
     t, y = check_times(times, name), np.asarray(values, float)
     if y.shape != t.shape or not np.isfinite(y).all():
@@ -127,13 +111,7 @@ def gain_control(times: Array, values: Array, *, step_time: float | None = None,
 
 
 def compare_transitions(dark: GainControl, bright: GainControl) -> Asymmetry:
-    """Compare the change after bright to dark with that after dark to bright; no significant change counts as none.
-
-    Raises
-    ------
-    InputError
-        A change is there, but its size is not known.
-    """
+    """Compare the change after bright to dark with that after dark to bright; no significant change counts as none."""
     sizes, variances = [], []
     for one in (dark, bright):
         a = one.approach

@@ -100,20 +100,6 @@ def line_jitter(position: Array, name: str = "edge", degree: int | None = None) 
     Spikes are set aside; polynomial, offset between even and odd lines and up to three oscillations are adjusted
     together, since each would falsify the others. A polynomial of degree 2 or 3 is used only where its last
     coefficient is significant beside the oscillations: fall-off and distortion bend an edge (Behr 1989, fig. 4.6).
-
-    Parameters
-    ----------
-    position : ndarray, shape (n,)
-        Column of the edge in successive lines; NaN: no edge.
-    name : str
-        Of the edge, for messages.
-    degree : int, optional
-        Degree of the polynomial, 1 to 3; None: by test.
-
-    Raises
-    ------
-    InputError
-        Less than `LEAST_LINES` lines, or so many spikes that nothing is regular.
     """
     p = np.asarray(position, float)
     lines = np.flatnonzero(np.isfinite(p))

@@ -90,17 +90,7 @@ class Waves:
 
 
 def spectrum(waves: Waves, y: Array, base: Array) -> Spectrum:
-    """Least-squares spectrum: at every frequency the base functions are adjusted anew (Lomb, Scargle).
-
-    Parameters
-    ----------
-    waves : Waves
-        Of the lines, of which some may be missing.
-    y : ndarray, shape (n,)
-        Values.
-    base : ndarray, shape (n, k)
-        Functions that are adjusted with every oscillation: the trend, the offset of the fields, other oscillations.
-    """
+    """Least-squares spectrum: at every frequency the base functions are adjusted anew (Lomb, Scargle)."""
     frequency = waves.frequency
     Q, _ = np.linalg.qr(base)
     rest = y - Q @ (Q.T @ y)
@@ -115,15 +105,7 @@ def spectrum(waves: Waves, y: Array, base: Array) -> Spectrum:
 
 
 def false_alarm(found: Spectrum, freedom: int, extent: float) -> float:
-    """Chance that noise alone has its strongest power this high.
-
-    Parameters
-    ----------
-    freedom : int
-        Degrees of freedom that are left beside the base functions and one oscillation.
-    extent : float
-        Lines from the first to the last: independent frequencies lie 1 / extent apart.
-    """
+    """Chance that noise alone has its strongest power this high."""
     single = (1.0 - float(found.power[found.best])) ** (freedom / 2.0)
     trials = max(1.0, float(found.frequency[-1] - found.frequency[0]) * extent)
     return -math.expm1(trials * math.log1p(-min(single, 1.0 - 1e-12)))
@@ -158,17 +140,7 @@ class AdjustedPeriod:
 
 
 def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], chances: list[float]) -> AdjustedPeriod:
-    """Adjust the base functions and the frequency, amplitude and phase of every oscillation by least squares.
-
-    Parameters
-    ----------
-    t, y, base
-        As for `spectrum`.
-    frequencies : list of float
-        Approximate frequencies, cycles per line.
-    chances : list of float
-        False-alarm chance of each, which is only passed on.
-    """
+    """Adjust the base functions and the frequency, amplitude and phase of every oscillation by least squares."""
     # About its middle, frequency and phase of an oscillation are nearly uncorrelated.
     middle = float(t.mean())
     limit, k = 0.5 / (float(t[-1] - t[0]) + 1.0), base.shape[1]

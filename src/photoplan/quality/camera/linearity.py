@@ -53,27 +53,7 @@ class Linearity:
 def linearity(
     exposure: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturation: float, usable: ArrayLike | None = None
 ) -> Linearity:
-    """Linearity error and response of levels.
-
-    Parameters
-    ----------
-    exposure : array, shape (n,)
-        Exposure, or photons; positive, any order, no value twice.
-    signal : array, shape (n,)
-        Mean grey value above black.
-    sigma : array, shape (n,)
-        Its standard deviation.
-    saturation : float
-        Grey value above black at which the sensor saturates.
-    usable : array of bool, shape (n,), optional
-        Levels whose mean grey value is that of the light: not those in which a part of the samples is saturated.
-
-    Raises
-    ------
-    InputError
-        An exposure is not positive or stands twice, fewer than three usable levels lie between 5 % and 95 % of
-        saturation, or the signal falls where the exposure grows.
-    """
+    """Linearity error and response of levels."""
     order = np.argsort(np.asarray(exposure, float), kind="stable")
     x, y, s = (np.asarray(v, float)[order] for v in (exposure, signal, sigma))
     if x.size and (x[0] <= 0 or (np.diff(x) <= 0).any()):

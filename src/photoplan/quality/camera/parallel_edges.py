@@ -71,20 +71,7 @@ class AboveControl:
 
 
 def compare_edges(first: LineJitter, second: LineJitter, offset: int = 0, *, periodic: bool = True) -> EdgePair:
-    """Correlate the deviations of two edges, spikes left out.
-
-    Parameters
-    ----------
-    offset : int
-        Line of the second window minus that of the first one, in the image.
-    periodic : bool
-        Whether the offset of the fields and periodic parts count; without them, what is left by chance is compared.
-
-    Raises
-    ------
-    InputError
-        The edges share too few lines, or one does not deviate at all.
-    """
+    """Correlate the deviations of two edges, spikes left out."""
     a, b = _by_line(first, 0, periodic), _by_line(second, offset, periodic)
     lines = sorted(a.keys() & b.keys())
     if len(lines) < LEAST_LINES:

@@ -73,23 +73,7 @@ class _Fit:
 
 
 def fit_edge(grey: NDArray[np.floating], *, name: str = "edge", saturation: float | None = None) -> EdgeLines:
-    """Edge of every line by least squares: own position, contrast and base of each line, blur common to all.
-
-    Parameters
-    ----------
-    grey : ndarray, shape (n, w)
-        Grey values of a window that the edge crosses from its first line to its last; NaN: not known.
-    name : str
-        Of the edge, for messages.
-    saturation : float, optional
-        Grey value at which pixels are saturated; where it is not known, many pixels at one highest value tell it.
-
-    Raises
-    ------
-    InputError
-        The window is too small or too large, has no edge, or not in many lines, the edge is saturated or lies on
-        texture.
-    """
+    """Edge of every line by least squares: own position, contrast and base of each line, blur common to all."""
     g = _window(grey, name)
     coarse, contrast = _coarse(g, name)
     _refuse_cut(g, coarse, contrast, name, saturation)
@@ -113,22 +97,7 @@ def fit_edge(grey: NDArray[np.floating], *, name: str = "edge", saturation: floa
 
 
 def correlate_edge(grey: NDArray[np.floating], fitted: EdgeLines, *, name: str = "edge") -> EdgeLines:
-    """Edge of every line by correlation with ten pixels of the middle line and a parabola (Behr 1989, eq. 4.8–4.10).
-
-    Parameters
-    ----------
-    grey : ndarray, shape (n, w)
-        The window that `fit_edge` was given.
-    fitted : EdgeLines
-        Its result: the place of the edge in the middle line, from which all others are counted.
-    name : str
-        Of the edge, for messages.
-
-    Raises
-    ------
-    InputError
-        As `fit_edge`.
-    """
+    """Edge of every line by correlation with ten pixels of the middle line and a parabola (Behr 1989, eq. 4.8–4.10)."""
     g = _window(grey, name)
     known = np.flatnonzero(np.isfinite(fitted.position) & np.isfinite(g).all(axis=1))
     if not known.size:

@@ -54,17 +54,7 @@ class FullWell:
 
 
 def full_well(mean: ArrayLike, temporal_variance: float, step: float = 1.0) -> FullWell:
-    """Grey values of full elements, from frames in which most elements are full.
-
-    Parameters
-    ----------
-    mean : array
-        Mean grey value of each element.
-    temporal_variance : float
-        Of a full element; NaN: unknown, taken as none.
-    step : float
-        Distance of neighbouring grey values.
-    """
+    """Grey values of full elements, from frames in which most elements are full."""
     values = np.asarray(mean, float)
     level = float(np.median(values))
     pattern = spread(values, level)
@@ -75,25 +65,7 @@ def full_well(mean: ArrayLike, temporal_variance: float, step: float = 1.0) -> F
 def find_saturation(
     exposure: ArrayLike, mean: ArrayLike, black: float, saturated_share: ArrayLike, variance: ArrayLike | None = None
 ) -> Saturation | None:
-    """Saturation of levels with growing exposure; None where none of them shows a sign of it.
-
-    Parameters
-    ----------
-    exposure, mean : array, shape (n,)
-        Exposure (increasing) and mean grey value.
-    black : float
-        Grey value without light; NaN: not known, that of the line through the darker levels is taken.
-    saturated_share : array, shape (n,)
-        Share of samples at the largest grey value. Where it stays below a half, a bright spot is saturated, and not the
-        area whose mean grey value is given.
-    variance : array, shape (n,), optional
-        Temporal variance.
-
-    Raises
-    ------
-    InputError
-        There are fewer than four levels, or the exposures do not increase.
-    """
+    """Saturation of levels with growing exposure; None where none of them shows a sign of it."""
     x, y, share = (np.asarray(v, float) for v in (exposure, mean, saturated_share))
     if x.size < 4 or (np.diff(x) <= 0).any():
         raise InputError(f"{x.size} levels; saturation needs four of increasing exposure")

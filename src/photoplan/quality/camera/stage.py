@@ -71,22 +71,6 @@ def stage_calibration(names: Iterable[str], stage: Array, measured: Array) -> St
     """Adjust the affine transformation from a stage's coordinates to columns and rows.
 
     A point whose studentised residual is beyond chance is left out, one after the other.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Of the points.
-    stage : ndarray, shape (n, 2)
-        Stage coordinates, any unit; y up, unless the stage says otherwise.
-    measured : ndarray, shape (n, 2)
-        Columns and rows of the target, pixels.
-
-    Raises
-    ------
-    InputError
-        Too few points, a name twice, a value that is not finite, or so many gross errors that nothing checks them.
-    GeometryError
-        The points lie on a line.
     """
     labels, S, P = _checked(names, stage, measured)
     used = np.ones(len(labels), bool)

@@ -48,16 +48,6 @@ def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike) -> StraightLine:
 
     Where the residuals are significantly (1 %) larger than the standard deviations allow, those of the result are
     enlarged to the scatter that was found.
-
-    Parameters
-    ----------
-    x, y, sigma : array, shape (n,)
-        Points and the standard deviations of y, all positive.
-
-    Raises
-    ------
-    InputError
-        There are too few different x, or a standard deviation is not positive.
     """
     x, y, sigma = (np.asarray(v, np.float64) for v in (x, y, sigma))
     if not (np.isfinite(x).all() and np.isfinite(y).all() and np.isfinite(sigma).all() and (sigma > 0).all()):
@@ -101,20 +91,7 @@ class GreyWedge:
 
 
 def grey_wedge(density: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturation: float) -> GreyWedge:
-    """Characteristic curve of patches.
-
-    Parameters
-    ----------
-    density, signal, sigma : array, shape (n,)
-        Optical density, mean grey value above black and its standard deviation.
-    saturation : float
-        Grey value above black at which the sensor saturates.
-
-    Raises
-    ------
-    InputError
-        Two patches have one density, fewer than three are neither saturated nor black, or a denser patch is brighter.
-    """
+    """Characteristic curve of patches."""
     order = np.argsort(np.asarray(density, float), kind="stable")
     d, y, s = (np.asarray(v, float)[order] for v in (density, signal, sigma))
     if (np.diff(d) <= 0).any():

@@ -79,24 +79,6 @@ def warm_up(
     Every epoch is transformed from the reference by least squares: x' = x + t + M (x − c), with the shift t at the
     middle c of the targets. One target gives a shift only: what moves it, shift or scale, then stays open. Two give
     scale and rotation too, three (not on a line) the scales of columns and rows apart.
-
-    Parameters
-    ----------
-    times : ndarray, shape (m,)
-        Seconds, increasing: one for each epoch.
-    positions : mapping of name to ndarray, shape (m, 2) or (m, r, 2)
-        Column and row of each target at each epoch, r repetitions; NaN: not measured.
-    model : str, optional
-        shift, similarity or affine; None: similarity from two targets on, else shift.
-    reference : str
-        `first` epoch, or the `mean` of all.
-
-    Raises
-    ------
-    InputError
-        No target, too few epochs, times missing or backwards, arrays that do not fit, a target that is never measured.
-    GeometryError
-        The targets do not determine the model.
     """
     t = check_times(times, "warm-up")
     names, P = _stacked(t, positions)

@@ -60,27 +60,7 @@ class Disc:
 def find_discs(
     grey: NDArray[Any], saturation: float | None = None, planes: NDArray[np.int_] | None = None
 ) -> tuple[Disc, ...]:
-    """Locate all discs that lie wholly in an image, dark on bright ground or bright on dark.
-
-    Parameters
-    ----------
-    grey : (height, width)
-        Grey values; NaN where there is none.
-    saturation : float, optional
-        Grey values from here on are saturated; None: the largest of the image's type, none for floats.
-    planes : (height, width) int, optional
-        Of a colour mosaic: number of the plane that each pixel belongs to, negative: not used. Every plane gets grey
-        values of its own and all share one geometry, so nothing is interpolated and no pixel is moved.
-
-    Returns
-    -------
-    tuple of Disc, by rows of the chart from above, roughly
-
-    Raises
-    ------
-    InputError
-        No disc is found, or all that are found are saturated or too weak; the message counts them.
-    """
+    """Locate all discs that lie wholly in an image, dark on bright ground or bright on dark."""
     limit = saturation
     if limit is None:
         limit = float(np.iinfo(grey.dtype).max) if grey.dtype.kind in "iu" else float("inf")
@@ -283,16 +263,6 @@ def disc_displacements(reference: Sequence[Disc], band: Sequence[Disc]) -> Displ
     """Match discs of two bands, each with its nearest in the other, and difference their centres.
 
     Two can be the same up to a third of the distance of nearest neighbours in the chart, at most 30 pixels.
-
-    Parameters
-    ----------
-    reference, band : sequence of Disc
-        Discs of the reference band, and of the band whose displacement is sought.
-
-    Raises
-    ------
-    InputError
-        Fewer than four discs are in both bands.
     """
     here = np.array([[d.x, d.y] for d in reference]).reshape(-1, 2)
     there = np.array([[d.x, d.y] for d in band]).reshape(-1, 2)

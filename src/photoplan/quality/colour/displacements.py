@@ -31,20 +31,6 @@ def edge_displacements(
     In each band the step of a normal distribution is fitted to the pixels of an edge; the direction comes from the
     reference. The difference of both positions is free of what both bands share, such as the object's own edge; where
     the bands are blurred unsymmetrically and differently, that enters.
-
-    Parameters
-    ----------
-    reference, band : (height, width)
-        Grey values; NaN where there is none.
-    edges : sequence of EdgeRegion
-        As `find_edges` gives them for the reference.
-    saturation : float
-        Grey values from here on are saturated: such edges are left out.
-
-    Raises
-    ------
-    InputError
-        Fewer than four edges can be measured in both bands.
     """
     rows = []
     height, width = reference.shape
@@ -134,20 +120,6 @@ def patch_displacements(
 
     Every edge and texture of a window takes part, whatever its direction; where colours change together with
     brightness, single windows are displaced by that, which the model over the field averages and tests.
-
-    Parameters
-    ----------
-    reference, band : (height, width)
-        Grey values; NaN where there is none.
-    saturation : float
-        Windows with grey values from here on are left out.
-    most : int
-        Windows at most, evenly spread.
-
-    Raises
-    ------
-    InputError
-        Fewer than four windows match.
     """
     height, width = reference.shape
     reach = _WINDOW + 2 * _MARGIN

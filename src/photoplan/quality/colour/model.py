@@ -175,21 +175,6 @@ def fit_band(band: int, size: tuple[int, int], measured: Displacements, kind: st
     Of the kinds the simplest is taken that predicts discs or edges which were left out about as well as the best: its
     squared errors of prediction exceed those of the best by less than their own standard error (cross-validation,
     leaving out one at a time). Gross errors beyond 4.5 times the robust spread of the residuals are left out.
-
-    Parameters
-    ----------
-    band : int
-        Counted from 1.
-    size : (width, height)
-    kind : str, optional
-        A name of `KINDS`, in place of the choice.
-
-    Raises
-    ------
-    GeometryError
-        Too few displacements, or they do not determine the model.
-    InputError
-        There is no such kind.
     """
     if kind is not None and kind not in KINDS:
         raise InputError(f"kind of model {kind!r}; allowed are {', '.join(KINDS)}")

@@ -88,18 +88,6 @@ def noise_of(grey: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) 
 
     The mask is that of Immerkær 1996 (Fast noise variance estimation), which is blind to planes; of the medians of
     blocks of 16 × 16 pixels the lowest fifth counts, so that texture does not.
-
-    Parameters
-    ----------
-    grey : array
-        Shape (h, w).
-    valid : array, optional
-        True = may be used; None: all.
-
-    Returns
-    -------
-    float
-        Grey values; 0 without noise, NaN if no block of 16 × 16 pixels is valid.
     """
     a = np.asarray(grey, np.float32)
     second = a[:, 2:] - 2 * a[:, 1:-1] + a[:, :-2]
@@ -118,23 +106,7 @@ def noise_of(grey: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) 
 def find_lines(
     grey: NDArray[np.float32], valid: NDArray[np.bool_] | None, least_length: float
 ) -> tuple[list[StraightEdge], Counter[str]]:
-    """Straight edges of a picture, the longest first; no test yet of what lies beside them.
-
-    Parameters
-    ----------
-    grey : array
-        Shape (h, w).
-    valid : array, optional
-        True = may be used; None: all.
-    least_length : float
-        Pixels.
-
-    Returns
-    -------
-    list of StraightEdge
-    Counter
-        Chains long enough that have no straight part of that length: ``curved``.
-    """
+    """Straight edges of a picture, the longest first; no test yet of what lies beside them."""
     if min(grey.shape) < 5:
         return [], Counter()
     gx, gy, least = _gradient(grey, valid)

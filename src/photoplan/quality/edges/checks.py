@@ -113,18 +113,8 @@ def check_clipping(
 
 
 def check_step(step: float, noise: float, grain: float, settings: EdgeSettings) -> None:
-    """Refuse a region without a significant step, a step drowned in noise, and pixels that one edge does not explain.
-
-    Parameters
-    ----------
-    step
-        Difference of both levels.
-    noise
-        Standard deviation of a pixel from the fitted edge.
-    grain
-        Noise of a pixel from its neighbours along the edge alone.
-    settings
-        What is allowed.
+    """Refuse a region without a significant step, a step drowned in noise, and pixels that one edge does not
+    explain.
     """
     if not step > 1.5 * noise or not step > 1.5 * grain:
         raise InputError(

@@ -85,19 +85,7 @@ class Enhancement:
 
 
 def enhancement_of(edges: Sequence[EnhancedEdge]) -> Enhancement:
-    """Judge edge enhancement by the over- and undershoot of all measured edges.
-
-    Parameters
-    ----------
-    edges : sequence
-        Measurements with ``overshoot`` and ``undershoot``, and their standard deviations ``overshoot_sigma`` and
-        ``undershoot_sigma`` where they have them.
-
-    Raises
-    ------
-    InputError
-        There is no edge with finite figures.
-    """
+    """Judge edge enhancement by the over- and undershoot of all measured edges."""
     known = [e for e in edges if isfinite(e.overshoot) and isfinite(e.undershoot)]
     if not known:
         raise InputError("edge enhancement cannot be judged without a measured edge")

@@ -156,14 +156,7 @@ def find_edges(picture: EdgePicture, rules: EdgeRules | None = None) -> tuple[li
 
 
 def examine(picture: EdgePicture, line: StraightEdge, rules: EdgeRules) -> tuple[EdgeRegion | None, str]:
-    """The part of a line where both sides are clean, in the widest window that allows it.
-
-    Returns
-    -------
-    EdgeRegion or None
-    str
-        Why there is none, a key of `REASONS`.
-    """
+    """The part of a line where both sides are clean, in the widest window that allows it."""
     strip = strip_along(picture.grey, picture.valid, picture.saturated, line, max(rules.halves))
     if strip is None:
         return None, "invalid"

@@ -58,24 +58,6 @@ def combine(
     known by `freedom` degrees each, only the rest follows from the few edges: the interval is that of Student's
     distribution with the degrees of freedom that both have together (after Satterthwaite 1946): σ² over the sum of
     rest² / (n − 1) and of the edges' parts by their own.
-
-    Parameters
-    ----------
-    values : sequence of float
-        NaN: the edge does not have the figure, and does not count.
-    sigmas : sequence of float
-        Standard deviations; where one is unknown (NaN) the median of the others stands for it.
-    confidence : float
-        Of the interval.
-    freedom : float
-        Degrees of freedom that each of the standard deviations was found with; infinite: they are known.
-    least : float
-        What the figure cannot fall below: the interval ends there.
-
-    Raises
-    ------
-    InputError
-        The confidence is not between 0 and 1.
     """
     if not 0.0 < confidence < 1.0:
         raise InputError(f"confidence {confidence:g}; it lies between 0 and 1")
@@ -151,11 +133,6 @@ def mean_curve(curves: Sequence[MtfCurve]) -> MtfCurve:
 
     Weights are those of the curves' standard deviations, as in `combine`; the frequencies end where the first curve
     does, at 1 at the latest.
-
-    Raises
-    ------
-    InputError
-        There is no curve.
     """
     if not curves:
         raise InputError("a mean of MTF curves needs one curve at least")

@@ -31,26 +31,6 @@ def spread_from_response(
 
     The share at k pixels is the rise of the response from k - 1/2 to k + 1/2: what a profile across an edge on the
     border of two pixels shows.
-
-    Parameters
-    ----------
-    position, response : ndarray, shape (n,)
-        Distance from the edge in pixels, increasing; response from 0 to 1.
-    half : int
-        How many pixels it reaches to each side.
-    sigma : ndarray, shape (n,), optional
-        Standard deviations of the response.
-
-    Returns
-    -------
-    spread : SpreadFunction
-    beyond : float
-        Share of the light outside of its reach.
-
-    Raises
-    ------
-    InputError
-        The response is not known as far as `half` + 1/2 pixels on both sides.
     """
     reach = half + 0.5
     if position[0] > -reach or position[-1] < reach:
@@ -77,11 +57,6 @@ def spread_of_edge(edge: EdgeMeasurement) -> EdgeSpread | None:
     It follows from the edge spread function as measured. An edge that runs along the pixels shows that at one phase
     only, and what lies between its samples is a model (`EdgeMeasurement.sampling`). The solution by a mixed object
     pixel (design/009) is no help there: half a pixel from the border it gives Z = 0.83 where it is 0.61.
-
-    Returns
-    -------
-    EdgeSpread or None
-        None if the edge is not seen as far as two pixels to both sides.
     """
     positions = edge.esf.positions
     half = min(_HALF, int(min(-positions[0], positions[-1]) - 0.5))

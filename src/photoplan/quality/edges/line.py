@@ -99,11 +99,6 @@ def find_line(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> EdgeLine:
 
     A line of least squares through the smoothed gradients, weighted with their squares, of which those that lie far
     from it or point elsewhere are left out step by step.
-
-    Raises
-    ------
-    InputError
-        Where the strong gradients do not lie on one line.
     """
     filled = np.where(valid, image, np.median(image[valid]))
     if not valid.all():
@@ -148,20 +143,6 @@ def fit_line(
     Offset, slope (and bend), blur, both levels and, where asked, their slopes are adjusted together (Levenberg and
     Marquardt). Where the true line spread function has another form the line is still right: its slope does not depend
     on the form, and a shift of its offset is taken up by the profile that is measured afterwards.
-
-    Parameters
-    ----------
-    curve
-        Degree of the line, 1 or 2.
-    shading
-        Whether both levels may change along the edge.
-    most
-        Steps of the fit at most.
-
-    Returns
-    -------
-    line, model, levels
-        Levels: dark, step, then the slopes of the dark and of the bright side along the edge.
     """
     start = _LineState(line, _first_blur(pixels, line))
     state = levenberg(

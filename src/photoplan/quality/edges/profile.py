@@ -219,19 +219,7 @@ def fit_profile(
     extra: NDArray[np.float64],
     blocks: NDArray[np.intp],
 ) -> EdgeFit:
-    """Adjust a profile to pixels.
-
-    Parameters
-    ----------
-    basis
-        Its functions.
-    observed
-        Distance from the line (pixels), light and weight of the pixels, shape (n,) each.
-    extra
-        Columns of the unknowns beside the shape, shape (n, k), the first one of ones.
-    blocks
-        Start index of each block of pixels, increasing from 0.
-    """
+    """Adjust a profile to pixels."""
     distance, light, weight = observed
     design = np.concatenate([extra, _looked_up(basis, distance)], axis=1)
     root_weight = np.sqrt(weight)

@@ -40,22 +40,6 @@ def sharpness_of(edges: Sequence[EdgeMeasurement]) -> tuple[Sharpness, Sharpness
     contrast over noise, up to four times the median edge, so that none decides alone.
 
     Where one direction has fewer than three edges, that of the other stands for it.
-
-    Parameters
-    ----------
-    edges : sequence of EdgeMeasurement
-        Of one channel and one part of the field.
-
-    Returns
-    -------
-    x, y : Sharpness
-    missing : tuple of str
-        ``x`` or ``y`` where the other direction stands in; empty if both are measured.
-
-    Raises
-    ------
-    InputError
-        Fewer than three edges for both directions.
     """
     found = {name: _along(edges, axis) for name, axis in (("x", 0.0), ("y", 90.0))}
     x, y = found["x"], found["y"]

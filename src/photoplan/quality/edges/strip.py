@@ -274,22 +274,7 @@ def strip_along(
     line: StraightEdge,
     half: int,
 ) -> Strip | None:
-    """Sum the pixels beside a line.
-
-    Parameters
-    ----------
-    grey : array
-        Shape (h, w).
-    valid, saturated : array, optional
-        Masks of the same shape; None: all valid, none saturated.
-    half : int
-        Bins to each side.
-
-    Returns
-    -------
-    Strip or None
-        None if the line's surroundings are far outside the picture or too large.
-    """
+    """Sum the pixels beside a line."""
     xs, ys = zip(*line.ends)
     reach = half + 1
     col, row = floor(min(xs)) - reach, floor(min(ys)) - reach

@@ -57,15 +57,7 @@ def _tail_transfer(spread: Spread, fx: _Array, fy: _Array, scale: float) -> _Arr
 
 
 def spread_transfer(spread: Spread, fx: _Array, fy: _Array, scale: float = 1.0) -> NDArray[np.complex128]:
-    """Optical transfer function of a spread function, without the pixel's aperture.
-
-    Parameters
-    ----------
-    fx, fy : arrays of one shape
-        Frequencies, cycles per pixel.
-    scale : float
-        Factor of all lengths, as `Spread.scale_at` gives it.
-    """
+    """Optical transfer function of a spread function, without the pixel's aperture."""
     result = _smooth_transfer(spread, fx, fy, scale).astype(complex)
     for values, f in ((spread.along_x, fx), (spread.along_y, fy)):
         if values:
@@ -193,20 +185,6 @@ def pixel_kernel(spread: Spread, aperture: Aperture, scale: float, cells: int, c
     Where the cells are means of a continuous scene and the spread function is smooth against them, both are one kernel
     that also undoes the averaging over the cells: the pixels' values are those of the continuous scene. Elsewhere cells
     that the aperture cuts are taken as even.
-
-    Parameters
-    ----------
-    scale : float
-        Factor of all lengths of the spread function.
-    cells : int
-        Cells along a side of a pixel.
-    continuous : bool
-        Whether the cells are means of a continuous scene, else they are even squares.
-
-    Raises
-    ------
-    InputError
-        The kernel is too large.
     """
 
     def smooth(fx: _Array, fy: _Array) -> NDArray[Any]:
@@ -251,14 +229,7 @@ def _trimmed(kernel: _Array) -> _Array:
 
 @lru_cache(maxsize=64)
 def _aperture_weights(aperture: Aperture, cells: int) -> tuple[_Array, int, int]:
-    """Shares of the cells in a pixel's value, and the cell of the first weight.
-
-    Returns
-    -------
-    weights : (rows, columns), sum 1
-    row, column : int
-        Cell of ``weights[0, 0]``, counted from the first cell of the pixel itself; negative for wide apertures.
-    """
+    """Shares of the cells in a pixel's value, and the cell of the first weight."""
     (wx, wy), middle = aperture.width, cells / 2.0
     if aperture.shape == "point":
         wx = wy = 0.0

@@ -49,15 +49,7 @@ MOST_PIXELS = 40_000_000
 
 
 def next_gain(automatic: AutomaticGain, gain: float, mean: float) -> float:
-    """Gain of the next frame, relative to the fixed one.
-
-    Parameters
-    ----------
-    gain : float
-        Of this frame.
-    mean : float
-        Mean of this frame above the offset, in grey values at gain 1.
-    """
+    """Gain of the next frame, relative to the fixed one."""
     wanted = automatic.target / mean if mean > 0.0 else automatic.most
     wanted = min(max(wanted, automatic.least), automatic.most)
     share = 1.0 - exp(-1.0 / automatic.frames) if automatic.frames > 0.0 else 1.0
@@ -255,17 +247,7 @@ def _grey(model: ImageModel, grey: _Array, frame: FormedFrame) -> NDArray[Any]:
 def model_transfer(
     model: ImageModel, frequency: _Array, angle_deg: float = 0.0, radius: float = 0.0
 ) -> NDArray[np.complex128]:
-    """Optical transfer function of spread and aperture together, of a continuous scene.
-
-    Parameters
-    ----------
-    frequency : array
-        Cycles per pixel along the direction.
-    angle_deg : float
-        Direction: 0 along x, 90 along y. An edge of `PatternScene` at an angle shows it across itself.
-    radius : float
-        Place in the field: 0 in the middle, 1 in the corners.
-    """
+    """Optical transfer function of spread and aperture together, of a continuous scene."""
     f = np.asarray(frequency, float)
     fx, fy = f * cos(radians(angle_deg)), f * sin(radians(angle_deg))
     scale = model.spread.scale_at(radius)

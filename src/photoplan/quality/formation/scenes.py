@@ -157,12 +157,8 @@ _SHARES: dict[str, Callable[[PatternScene, _Array, _Array, float], _Array]] = {
 
 
 def parse_pattern(text: str) -> tuple[str, tuple[float, ...]] | None:
-    """Kind and numbers of a pattern such as ``edge:5`` or ``bars:6,45``; None: the text does not begin with a pattern.
-
-    Raises
-    ------
-    UsageError
-        What follows the colon is no list of numbers.
+    """Kind and numbers of a pattern such as ``edge:5`` or ``bars:6,45``; None: the text does not begin with
+    a pattern.
     """
     kind, colon, rest = text.partition(":")
     if kind not in PATTERNS:

@@ -38,13 +38,7 @@ def fixed_pattern(
     size: tuple[int, int],
     rng: np.random.Generator,
 ) -> Pattern:
-    """The pattern of one sensor; the same for the same state of the generator.
-
-    Raises
-    ------
-    InputError
-        A defect lies outside the image.
-    """
+    """The pattern of one sensor; the same for the same state of the generator."""
     width, height = size
     shape = (height, width)
 

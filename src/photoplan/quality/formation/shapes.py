@@ -29,17 +29,7 @@ _Wave = Callable[[_Array], _Array]
 
 
 def edge_share(x: _Array, y: _Array, side: float, angle_deg: float) -> _Array:
-    """Share to the right of a line through (0, 0) that is turned against the columns.
-
-    Parameters
-    ----------
-    x, y : arrays that broadcast
-        Centres of the cells.
-    side : float
-        Of the cells.
-    angle_deg : float
-        Between line and columns; with a positive one its lower part lies further left.
-    """
+    """Share to the right of a line through (0, 0) that is turned against the columns."""
     normal = (cos(radians(angle_deg)), sin(radians(angle_deg)))
     t = np.clip(normal[0] * x + normal[1] * y, -2.0 * side, 2.0 * side)
     return _over_cell(t, normal, side, lambda s: np.maximum(s, 0.0), lambda s: np.maximum(s, 0.0) ** 2 / 2.0)

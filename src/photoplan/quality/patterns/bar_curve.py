@@ -37,20 +37,7 @@ class BarCurve:
 
 
 def bar_curve(groups: Sequence[BarContrast], levels: tuple[float, float] | None = None) -> BarCurve:
-    """Contrast transfer and MTF of frequency groups.
-
-    Parameters
-    ----------
-    groups : sequence of BarContrast
-        In any order; one is enough where `levels` are given.
-    levels : tuple of float, optional
-        Light of wide dark and bright areas. None: those of the widest bars, if their middle is flat.
-
-    Raises
-    ------
-    InputError
-        No group; no levels and no bars with a flat middle; two groups have the same frequency.
-    """
+    """Contrast transfer and MTF of frequency groups."""
     if not groups:
         raise InputError("no group of bars is given")
     ordered = tuple(sorted(groups, key=lambda group: group.frequency))
@@ -132,11 +119,6 @@ def coltman_mtf(contrast: MtfCurve) -> MtfCurve:
 
     MTF(f) = π/4 [C(f) + C(3f)/3 − C(5f)/5 + C(7f)/7 + C(11f)/11 − …]. C is interpolated linearly; beyond the last
     frequency it is 0, and what this may miss is in the standard deviations.
-
-    Parameters
-    ----------
-    contrast : MtfCurve
-        Contrast transfer, 1 at frequency 0.
     """
     given = np.zeros(contrast.frequency.size) if contrast.sigma is None else contrast.sigma
     last, end = float(contrast.frequency[-1]), float(contrast.modulation[-1])

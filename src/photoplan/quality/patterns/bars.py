@@ -275,13 +275,7 @@ def wave_columns(shape: tuple[int, ...], phase: Array, harmonics: tuple[int, ...
 
 
 def find_wave(values: Array, what: str) -> BarWave:
-    """The strongest plane wave of a window.
-
-    Raises
-    ------
-    InputError
-        No wave stands out of the noise.
-    """
+    """The strongest plane wave of a window."""
     rows, columns = values.shape
     flat = values - values.mean()
     plane = wave_columns(values.shape, np.zeros(values.size), ())

@@ -25,11 +25,6 @@ def clipped_pixels(stored: NDArray[Any]) -> NDArray[np.bool_]:
 
     They are at a limit of an integer type; or they all have the highest (lowest) value, one in a hundred of them or
     more, while the other end of the range shows noise. Noise-free drawings are not clipped.
-
-    Parameters
-    ----------
-    stored : ndarray
-        Grey values as stored, one band.
     """
     clipped = np.zeros(stored.shape, bool)
     if stored.size == 0:
@@ -55,24 +50,7 @@ def _heaped(stored: NDArray[Any], end: float, step: int, at_end: NDArray[np.bool
 def pattern_window(
     light: NDArray[Any], clipped: NDArray[np.bool_] | None, what: str, least: int = 12, most: int = MOST_SIDE
 ) -> Array:
-    """The window of a pattern as float64, checked.
-
-    Parameters
-    ----------
-    light : ndarray
-        Proportional to light.
-    clipped : ndarray, optional
-        True where a pixel is cut off at an end of its range, same shape.
-    what : str
-        Names the window in messages.
-    least, most : int
-        Shortest and longest side, pixels.
-
-    Raises
-    ------
-    InputError
-        It is no two-dimensional window, too small or large, has pixels without value, is clipped or uniform.
-    """
+    """The window of a pattern as float64, checked."""
     values = np.asarray(light, np.float64)
     if values.ndim != 2 or min(values.shape, default=0) < least:
         size = " × ".join(map(str, values.shape[::-1]))
@@ -112,13 +90,7 @@ def waves(turn: ArrayLike, harmonics: Sequence[int]) -> Array:
 
 
 def least_squares(columns: Array, values: Array) -> tuple[Array, Array, Array]:
-    """Solution, its covariance, and residuals (observed minus computed) of an overdetermined linear system.
-
-    Raises
-    ------
-    InputError
-        The columns depend on each other.
-    """
+    """Solution, its covariance, and residuals (observed minus computed) of an overdetermined linear system."""
     fit = solve(columns, values)
     if fit.rank < columns.shape[1]:
         raise InputError("the pixels do not determine the pattern: too few of its bars are in the window")

@@ -84,19 +84,7 @@ class StarRing:
 
 
 def fit_ring(values: Array, angle: Array, radius: float, sectors: int, *, whole: bool) -> StarRing:
-    """Least squares of a wave with so many periods around the centre, beside a level that changes slowly.
-
-    Parameters
-    ----------
-    values, angle : ndarray
-        Light and direction of the pixels.
-    radius : float
-        Of the ring.
-    sectors : int
-        Bright sectors.
-    whole : bool
-        The pixels go all around; else they are around one or two opposite directions.
-    """
+    """Least squares of a wave with so many periods around the centre, beside a level that changes slowly."""
     frequency = sectors / (2.0 * pi * radius)
     around = angle / (2.0 * pi)
     slow = np.hstack([np.ones((angle.size, 1)), waves(around, (1, 2) if whole else (1,))])
@@ -139,13 +127,7 @@ def rough_centre(values: Array) -> tuple[float, float]:
 
 
 def count_sectors(pixels: StarPixels, radii: tuple[float, float], what: str) -> int:
-    """Number of bright sectors: the strongest wave around the outer rings.
-
-    Raises
-    ------
-    InputError
-        No wave stands out.
-    """
+    """Number of bright sectors: the strongest wave around the outer rings."""
     values, angle = pixels.between((radii[0] + radii[1]) / 2.0, radii[1])
     count = 1 << int(np.ceil(np.log2(max(2.0 * pi * radii[1], 64.0))))
     place = np.clip(((angle + pi) / (2.0 * pi) * count).astype(int), 0, count - 1)
@@ -173,11 +155,6 @@ def find_centre(
 
     About a wrong centre the phase of a ring's wave changes with the direction, by the number of sectors times the part
     of the shift across the direction through the radius. The shifts follow from all parts of all rings at once.
-
-    Raises
-    ------
-    InputError
-        The centre does not settle.
     """
     sigma = (np.inf, np.inf)
     for step in range(30):

@@ -124,13 +124,7 @@ class _Three:
 
 
 def find_usaf(values: Array, what: str) -> UsafPlace:
-    """The place of the target.
-
-    Raises
-    ------
-    InputError
-        Too few bars fit the layout.
-    """
+    """The place of the target."""
     best: UsafPlace | None = None
     for bright in (True, False):
         threes = _threes(_bars(values if bright else -values))

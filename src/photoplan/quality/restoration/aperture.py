@@ -20,16 +20,7 @@ LEAST_TRANSFER = 0.05
 def aperture_transfer(
     shape: Literal["square", "round"], ratio: float, u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Transfer function of an aperture.
-
-    Parameters
-    ----------
-    shape : 'square' or 'round'
-    ratio : float
-        Side or diameter of the aperture by the step of the scan.
-    u, v : ndarray
-        Frequencies in cycles per step, shapes that broadcast.
-    """
+    """Transfer function of an aperture."""
     if shape == "square":
         return np.asarray(np.sinc(ratio * u) * np.sinc(ratio * v))
     return disc_transfer(ratio / 2.0, np.hypot(u, v))
@@ -40,24 +31,6 @@ def aperture_filter(shape: Literal["square", "round"], ratio: float = 1.0, half:
 
     With ratio 1 and nine values a side these are He's matrices; the square one is printed divided by its sum, the
     round one before that.
-
-    Parameters
-    ----------
-    shape : 'square' or 'round'
-    ratio : float
-        Side or diameter of the aperture by the step of the scan.
-    half : int
-        How many pixels the filter reaches to each side.
-
-    Returns
-    -------
-    ndarray, shape (2 half + 1, 2 half + 1)
-        Sum 1.
-
-    Raises
-    ------
-    InputError
-        The aperture is so large that it loses frequencies below 0.5 cycles per step, or is not positive.
     """
     if not 0.0 < ratio <= 10.0:
         raise InputError(f"aperture by step {ratio:g}; allowed are numbers above 0 up to 10")

@@ -68,24 +68,7 @@ class Convolution:
         out: NDArray[Any],
         valid: NDArray[np.bool_] | None = None,
     ) -> tuple[int, int]:
-        """Convolve the inner part of an array.
-
-        Parameters
-        ----------
-        source : ndarray, shape (height + 2 rows, LEFT + width + 2 columns + RIGHT)
-            Pixels with a margin; the columns LEFT and RIGHT of it are 0.
-        margin : (columns, rows)
-            At least what the kernel reaches.
-        out : ndarray, shape (height, width)
-            Gets the result; whole numbers are rounded to the nearest and clipped.
-        valid : ndarray of bool, shape (height, width)
-            Pixels that are counted; None: all.
-
-        Returns
-        -------
-        below, above : int
-            Pixels that were clipped, see `photoplan.kernels.convolve.round_clipped`.
-        """
+        """Convolve the inner part of an array."""
         rows, columns = (side // 2 for side in self.kernel.values.shape)
         if margin[0] < columns or margin[1] < rows:
             raise UsageError(f"a margin of {margin} pixels; the kernel reaches {(columns, rows)}")
@@ -138,17 +121,7 @@ class Margin:
     rows: int
 
     def around(self, window: Window, size: tuple[int, int], gaps: bool = True) -> Window:
-        """Pixels of an image of `size` that the filtered pixels of a window depend on.
-
-        Parameters
-        ----------
-        window : Window
-            Inside the image.
-        size : (int, int)
-            Width and height of the image.
-        gaps : bool
-            Whether pixels may be missing beside the window, so that those further away have to stand in.
-        """
+        """Pixels of an image of `size` that the filtered pixels of a window depend on."""
         times = 3 if gaps else 1
         columns, rows = times * self.columns, times * self.rows
         wide = (window.col - columns, window.row - rows, window.stop[0] + columns, window.stop[1] + rows)
@@ -169,25 +142,7 @@ class Margin:
         valid: NDArray[np.bool_] | None,
         scratch: Scratch | None = None,
     ) -> NDArray[np.float32]:
-        """Pixels of a window with its margin, all of them finite, as `Convolution` wants them.
-
-        Parameters
-        ----------
-        window : Window
-            Whose pixels will be filtered.
-        pixels : ndarray, shape (bands, at.height, at.width)
-            Of any type that float32 holds; values at invalid pixels are of no account.
-        at : Window
-            Where they are: what `around` said, of the whole image's pixels.
-        valid : ndarray of bool, shape (at.height, at.width)
-            None: all are.
-        scratch : Scratch, optional
-            Memory for the result, which then holds until the next one.
-
-        Returns
-        -------
-        ndarray, shape (bands, window.height + 2 rows, LEFT + window.width + 2 columns + RIGHT)
-        """
+        """Pixels of a window with its margin, all of them finite, as `Convolution` wants them."""
         wide = Window(
             window.col - self.columns,
             window.row - self.rows,

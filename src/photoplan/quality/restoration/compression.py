@@ -35,16 +35,6 @@ def kept_by_compression(pixels: Array) -> Array:
 
     It is the slope of the scene on the rounded coefficients, for a Laplacian distribution of the coefficients (Lam and
     Goodman 2000) by the share of them that are zero.
-
-    Parameters
-    ----------
-    pixels : ndarray, shape (windows, rows, columns)
-        Grey values of 8 bits; rows and columns are multiples of 8 and begin at borders of blocks.
-
-    Returns
-    -------
-    ndarray, shape (8, 8)
-        At multiples of 1/16 cycles/pixel along columns and rows; 1 everywhere if the image was not compressed.
     """
     parts = pixels.reshape(pixels.shape[0], pixels.shape[1] // BLOCK, BLOCK, -1, BLOCK).swapaxes(2, 3)
     coefficients = dctn(parts.reshape(-1, BLOCK, BLOCK), axes=(1, 2), norm="ortho").reshape(-1, BLOCK * BLOCK)

@@ -29,22 +29,6 @@ def radial_filter(
     other with the squared cosine of the direction. The weights on the axes follow from the row and column sums, as
     many linear equations as unknowns. Kölbl states this principle (2006, §3); with distances rounded to two digits it
     gives the printed filters of figures 4 and 6 to the last digit.
-
-    Parameters
-    ----------
-    inverse_x, inverse_y : ndarray, shape (2 n + 1,)
-        Inverses along a row and along a column, symmetric; None for y: the same. Their sums must be equal.
-    distance_digits : int, optional
-        Decimals to which distances are rounded; None: exact.
-
-    Returns
-    -------
-    ndarray, shape (2 n + 1, 2 n + 1)
-
-    Raises
-    ------
-    InputError
-        Inverses of different length, not symmetric, or with different sums.
     """
     across = np.asarray(inverse_x, float)
     along = across if inverse_y is None else np.asarray(inverse_y, float)

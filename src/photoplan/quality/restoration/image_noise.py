@@ -20,18 +20,6 @@ def block_noise(grey: NDArray[np.float64], valid: NDArray[np.bool_] | None = Non
 
     Differences of differences in both directions, [1 -2 1] times [1 -2 1], leave nothing of planes and of edges along
     rows or columns; their root mean square, divided by 6, is the noise of a pixel.
-
-    Parameters
-    ----------
-    grey : ndarray, shape (rows, columns)
-        Linear light.
-    valid : ndarray of bool, same shape, optional
-        Blocks with an invalid pixel are left out.
-
-    Returns
-    -------
-    ndarray, shape (blocks,)
-        Empty if no block is valid.
     """
     rows, columns = (side // BLOCK * BLOCK for side in grey.shape)
     if rows == 0 or columns == 0:
@@ -46,14 +34,7 @@ def block_noise(grey: NDArray[np.float64], valid: NDArray[np.bool_] | None = Non
 
 
 def image_noise(blocks: NDArray[np.float64]) -> float:
-    """Noise of an image from that of its blocks: what the most even ones show; NaN if there is none.
-
-    Parameters
-    ----------
-    blocks : ndarray, shape (n,)
-        Of `block_noise`, of the whole image or of windows spread over it. Blocks without any noise, as clipped areas
-        and compression leave them, do not count.
-    """
+    """Noise of an image from that of its blocks: what the most even ones show; NaN if there is none."""
     seen = np.sort(blocks[blocks > 0.0])
     if seen.size == 0:
         return float("nan")

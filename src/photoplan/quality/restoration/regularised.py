@@ -72,17 +72,7 @@ class Expectation:
     def of(
         cls, transfer: Transfer, scene: SceneStatistics, aperture: float = 1.0, kept: Array | None = None
     ) -> Expectation:
-        """What is expected of an image.
-
-        Parameters
-        ----------
-        transfer : Transfer
-            Of the image, real and symmetric.
-        aperture : float
-            Side of the ideal aperture, pixels; below 1 the best filter is sharper and noisier.
-        kept : ndarray, shape (8, 8), optional
-            Of `kept_by_compression`: what the image shows is the scene to this part only.
-        """
+        """What is expected of an image."""
         u, v = frequency_grid()
         power, (modulation, sigma) = scene.power(u, v), transfer(u, v)
         ideal = np.sinc(aperture * u) * np.sinc(aperture * v)
@@ -105,12 +95,7 @@ class Expectation:
         return self.error(kernel) / max(self.error(np.ones((1, 1))), 1e-300)
 
     def error(self, kernel: Array) -> float:
-        """Expected root mean square difference to the ideal image after a filter, in the light of the scene.
-
-        Parameters
-        ----------
-        kernel : ndarray, shape (2 m + 1, 2 n + 1)
-        """
+        """Expected root mean square difference to the ideal image after a filter, in the light of the scene."""
         base = frequency_grid()[0][0, 0]
         left, right = (
             np.exp(-2j * pi * np.outer(base, np.arange(side) - side // 2)) for side in np.asarray(kernel).shape
@@ -120,17 +105,7 @@ class Expectation:
         return sqrt(max(float(square), 0.0))
 
     def best(self, half: tuple[int, int]) -> Array:
-        """Kernel of least expected error, symmetric in x and in y, sum 1.
-
-        Parameters
-        ----------
-        half : (int, int)
-            How many rows and columns the kernel reaches to each side.
-
-        Returns
-        -------
-        ndarray, shape (2 half[0] + 1, 2 half[1] + 1)
-        """
+        """Kernel of least expected error, symmetric in x and in y, sum 1."""
         # A quadrant of the kernel is unknown; its waves are products of one per axis.
         down, right = (_waves(frequency_grid()[0][0, 0], reach) for reach in half)
         count = self.seen.size

@@ -87,24 +87,7 @@ class Restorer:
     def restore(
         self, window: Window, pixels: NDArray[Any], at: Window, valid: NDArray[np.bool_] | None
     ) -> RestoredPixels:
-        """Restore a window.
-
-        Parameters
-        ----------
-        window : Window
-            Inside the image.
-        pixels : ndarray, shape (bands, at.height, at.width)
-            Grey values of the image, or light where that is given.
-        at : Window
-            Where they are; see `Margin.around`.
-        valid : ndarray of bool, shape (at.height, at.width)
-            None: all are.
-
-        Raises
-        ------
-        InputError
-            Grey values are not in the linearisation's table.
-        """
+        """Restore a window."""
         rows = slice(window.row - at.row, window.stop[1] - at.row)
         cols = slice(window.col - at.col, window.stop[0] - at.col)
         mask = None if valid is None else np.ascontiguousarray(valid[rows, cols])
@@ -215,16 +198,6 @@ def field_weights(
     Places that form a full grid (each of their columns with each of their rows, whatever the steps) are interpolated
     bilinearly, and beyond the outer ones the outer ones hold. Others get weights by the inverse square of the distance
     (Shepard 1968), so that each place has its own filter exactly and far from all of them their mean holds.
-
-    Parameters
-    ----------
-    places : sequence of (column, row)
-        All different.
-
-    Returns
-    -------
-    list of (place, weights)
-        Places, by their index, that have any weight in the window; weights of shape (height, width), None: 1 for all.
     """
     if len(places) == 1:
         return [(0, None)]

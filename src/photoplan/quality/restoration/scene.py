@@ -94,21 +94,7 @@ def _unit_contrast(exponent: float) -> float:
 
 
 def block_spectra(grey: Array, usable: NDArray[np.bool_] | None = None) -> Array:
-    """Power spectra of overlapping blocks under a Hann window, mean taken off.
-
-    Parameters
-    ----------
-    grey : ndarray, shape (rows, columns)
-        Linear light; blocks with a value that is not finite are left out.
-    usable : ndarray of bool, same shape, optional
-        Blocks with a pixel that is not usable are left out.
-
-    Returns
-    -------
-    ndarray, shape (blocks, side, side)
-        White noise of variance 1 has the mean 1. Frequencies in the order of `numpy.fft.fftfreq`; side is `BLOCK`, or
-        the lesser of rows and columns.
-    """
+    """Power spectra of overlapping blocks under a Hann window, mean taken off."""
     side = min(BLOCK, *grey.shape)
     keep = np.isfinite(grey) if usable is None else np.isfinite(grey) & usable
     views = [
@@ -130,15 +116,6 @@ def scenes_of(
     A blurred white texture and noise that was smoothed have the same spectrum, and the mean spectrum alone cannot tell
     which it is. So there are two answers: noise of any size and smoothing, and no texture; and white noise, no more
     than the most even blocks show, and for the rest a texture. Where the image has none of both, they agree.
-
-    Parameters
-    ----------
-    spectrum, transfer
-        As in `fit_scene`.
-    even : float
-        Standard deviation of the noise by the most even blocks.
-    stated : float, optional
-        Standard deviation of white noise, if it is known: there is one answer then.
     """
     if stated is not None:
         return (fit_scene(spectrum, transfer, (stated, stated), textured=True),)
@@ -151,20 +128,7 @@ def scenes_of(
 def fit_scene(
     spectrum: Array, transfer: Transfer, noise: tuple[float, float], *, textured: bool = False
 ) -> SceneStatistics:
-    """Noise, contrast and exponent of the scene by which a mean spectrum is likeliest (Whittle 1953).
-
-    Parameters
-    ----------
-    spectrum : ndarray, shape (side, side)
-        Mean of `block_spectra`.
-    transfer : Transfer
-        Of the image.
-    noise : (float, float)
-        Least and largest standard deviation of the noise.
-    textured : bool
-        The noise is white and the scene may have a part that is white, too; else noise may have been smoothed and the
-        scene has no such part.
-    """
+    """Noise, contrast and exponent of the scene by which a mean spectrum is likeliest (Whittle 1953)."""
     side = spectrum.shape[0]
     base = np.fft.fftfreq(side)
     down, right = (part.ravel()[:, None] for part in np.mgrid[-FOLDS : FOLDS + 1, -FOLDS : FOLDS + 1])

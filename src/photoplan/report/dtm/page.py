@@ -35,12 +35,8 @@ MOST_NOTES = 50
 
 
 def open_build_report(output: Path, wanted: bool | None, overwrite: bool) -> ReportFile | None:
-    """The page beside a model to be, before any work; None: it is not wanted, or left open and matplotlib is missing.
-
-    Raises
-    ------
-    UsageError
-        It exists, or it is wanted and matplotlib is missing.
+    """The page beside a model to be, before any work; None: it is not wanted, or left open and matplotlib is
+    missing.
     """
     if wanted is False:
         return None

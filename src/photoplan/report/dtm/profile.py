@@ -17,13 +17,7 @@ _GROUND, _BAND = "#5b4a33", "#d9a441"
 
 
 def profile_picture(profiles: Profiles) -> bytes:
-    """A PNG: a panel for each profile, all in one scale.
-
-    Raises
-    ------
-    UsageError
-        There are too many profiles.
-    """
+    """A PNG: a panel for each profile, all in one scale."""
     if len(profiles) > MOST:
         raise UsageError(f"{len(profiles)} lines; a picture shows at most {MOST}: give fewer, or write a .csv alone")
     figure = mpl.figure.Figure(figsize=(10, 1.0 + 2.4 * len(profiles)), layout="constrained", dpi=110)

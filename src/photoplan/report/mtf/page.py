@@ -193,16 +193,7 @@ _NORMAL_95 = 1.96
 
 @styled
 def draw_overview(small: NDArray[np.uint8], size: tuple[int, int], edges: Sequence[MeasuredEdge]) -> bytes:
-    """The image with its edges, coloured by their MTF50.
-
-    Parameters
-    ----------
-    small : array
-        A small copy of the image, (rows, columns).
-    size : tuple of int
-        Width and height of the image, pixels.
-    edges : sequence of MeasuredEdge
-    """
+    """The image with its edges, coloured by their MTF50."""
     width, height = size
     # Beside the picture are its axis and the colours.
     tall = float(np.clip((_WIDTH - 1.4) * height / width, 1.4, 9.0))
@@ -280,15 +271,7 @@ def draw_curves(means: Sequence[EdgeGroup], total: EdgeGroup, edges: Sequence[Me
 
 @styled
 def draw_field(groups: Sequence[EdgeGroup], grid: int) -> bytes:
-    """MTF50 in the cells of the field, with half intervals and numbers of edges: of all edges and each direction.
-
-    Parameters
-    ----------
-    groups : sequence of EdgeGroup
-        Of one channel, each with its cell.
-    grid : int
-        Cells in each direction.
-    """
+    """MTF50 in the cells of the field, with half intervals and numbers of edges: of all edges and each direction."""
     known = np.array([g.mtf50.value for g in groups if np.isfinite(g.mtf50.value)])
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.5)
     pad = max(0.02, 0.1 * (high - low))

@@ -23,16 +23,7 @@ _DIRECTIONS = (("row", BLUE, "-"), ("column", ORANGE, "--"), ("diagonal", GREEN,
 
 
 def frequency_response(values: Array, frequency: Array, direction: tuple[float, float]) -> Array:
-    """Factor by which a kernel changes the amplitude of waves.
-
-    Parameters
-    ----------
-    values : ndarray, shape (2 m + 1, 2 n + 1)
-    frequency : ndarray
-        Cycles per pixel.
-    direction : (column, row)
-        Unit vector across the waves.
-    """
+    """Factor by which a kernel changes the amplitude of waves."""
     m, n = (side // 2 for side in values.shape)
     rows, columns = np.mgrid[-m : m + 1, -n : n + 1]
     along = (direction[0] * columns + direction[1] * rows).ravel()
@@ -106,15 +97,7 @@ def _response(axes: Any, values: Array) -> None:
 
 
 def draw_filter(path: Path, picture: Path, *, overwrite: bool = False) -> Path:
-    """Draw a filter file as PNG.
-
-    Raises
-    ------
-    InputError
-        The file is no filter.
-    UsageError
-        The picture exists and `overwrite` is False, or matplotlib is not installed.
-    """
+    """Draw a filter file as PNG."""
     check_output(picture, [path], overwrite=overwrite)
     load_matplotlib("a picture of a filter")
     used = load_filter(path)

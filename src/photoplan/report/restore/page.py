@@ -48,13 +48,7 @@ _BANDS = 6
 
 
 def restore_page(found: FoundFilter, jobs: Sequence[Job], made: RestoreReport) -> str:
-    """The report as one HTML document; images and results are opened again for details.
-
-    Raises
-    ------
-    InputError
-        An image changed meanwhile and is damaged.
-    """
+    """The report as one HTML document; images and results are opened again for details."""
     by_path = {job.target: job for job in jobs}
     parts = [section("The filter", _filter(found))]
     for k, image in enumerate(made.images):

@@ -115,12 +115,7 @@ def draw_field(maps: Sequence[FieldMap]) -> bytes:
 
 @styled
 def draw_details(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> bytes:
-    """A detail before and after, enlarged by a whole factor.
-
-    Parameters
-    ----------
-    before, after : ndarray, shape (height, width) or (height, width, 3)
-    """
+    """A detail before and after, enlarged by a whole factor."""
     height, width = before.shape[:2]
     factor = max(1, _DETAIL // max(height, width))
     wide, tall, gap, head = factor * width, factor * height, 48, 68
@@ -193,11 +188,6 @@ def compare(before: RasterReader, after: RasterReader) -> Compared:
 
     At most 20 × 20 windows of 160 × 160 pixels are read, spread over the image; all of it where it is small. Contrast
     is the root mean square difference of neighbouring pixels.
-
-    Raises
-    ------
-    InputError
-        Pixels are damaged.
     """
     windows = _windows(before.size)
     step = max(1, round((len(windows) * min(SIDE, *before.size) ** 2 / _VALUES) ** 0.5))

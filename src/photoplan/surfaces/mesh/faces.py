@@ -17,25 +17,7 @@ from photoplan.surfaces.units import LineElement, MeshFaces, Unit
 
 
 def constrained_faces(xy: NDArray[np.float64], edges: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Triangles over all points (their convex hull is filled) that hold every edge.
-
-    Parameters
-    ----------
-    xy : ndarray, shape (n, 2)
-        Points; finite, no two equal.
-    edges : ndarray, shape (m, 2)
-        Point numbers of the edges that must be kept; they may meet in points, but not cross.
-
-    Returns
-    -------
-    ndarray, shape (k, 3), int32
-        Point numbers of each triangle, counter-clockwise; empty for fewer than three points or points on one line.
-
-    Raises
-    ------
-    GeometryError
-        A point is not finite, two are equal, an edge has one point twice, or two edges cross.
-    """
+    """Triangles over all points (their convex hull is filled) that hold every edge."""
     xy = np.ascontiguousarray(xy, np.float64)
     edges = np.ascontiguousarray(edges, np.int64).reshape(-1, 2)
     if not np.isfinite(xy).all():
@@ -71,33 +53,6 @@ def build_faces(
     if a line passes. Along a two-sided breakline the triangles on its left have the left heights, those on its right
     the right ones; at a free end both sides have the mean, and where walls meet each sector between two of them has
     the mean of what they give it. In both cases all units must see the same lines: see `lines`.
-
-    Parameters
-    ----------
-    unit : Unit
-        Its own faces are not used.
-    lines : sequence of LineElement
-        All lines that touch the unit, edges and corners included, not clipped and with grid intersections
-        (`on_grid`); in the same order for all units. Lines meet in common vertices only. Border vertices without
-        height take that of another line or a post at their place, else no triangle reaches them.
-    neighbours : mapping of "north", "east", "south", "west" to Unit, optional
-        Units beside this one: where their posts lie between two of this unit, they become vertices of its triangles,
-        so that the surface is continuous.
-    domain : shapely polygon or multipolygon, optional
-        Where there is a surface; triangles outside are left out. Its border must be among the lines.
-
-    Returns
-    -------
-    MeshFaces or None
-        None if no mesh needs triangles. A mesh wholly outside the domain whose four posts have heights is marked by
-        one triangle of three equal corners: else it would count as bilinear.
-
-    Raises
-    ------
-    InputError
-        A line lacks its grid intersections, or a neighbour's side is none of the four.
-    GeometryError
-        Lines cross without a common vertex.
     """
     nodes = mesh_nodes(unit, lines, neighbours or {})
     if nodes is None:
@@ -201,21 +156,6 @@ def split_at_walls(
     The pieces of walls that meet in a point part its surroundings into sectors; each has the mean of the heights that
     the walls on both of its sides give it. In the middle of a wall these are the heights left and right; where a wall
     ends there is one sector, and with it one height, the mean of both.
-
-    Parameters
-    ----------
-    lines : sequence of LineElement
-        Those that the nodes come from.
-    corners : ndarray, shape (f, 3)
-        Node numbers of the triangles, counter-clockwise on the map.
-
-    Returns
-    -------
-    values : ndarray, shape (k, 4)
-        X, Y, Z and standard deviation of every vertex that a triangle uses. At a wall the vertex on the left comes
-        before that on the right.
-    corners : ndarray, shape (f, 3)
-        Vertex numbers.
     """
     rank = np.zeros(corners.shape, np.int64)
     height = nodes.values[corners, 2]

@@ -20,23 +20,6 @@ def on_grid(line: LineElement, layout: UnitLayout, meshes: NDArray[np.int64]) ->
     The new vertices are computed once, so that the meshes on both sides of a grid line hold the very same numbers;
     where a line runs along the border of two units it gets the posts of both. Vertices within 1e-6 of a mesh of a grid
     line are moved onto it. Lines that share vertices share them still.
-
-    Parameters
-    ----------
-    line : LineElement
-        With or without intersections; another grid's may stay.
-    meshes : ndarray, shape (rows, columns)
-        Meshes along the side of every unit; 0 for empty units, of which only the borders count.
-
-    Returns
-    -------
-    LineElement
-        Heights and standard deviations of new vertices are linear between their neighbours; `on_grid` is True there.
-
-    Raises
-    ------
-    InputError
-        `meshes` does not have the layout's shape.
     """
     if meshes.shape != (layout.rows, layout.columns):
         raise InputError(

@@ -13,25 +13,7 @@ from photoplan.surfaces.units import Unit
 
 
 def thin(unit: Unit, tolerance: float) -> Unit:
-    """A unit with the coarsest grid, by factors of two, whose bilinear surface keeps to all posts.
-
-    Parameters
-    ----------
-    unit : Unit
-        Without triangles: they belong to its grid.
-    tolerance : float
-        Largest difference between the coarse surface and a post that is left out, metres.
-
-    Returns
-    -------
-    Unit
-        Its valid meshes cover exactly the area of the given ones.
-
-    Raises
-    ------
-    InputError
-        The unit has triangles, or the tolerance is negative.
-    """
+    """A unit with the coarsest grid, by factors of two, whose bilinear surface keeps to all posts."""
     if unit.faces is not None:
         raise InputError(f"unit at {unit.left}, {unit.top} has triangles; thin the grid first, then build them")
     if not tolerance >= 0:

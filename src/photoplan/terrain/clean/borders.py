@@ -37,11 +37,6 @@ def closed(lines: Sequence[MeasuredLine]) -> tuple[list[MeasuredLine], list[Find
     """The lines, with border lines and holes closed: their first vertex is their last.
 
     A gap is closed if it is not longer than the longest side of the line (the file left the repeated vertex out).
-
-    Raises
-    ------
-    GeometryError
-        A border line or hole with a larger gap, or with fewer than three vertices; it is named.
     """
     out, found = [], []
     for line in lines:
@@ -105,12 +100,6 @@ def domain_of(measured: MeasuredTerrain) -> Any | None:
     Rings are taken from the largest to the smallest, a border line adds its area, a hole takes it away; so a border
     line inside a hole is an island. Self-crossing rings count where they enclose a point an odd number of times.
     With holes alone, everything around the data and outside of the holes is the area.
-
-    Returns
-    -------
-    shapely geometry or None
-        None: there is neither a border line nor a hole, and nothing bounds the model. An empty geometry: the holes
-        leave nothing.
     """
     rings = [(line.kind, _polygon(line)) for line in measured.lines if line.kind in ("border", "hole")]
     valid = [(kind, _areas(shapely.make_valid(ring))) for kind, ring in rings if ring is not None]

@@ -12,18 +12,6 @@ def clusters(xy: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
 
     The first of several close points stands for them, and no point is farther than twice the tolerance from the one
     that stands for it. Time and memory grow linearly with the number of points, also where many lie at one place.
-
-    Parameters
-    ----------
-    xy : ndarray, shape (n, 2)
-        Finite coordinates, metres.
-    tolerance : float
-        Metres, above zero.
-
-    Returns
-    -------
-    ndarray, shape (n,), int64
-        ``r[r] == r``: points that stand for themselves.
     """
     chosen = np.arange(len(xy))
     if len(xy) < 2:

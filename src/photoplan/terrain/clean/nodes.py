@@ -117,15 +117,7 @@ def insert(net: Network, new: Insertions) -> tuple[Network, NDArray[np.bool_], N
 
 
 def noded(net: Network, tolerance: float) -> tuple[Network, list[tuple[float, float]]]:
-    """The network with a common vertex wherever lines meet, cross or run along each other.
-
-    Returns
-    -------
-    network : Network
-        Segments have two different vertices, and no point but vertices in common.
-    joined : list of (X, Y)
-        Places where vertices had to be joined beyond the tolerance.
-    """
+    """The network with a common vertex wherever lines meet, cross or run along each other."""
     joined: list[tuple[float, float]] = []
     reach = tolerance
     while True:

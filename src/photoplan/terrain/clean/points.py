@@ -103,18 +103,6 @@ def join_to_lines(
 
     Points on walls are left out and reported, since nobody knows to which side they belong. Points on a border line or
     hole stay points, at the place of one of its vertices.
-
-    Parameters
-    ----------
-    near : ndarray of int
-        Points that can be on lines: those of `points_near`.
-
-    Returns
-    -------
-    Network, Points
-    Joined or None
-        What became vertices; None: no point is on a line any more.
-    list of Finding
     """
     start = net.segments
     near = near[points.keep[near]]

@@ -58,28 +58,6 @@ def clean(
     - Border lines and holes are closed if the gap is not longer than their longest side; self-crossing ones are
       reported and count where they enclose a place an odd number of times (`domain_of`). Points and lines outside are
       counted and kept.
-
-    Parameters
-    ----------
-    measured : MeasuredTerrain
-        As it was read; not changed.
-    sigmas : mapping of str to float, optional
-        Standard deviation of the heights of each class, metres, for groups and lines that have none of their own;
-        default `CLASS_SIGMAS`.
-
-    Returns
-    -------
-    MeasuredTerrain
-        With the same classes and groups; lines may have more vertices, or be parted at walls. Border lines and holes
-        repeat their first vertex at their end.
-    tuple of Finding
-
-    Raises
-    ------
-    GeometryError
-        A border line is not closed; or fewer than three different places with heights are left, or all lie on one line.
-    InputError
-        Coordinates that are in no projected CRS.
     """
     _check_range(measured)
     sigmas = {**CLASS_SIGMAS, **(sigmas or {})}

@@ -25,21 +25,6 @@ def joined_segments(
 
     Two ends are joined where they are the only ones of their class, code and accuracy at a place, one of the two lines
     is a single segment, and their heights agree. Two-sided breaklines keep their direction, others may be turned round.
-
-    Parameters
-    ----------
-    lines : sequence of MeasuredLine
-    tolerance : float
-        Distance in plan below which ends are at one place, metres.
-    height_tolerance : float
-        Difference of heights up to which they agree, metres; a missing height agrees with all.
-
-    Returns
-    -------
-    list of MeasuredLine
-        In the order of their first parts; a joined line has that one's name.
-    list of Finding
-        How many were joined, and the classes and codes of which most lines are left as single segments.
     """
     single = np.array([len(line.xyz) == 2 for line in lines], bool)
     if not single.any():

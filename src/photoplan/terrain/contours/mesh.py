@@ -85,20 +85,7 @@ class Front:
     _here: dict[int, tuple[NDArray[np.float64], NDArray[np.int64]]] = field(default_factory=dict)
 
     def share(self, part: SurfacePart, xyz: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Take vertices on a part's outer edge: those that a neighbour has become the neighbour's.
-
-        Parameters
-        ----------
-        part
-            Parts come row by row, from left to right.
-        xyz
-            Shape (n, 3).
-
-        Returns
-        -------
-        xyz, numbers
-            Shapes (n, 3) and (n,): the vertices as they are everywhere, and their numbers in the whole terrain.
-        """
+        """Take vertices on a part's outer edge: those that a neighbour has become the neighbour's."""
         if part.row != self.row:
             self._above = self._here if part.row == self.row + 1 else {}
             self._here, self.row = {}, part.row

@@ -88,17 +88,7 @@ def _kept_faces(faces: MeshFaces, keep: NDArray[np.bool_]) -> MeshFaces:
 def unit_parts(
     source: UnitSource, bounds: Bounds | None = None, lines: Callable[[Bounds], Sequence[LineElement]] | None = None
 ) -> Iterator[SurfacePart]:
-    """The units of a hybrid model, row by row from the north.
-
-    Parameters
-    ----------
-    source
-        The model.
-    bounds
-        Only the meshes that touch them.
-    lines
-        Gives the line elements that pass near map bounds; None: contours are smoothed over breaklines as elsewhere.
-    """
+    """The units of a hybrid model, row by row from the north."""
     layout = source.layout
     for row in range(layout.rows):
         for column in range(layout.columns):
@@ -138,19 +128,7 @@ def grid_parts(
     bounds: Bounds | None = None,
     side: int = 512,
 ) -> Iterator[SurfacePart]:
-    """Pieces of a height grid, row by row from the north.
-
-    Parameters
-    ----------
-    grid
-        Posts.
-    origin, mesh
-        X, Y of the upper-left post and mesh widths, metres.
-    bounds
-        Only the meshes that touch them.
-    side
-        Meshes along the side of a part.
-    """
+    """Pieces of a height grid, row by row from the north."""
     columns, rows = grid.size
     for row in range(-(-(rows - 1) // side)):
         for column in range(-(-(columns - 1) // side)):

@@ -79,18 +79,6 @@ def trace_contours(parts: Iterable[SurfacePart], options: ContourOptions) -> Ite
 
     Time grows linearly with the meshes and with the lines' vertices; memory holds one part and the lines that the
     present row of parts has open.
-
-    Parameters
-    ----------
-    parts
-        Row by row from the north, each from left to right (see `unit_parts` and `grid_parts`).
-    options
-        See `ContourOptions`.
-
-    Raises
-    ------
-    UsageError
-        The interval is so small that one part has more than thirty million pieces of lines.
     """
     front, joiner = Front(), Joiner()
     shortest = options.shortest

@@ -56,13 +56,7 @@ class CorrectionFile(Entry):
 
 
 def read_pose_errors(path: Path) -> PoseErrors | None:
-    """How exactly a corrected trajectory is known; None: the file does not say.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or an entry is wrong.
-    """
+    """How exactly a corrected trajectory is known; None: the file does not say."""
     found = read_entries(path, CorrectionFile, MAX_BYTES).accuracy
     if found is None:
         return None
@@ -88,13 +82,7 @@ def read_pose_errors(path: Path) -> PoseErrors | None:
 
 
 def read_line_correction(path: Path) -> LineCorrection:
-    """Corrections of a trajectory.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or an entry is missing, unknown or wrong.
-    """
+    """Corrections of a trajectory."""
     found = read_entries(path, CorrectionFile, MAX_BYTES)
     spline = None
     if found.spline is not None:
@@ -109,18 +97,7 @@ def read_line_correction(path: Path) -> LineCorrection:
 def line_correction_text(
     found: LineCorrection, covariance: _Floats | None, sigma: _Floats | None, errors: PoseErrors | None = None
 ) -> str:
-    """The file.
-
-    Parameters
-    ----------
-    found : LineCorrection
-    covariance : ndarray, shape (7, 7), optional
-        Of boresight, lever arm and time offset; radians, metres, seconds.
-    sigma : ndarray, shape (k, 6), optional
-        Standard deviations of the spline's coefficients; metres, radians.
-    errors : PoseErrors, optional
-        Of what comes of all corrections.
-    """
+    """The file."""
     lines = [
         'format = "photoplan line correction 1"',
         "# About x (along the flight), y (to the left) and z (up) of the camera; degrees.",

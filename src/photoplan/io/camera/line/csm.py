@@ -26,13 +26,7 @@ _ROWS = 25
 
 
 def read(isd: Any, path: Path) -> StatedLine:
-    """The line camera of an ISD.
-
-    Raises
-    ------
-    InputError
-        It is of another kind of camera, or a number is missing or wrong.
-    """
+    """The line camera of an ISD."""
     if not isinstance(isd, dict) or "line_scan_rate" not in isd:
         name = isd.get("name_model", "") if isinstance(isd, dict) else ""
         if name == FRAME_MODEL:

@@ -65,11 +65,6 @@ def looks_of(detectors: StripDetectors, folder: Path, max_bytes: int) -> tuple[t
     """Directions of a line, or of its chips, and how far the elements of its table lie beside them, in columns.
 
     None: no table.
-
-    Raises
-    ------
-    InputError
-        The table cannot be used, or its elements do not follow a smooth curve.
     """
     whole = StripChip(columns=detectors.columns, x_mm=detectors.x_mm, y_mm=detectors.y_mm)
     chips, table, file = detectors.chips or (whole,), None, Path()

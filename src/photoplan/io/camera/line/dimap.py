@@ -37,13 +37,7 @@ def is_it(root: Element) -> bool:
 
 
 def read(root: Element, path: Path) -> StatedLine:
-    """The line camera of a document.
-
-    Raises
-    ------
-    InputError
-        A number is missing or wrong.
-    """
+    """The line camera of a document."""
     model = root.find(_MODEL)
     assert model is not None
     try:

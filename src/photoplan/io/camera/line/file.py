@@ -29,19 +29,7 @@ LINE_FORMATS: dict[str, Callable[[Path], StatedLine]] = {".json": _isd, ".isd": 
 
 
 def read_line(path: Path, detectors: str | None = None) -> StatedLine:
-    """A line camera of a file: CSM support data (ISD, JSON), DIMAP with a physical model, or an aerial strip (TOML).
-
-    Parameters
-    ----------
-    path : Path
-    detectors : str, optional
-        Which line of a strip that has several.
-
-    Raises
-    ------
-    InputError
-        The format is unknown, the file cannot be used, or has no such line.
-    """
+    """A line camera of a file: CSM support data (ISD, JSON), DIMAP with a physical model, or an aerial strip (TOML)."""
     kind = path.suffix.lower()
     if kind == ".toml":
         return strip.read(path, detectors)

@@ -12,13 +12,7 @@ from photoplan.io.plain_files import read_text
 
 
 def read_numbers(path: Path, columns: str, max_bytes: int) -> NDArray[np.float64]:
-    """The numbers (n, k) of a table: CSV that begins with the names of its columns, or NPY.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is too large, has other columns, or a number that is not finite; told by its row.
-    """
+    """The numbers (n, k) of a table: CSV that begins with the names of its columns, or NPY."""
     count = columns.count(",") + 1
     try:
         if path.suffix.lower() == ".npy":

@@ -91,28 +91,14 @@ def names(path: Path) -> list[str]:
 
 
 def files_beside(path: Path) -> list[Path]:
-    """The record of the flight that a strip names, and tables of its detectors.
-
-    Raises
-    ------
-    InputError
-        The file of the strip cannot be used.
-    """
+    """The record of the flight that a strip names, and tables of its detectors."""
     strip = read_entries(path, StripFile, MAX_BYTES)
     tables = dict.fromkeys(each.table for each in strip.detectors.values() if each.table is not None)
     return [path.parent / name for name in (strip.flight.file, *tables)]
 
 
 def read(path: Path, name: str | None) -> StatedLine:
-    """The line camera of a strip, by the name of its detectors; None: there is one line of them.
-
-    Raises
-    ------
-    InputError
-        An entry or a number is missing or wrong.
-    HeightSystemError
-        The grid that leads from the record's heights to the ellipsoid is missing.
-    """
+    """The line camera of a strip, by the name of its detectors; None: there is one line of them."""
     strip = read_entries(path, StripFile, MAX_BYTES)
     known = ", ".join(strip.detectors)
     if name is None and len(strip.detectors) > 1:

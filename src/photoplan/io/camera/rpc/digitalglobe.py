@@ -20,13 +20,7 @@ def is_it(root: Element) -> bool:
 
 
 def read(root: Element, path: Path) -> RationalFunctions:
-    """Polynomials of the element ``RPB/IMAGE``.
-
-    Raises
-    ------
-    InputError
-        A number is missing or wrong.
-    """
+    """Polynomials of the element ``RPB/IMAGE``."""
     image = root.find(".//RPB/IMAGE")
     assert image is not None
     texts = {name: image.findtext(own) for name, own in NAMES.items()}

@@ -25,13 +25,7 @@ def is_it(root: Element) -> bool:
 
 
 def read(root: Element, path: Path) -> RationalFunctions:
-    """Polynomials of the inverse model.
-
-    Raises
-    ------
-    InputError
-        A number is missing or wrong.
-    """
+    """Polynomials of the inverse model."""
     model = root.find(".//Global_RFM")
     assert model is not None
     validity = model.find("RFM_Validity")

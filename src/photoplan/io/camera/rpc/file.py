@@ -46,12 +46,8 @@ RPC_FORMATS: dict[str, Callable[[Path], StatedRpc]] = {
 
 
 def read_rpc(path: Path) -> StatedRpc:
-    """Rational polynomials of a file: ``_RPC.TXT``, ``.RPB``, ``.geom``, XML of DIMAP or DigitalGlobe, an image's own.
-
-    Raises
-    ------
-    InputError
-        The format is unknown, or the file cannot be used.
+    """Rational polynomials of a file: ``_RPC.TXT``, ``.RPB``, ``.geom``, XML of DIMAP or DigitalGlobe, an
+    image's own.
     """
     read = RPC_FORMATS.get(path.suffix.lower())
     if read is not None:

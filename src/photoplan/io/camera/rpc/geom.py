@@ -25,13 +25,7 @@ def is_it(head: str) -> bool:
 
 
 def read(path: Path) -> RationalFunctions:
-    """Polynomials of ``line_off:  2345``, ``line_num_coeff_00: …`` and so on; keys may have a prefix with dots.
-
-    Raises
-    ------
-    InputError
-        The file states another sensor model, or a number is given twice, missing or wrong.
-    """
+    """Polynomials of ``line_off:  2345``, ``line_num_coeff_00: …`` and so on; keys may have a prefix with dots."""
     found: dict[str, str] = {}
     for number, line in enumerate(read_text(path, MAX_BYTES).split("\n"), 1):
         match = re.match(r"\s*(?:[\w.]+\.)?(\w+)\s*:\s*(.*?)\s*$", line)

@@ -44,22 +44,7 @@ class StatedRpc:
 def stated(
     values: Mapping[str, str | Sequence[str]], where: str, first: tuple[float, float] = (0.0, 0.0)
 ) -> RationalFunctions:
-    """Rational polynomials of numbers as GDAL calls them.
-
-    Parameters
-    ----------
-    values : mapping
-        Offsets and scales by the names of `SINGLE`, twenty coefficients each by those of `GROUPS`; all as texts.
-    where : str
-        What messages begin with.
-    first : (float, float)
-        Sample and line that the file gives the centre of the upper-left pixel.
-
-    Raises
-    ------
-    InputError
-        A number is missing, none, or cannot be.
-    """
+    """Rational polynomials of numbers as GDAL calls them."""
     missing = [name for name in (*SINGLE, *GROUPS) if name not in values]
     if missing:
         raise InputError(

@@ -19,13 +19,7 @@ NAMES |= {
 
 
 def read(path: Path) -> RationalFunctions:
-    """Polynomials of ``lineOffset = 2345;``, ``lineNumCoef = ( 1.0E+00, … );`` and so on.
-
-    Raises
-    ------
-    InputError
-        A number is given twice, missing or wrong.
-    """
+    """Polynomials of ``lineOffset = 2345;``, ``lineNumCoef = ( 1.0E+00, … );`` and so on."""
     text = read_text(path, MAX_BYTES)
     values: dict[str, str] = {}
     for name, own in NAMES.items():

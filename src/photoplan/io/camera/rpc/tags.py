@@ -18,11 +18,6 @@ def read(path: Path) -> RationalFunctions | None:
     """Polynomials of an image file; None if it holds none.
 
     Files beside it are not looked at: what decides a product is named.
-
-    Raises
-    ------
-    InputError
-        It is no image, or a number is missing or wrong.
     """
     driver = read_info(path).driver
     alone = gdal_settings(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR")

@@ -25,12 +25,8 @@ def rpc_text(functions: RationalFunctions) -> str:
 
 
 def read(path: Path) -> RationalFunctions:
-    """Polynomials of ``LINE_OFF: +002345.00 pixels``, ``LINE_NUM_COEFF_1: …`` and so on; what else there is, is left.
-
-    Raises
-    ------
-    InputError
-        A number is given twice, missing or wrong.
+    """Polynomials of ``LINE_OFF: +002345.00 pixels``, ``LINE_NUM_COEFF_1: …`` and so on; what else there is,
+    is left.
     """
     found: dict[str, str] = {}
     for number, line in enumerate(read_text(path, MAX_BYTES).split("\n"), 1):
