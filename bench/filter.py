@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.geometry.grid import Window
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
-from photoplan.quality.restoration.restorer import Restorer
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter, Restorer
 
 SIDE, TILE = 2048, 512
 #: Our rate by that of `cv2.filter2D`, at least, for 8 bit.

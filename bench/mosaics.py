@@ -27,7 +27,7 @@ from prepare import CHECKOUT, WORK
 from rasterio.transform import from_origin
 
 from photoplan import load_project, plan_mosaic
-from photoplan.io.geopackage import VectorLayer, write_geopackage
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
 from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.project import scene
 

@@ -24,7 +24,7 @@ from prepare import WORK
 from programs import ORTHORITY, Missing, install_orthority
 from rasterio.transform import from_origin
 
-from photoplan.products.init.run import InitRequest, init_project
+from photoplan.products.init import InitRequest, init_project
 
 HERE = Path(__file__).resolve().parent
 CRS = "EPSG:32632"

@@ -16,14 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from photoplan.engine.cluster import Question
-from photoplan.engine.executors import Workers, executor_factory, open_workers
+from photoplan.engine.executors import Question, Workers, executor_factory, open_workers
 from photoplan.engine.run import Made, Runner, Tally, Work
 from photoplan.events import SILENT
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.product import ProductFile
-from photoplan.io.run_record import versions
-from photoplan.plan.tiles import Tile, Tiles
+from photoplan.io.store import versions
+from photoplan.plan.footprint import Tile, Tiles
 
 SIDE, TILES = 128, 1000
 NOTHING = Made((None,), {"worst_residual": 0.0, "cells": 1})

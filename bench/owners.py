@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.engine.base import Source
-from photoplan.engine.execute import render
+from photoplan.cameras.lenses import NoLens
+from photoplan.engine.execute import Source, render
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.compile import AnchorRule
-from photoplan.plan.owner import GivenOwners
+from photoplan.plan.anchors import AnchorRule
+from photoplan.plan.footprint import Tiles
 from photoplan.plan.product import ProductPlan
-from photoplan.plan.tiles import Tiles
-from photoplan.surfaces.level import LevelSurface
+from photoplan.plan.sources import GivenOwners
+from photoplan.surfaces.base import LevelSurface
 from photoplan.targets.map import MapTarget
 
 SIDE = 512

@@ -11,10 +11,10 @@ import rasterio
 import yaml
 from rpc import rasterio_rpc
 
-from photoplan.cameras.rpc_fit import fit_rpc
-from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.cameras.rpc import fit_rpc
+from photoplan.geometry.local import GeodeticGround
 from photoplan.io.project.file import load_project
-from photoplan.products.init.run import InitRequest, init_project
+from photoplan.products.init import InitRequest, init_project
 from photoplan.project.scene import open_scene
 
 CHECKOUT = Path(__file__).resolve().parents[1]

@@ -20,12 +20,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from tools.shaken_strip import ShakenStrip
 
-from photoplan.cameras.line import LineCamera
+from photoplan.cameras.pushbroom import LineCamera
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.camera.line.file import read_line
 from photoplan.kernels.pack import pack
 from photoplan.kernels.rectify import rectify_tile
-from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.anchors import AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 

@@ -16,9 +16,9 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from photoplan.io.terrain.files import read_measured
-from photoplan.surfaces.measured import MeasuredTerrain
-from photoplan.surfaces.mesh.faces import constrained_faces
-from photoplan.terrain.clean.run import clean
+from photoplan.surfaces.mesh import constrained_faces
+from photoplan.surfaces.units import MeasuredTerrain
+from photoplan.terrain.clean import clean
 
 
 def network(measured: MeasuredTerrain) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.geometry.grid import Window
-from photoplan.plan.tiles import Tile
-from photoplan.products.view import job, make
+from photoplan.plan.footprint import Tile
+from photoplan.products.view import make
+from photoplan.products.view import make as job
 from photoplan.products.view.camera import CameraRequest
 from photoplan.products.view.content import ViewScene
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from pydantic import TypeAdapter
 
-from photoplan.cameras.mark_pattern import MarkPattern
+from photoplan.cameras.fiducials import MarkPattern
 from photoplan.io.mark_model import Mark
 from photoplan.orientation.marks.template import render
 from photoplan.project.camera_marks import mark_pattern

@@ -7,19 +7,17 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
+from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.plane import Affine2D
+from photoplan.cameras.lenses import NoLens
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose
 from photoplan.plan.ground import TileGround
-from photoplan.plan.visibility import hidden_pixels
+from photoplan.plan.sources import hidden_pixels
 from photoplan.products.rectify import rectify
-from photoplan.surfaces.base import Terrain
-from photoplan.surfaces.faces import Faces
-from photoplan.surfaces.level import LevelSurface
-from photoplan.surfaces.objects import ObjectSurface
+from photoplan.surfaces.base import LevelSurface, Terrain
+from photoplan.surfaces.objects import Faces, ObjectSurface
 from photoplan.surfaces.polygon_faces import filled
 from photoplan.targets.map import MapTarget
 

@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.products.mtf.image import LUMINANCE, LightImage
+from photoplan.products.mtf.edges import LUMINANCE, LightImage, MtfRequest, measure_mtf
 from photoplan.products.mtf.result import MeasuredEdge
-from photoplan.products.mtf.run import MtfRequest, measure_mtf
-from photoplan.products.restore.design import DesignRequest, design_restoration
-from photoplan.products.restore.run import RestoreRequest, restore_images
-from photoplan.project.linearisation import linearisation_of
+from photoplan.products.restore import DesignRequest, RestoreRequest, design_restoration, restore_images
+from photoplan.project.steps import linearisation_of
 from photoplan.quality.edges.response import EdgeMeasurement, measure_edge
 from photoplan.quality.restoration.design import DesignOptions
 

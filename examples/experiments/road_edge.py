@@ -23,22 +23,20 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.engine.base import Source
-from photoplan.engine.execute import render
+from photoplan.cameras.lenses import NoLens
+from photoplan.engine.execute import Source, render
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.compile import AnchorRule
+from photoplan.plan.anchors import AnchorRule
+from photoplan.plan.footprint import Tiles
 from photoplan.plan.product import ProductPlan
-from photoplan.plan.tiles import Tiles
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.surfaces.raster import RasterSurface
-from photoplan.surfaces.units import MemoryUnits
+from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, MemoryUnits, PointGroup
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import Built, build_terrain, plan_build
-from photoplan.terrain.clean.run import clean
+from photoplan.terrain.clean import clean
 from photoplan.terrain.settings import BuildSettings
 
 CENTRE, RADIUS = np.array([70.0, -85.0]), 150.0

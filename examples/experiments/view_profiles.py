@@ -17,8 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
-from photoplan.products.view.camera import CameraRequest, view_camera
-from photoplan.products.view.ground import ViewGround
+from photoplan.products.view.camera import CameraRequest, ViewGround, view_camera
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.seen import SeenSurface
 

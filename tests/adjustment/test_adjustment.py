@@ -6,11 +6,18 @@ import numpy as np
 import pytest
 
 from photoplan.adjustment.blocks import Kind, Layout
-from photoplan.adjustment.chances import chance_chi_square, chance_f, chance_gain, chance_normal, chance_t
-from photoplan.adjustment.iterate import levenberg
-from photoplan.adjustment.linear import Decomposed, solve
-from photoplan.adjustment.robust import bisquare, cauchy, geman_mcclure, huber, spread
-from photoplan.orientation.bundle.unknowns import Vectors
+from photoplan.adjustment.least_squares import (
+    Decomposed,
+    bisquare,
+    cauchy,
+    geman_mcclure,
+    huber,
+    levenberg,
+    solve,
+    spread,
+)
+from photoplan.adjustment.statistics import chance_chi_square, chance_f, chance_gain, chance_normal, chance_t
+from photoplan.orientation.bundle.model import Vectors
 
 RNG = np.random.default_rng(3)
 

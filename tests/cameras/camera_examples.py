@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from photoplan.cameras.fiducials import Bilinear2D
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.fisheye import Fisheye
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.opencv import OpenCV
-from photoplan.cameras.lenses.radial_table import RadialTable
-from photoplan.cameras.lenses.reversed import Reversed
-from photoplan.cameras.plane import Bilinear2D
+from photoplan.cameras.lenses import Brown, Fisheye, Lens, NoLens, OpenCV, RadialTable, Reversed
 
 #: USGS report OSL/1785 (Jena LMK 1000, Lamegon PI/C 7384525C): mean radial distortion, camera constant 152.299 mm.
 OSL_1785_ANGLES = (7.5, 15.0, 22.7, 30.0, 35.0, 40.0)

@@ -13,9 +13,7 @@ import math
 import numpy as np
 import pytest
 
-from photoplan.cameras.affine_facts import affine_facts
-from photoplan.cameras.fiducials_fit import FiducialFit, fit_affine
-from photoplan.cameras.plane import Affine2D
+from photoplan.cameras.fiducials import Affine2D, FiducialFit, affine_facts, fit_affine
 from photoplan.errors import InputError
 
 #: DX, DY of the stage (µm), measured column and row (pixels), printed residuals (pixels).

@@ -16,7 +16,7 @@ from tools.shaken_strip import ShakenStrip
 from tools.thinned import some
 
 from photoplan.cameras.base import project, tremor_told
-from photoplan.cameras.line_chips import ChippedLine
+from photoplan.cameras.pushbroom import ChippedLine
 from photoplan.errors import InputError
 from photoplan.io.camera.line.file import read_line
 

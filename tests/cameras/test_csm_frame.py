@@ -21,7 +21,7 @@ from photoplan.geometry.crs import crs_step
 from photoplan.io.camera.csm_frame import is_frame, read, read_frame
 from photoplan.io.camera.line.file import read_line
 from photoplan.plan.footprint import footprint
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 
 #: Support data of USGS's ale and usgscsm; `edited_…` have other coefficients, sums and first detectors.
 DATA = Path(__file__).parents[1] / "data/csm_frame"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tools.body_axes import over_its_body
 
 from photoplan.cameras.base import project
-from photoplan.cameras.line import LineCamera
+from photoplan.cameras.pushbroom import LineCamera
 from photoplan.errors import InputError
 from photoplan.io.camera.isd import Isd
 from photoplan.io.camera.line import csm

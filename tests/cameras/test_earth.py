@@ -11,16 +11,13 @@ from tools.resolution import curvature_displacement
 from photoplan.cameras.base import Camera, project
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.corrected import CurvatureCorrection, corrected_camera
-from photoplan.cameras.curved import curved_camera
+from photoplan.cameras.curvature import Refraction, WarpedCamera, _profile, curved_camera
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.refraction import Refraction, _profile
-from photoplan.cameras.warped import WarpedCamera
+from photoplan.cameras.lenses import NoLens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.local import LocalFrame, earth_radius
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.pose import Pose, rotation_opk
 
 UTM = "EPSG:25832"
 #: Transverse Mercator with scale 1 on its meridian: nothing but curvature differs from Cartesian space near it.

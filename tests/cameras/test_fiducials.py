@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from photoplan.cameras.base import project
-from photoplan.cameras.fiducials_fit import FiducialFit, fit_affine, fit_bilinear
+from photoplan.cameras.fiducials import Affine2D, Bilinear2D, FiducialFit, fit_affine, fit_bilinear
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.cameras.lenses import NoLens
 from photoplan.errors import GeometryError, InputError
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.pose import Pose, rotation_opk
 
 #: Ecker 1991, §8.1.1 (calibration of 22.8.74, millimetres) and §8.1.2 (scanner coordinates, pixels of 0.1 mm).
 QUARRY_MM = {"1": (105.999, -106.016), "2": (-106.012, -106.006), "3": (-105.997, 105.993), "4": (106.007, 105.993)}

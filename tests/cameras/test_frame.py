@@ -9,14 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photoplan.cameras.base import project
+from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.plane import Affine2D
+from photoplan.cameras.lenses import Lens, NoLens
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.pose import Pose, rotation_opk
 
 POSE = Pose.from_angles([4321.5, 8765.25, 1300.0], [0.05, -0.08, 1.9])
 every_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES.keys())

@@ -13,9 +13,8 @@ from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.framed import FramedCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.geometry.cylinder import CylinderFrame
-from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
+from photoplan.cameras.lenses import Brown
+from photoplan.geometry.frames import CylinderFrame, Frame, ImageFrame, WallFrame
 from photoplan.geometry.pose import Pose
 
 CENTER = (X0 + 3.0, Y0 - 5.0, 300.0)

@@ -20,7 +20,7 @@ from tools.ign_block import unaltered_height
 from photoplan.cameras.base import project
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses import NoLens
 from photoplan.geometry.local import LocalFrame
 from photoplan.geometry.pose import Pose
 

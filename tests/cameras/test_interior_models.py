@@ -10,9 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.thinned import some
 
-from photoplan.cameras.affine_facts import affine_facts, film_shrinkage, residuals_on_film
-from photoplan.cameras.fiducials_fit import MODELS, FiducialFit, fit_affine, fit_bilinear, fit_marks, fit_similarity
-from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.cameras.fiducials import (
+    MODELS,
+    Affine2D,
+    Bilinear2D,
+    FiducialFit,
+    affine_facts,
+    film_shrinkage,
+    fit_affine,
+    fit_bilinear,
+    fit_marks,
+    fit_similarity,
+    residuals_on_film,
+)
 from photoplan.errors import InputError
 
 #: Eight marks (USGS report OSL/1785, millimetres).

@@ -18,14 +18,17 @@ from hypothesis import strategies as st
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.field import FieldLimited, field_limited
-from photoplan.cameras.lenses.fisheye import Fisheye
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.opencv import OpenCV
-from photoplan.cameras.lenses.radial_table import RadialTable
-from photoplan.cameras.lenses.reversed import Reversed
+from photoplan.cameras.lenses import (
+    Brown,
+    FieldLimited,
+    Fisheye,
+    Lens,
+    NoLens,
+    OpenCV,
+    RadialTable,
+    Reversed,
+    field_limited,
+)
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
 

@@ -18,17 +18,15 @@ from tools.command import inside
 from tools.line_strip import Strip, pattern
 
 from photoplan.cameras.base import project
-from photoplan.cameras.line import LineCamera
-from photoplan.cameras.rpc_fit import fit_rpc
+from photoplan.cameras.pushbroom import LineCamera
+from photoplan.cameras.rpc import fit_rpc
 from photoplan.errors import HeightSystemError, InputError
-from photoplan.geometry.body import EARTH_RADII, BodyGround
-from photoplan.geometry.geodetic import GeodeticGround
-from photoplan.geometry.local import Ellipsoid
+from photoplan.geometry.local import EARTH_RADII, BodyGround, Ellipsoid, GeodeticGround
 from photoplan.io.camera.line import csm
 from photoplan.io.camera.line.file import read_line
 from photoplan.io.camera.line.model import StatedLine
 from photoplan.plan.footprint import footprint
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 
 FILES = ["chandrayaan2_tmc2_isd", "ctxLineScan", "hirise_isd", "lrolroc_isd", "mexhrsc_isd", "constVelocityLineScan"]
 #: Here the reference intersects rays behind the camera: it looks away from the body.

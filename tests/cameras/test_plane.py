@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.cameras.fiducials import Affine2D, Bilinear2D
 from photoplan.errors import GeometryError, InputError, UsageError
 
 number = st.floats(-2.0, 2.0)

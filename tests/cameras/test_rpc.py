@@ -13,10 +13,10 @@ from rasterio.warp import Resampling, reproject
 from tools.rpc_images import CRS, camera, functions, gdal_form
 
 from photoplan.cameras.base import project
-from photoplan.cameras.plane import Affine2D
+from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.rpc import BOUND, RationalFunctions, RpcCamera, terms
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.geometry.local import GeodeticGround
 
 
 def places(n: int = 200, seed: int = 1) -> np.ndarray:

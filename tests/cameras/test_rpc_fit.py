@@ -8,10 +8,9 @@ from tools.pinhole import Pinhole
 from tools.rpc_images import CRS, camera, functions
 
 from photoplan.cameras.base import project
-from photoplan.cameras.rpc import RpcCamera
-from photoplan.cameras.rpc_fit import fit_rpc, fitted_functions
+from photoplan.cameras.rpc import RpcCamera, fit_rpc, fitted_functions
 from photoplan.errors import GeometryError
-from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.geometry.local import GeodeticGround
 from photoplan.geometry.pose import Pose
 
 GROUND = GeodeticGround(CRS)

@@ -16,7 +16,7 @@ from photoplan.geometry.crs import require_projected_metres
 from photoplan.io.camera import csm_frame
 from photoplan.io.camera.line import csm
 from photoplan.plan.footprint import footprint
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 
 DATA = Path(__file__).parents[1] / "data"
 #: Radius of Phobos, metres.

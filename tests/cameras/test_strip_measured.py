@@ -10,10 +10,9 @@ from test_chips import FIRST, strip_file
 from tools.shaken_strip import ShakenStrip
 
 from photoplan.cameras.base import project
-from photoplan.cameras.line import LineCamera
-from photoplan.cameras.line_chips import ChippedLine
-from photoplan.cameras.line_correctable import CorrectableLine, TrackPriors
+from photoplan.cameras.correctable import CorrectableLine, TrackPriors
 from photoplan.cameras.line_correction import LineCorrection
+from photoplan.cameras.pushbroom import ChippedLine, LineCamera
 from photoplan.io.camera.line.file import read_line
 
 PRIORS = TrackPriors(

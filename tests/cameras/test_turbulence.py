@@ -9,8 +9,8 @@ import pytest
 from tools.shaken_strip import ShakenStrip
 
 from photoplan.cameras.base import project
-from photoplan.cameras.line import LineCamera
-from photoplan.geometry.motion import cubic_convolution
+from photoplan.cameras.pushbroom import LineCamera
+from photoplan.geometry.pose import cubic_convolution
 from photoplan.io.camera.line.file import read_line
 
 

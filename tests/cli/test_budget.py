@@ -11,7 +11,7 @@ import pytest
 from tools.command import Here, edit
 from tools.small_block import FOCAL, write_block
 
-from photoplan.plan.budget import displacement_by_height, displacement_by_kappa, displacement_by_tilt
+from photoplan.plan.accuracy import displacement_by_height, displacement_by_kappa, displacement_by_tilt
 
 NUMBERS = ("--camera-constant", 150, "--height", 1500, "--format", 200, 200, "--pixel", 15)
 GON = np.pi / 200

@@ -13,7 +13,7 @@ from tools.camera_series import disc_frame, edge_frame, write_series
 from tools.command import Here, Said
 
 from photoplan.geometry.grid import Window
-from photoplan.project.fall_off import read_fall_off
+from photoplan.project.steps import read_fall_off
 from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off
 
 SIZE = (160, 120)

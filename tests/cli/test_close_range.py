@@ -13,11 +13,10 @@ from tools.command import inside
 from photoplan.cameras.base import project as project_points
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.cameras.lenses import NoLens
+from photoplan.geometry.pose import Pose, rotation_from_angles
 from photoplan.plain import shown_metres
-from photoplan.report.adjust.tables import plain
+from photoplan.report.adjust import plain
 
 SIZE, C = (4000, 3000), 3200.0
 

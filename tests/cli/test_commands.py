@@ -19,7 +19,7 @@ from photoplan.cli.main import VERBS
 from photoplan.io.project.file import load_project
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import ground_of
-from photoplan.surfaces.intersect import intersect
+from photoplan.surfaces.shifted import intersect
 
 
 def test_help_answers_at_once() -> None:

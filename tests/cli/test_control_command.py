@@ -13,8 +13,7 @@ from tools.proposed import residuals, spoilt
 from tools.real_projects import drone_project
 from tools.recorded import recorded
 
-from photoplan.io.ground_points import read_ground_points
-from photoplan.io.image_points import read_image_points
+from photoplan.io.points import read_ground_points, read_image_points
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 

@@ -8,7 +8,7 @@ import pytest
 from tools.orientation_blocks import CAMERA, GROUND, NAMES, block, our_pixels
 from tools.recorded import recorded
 
-from photoplan.geometry.rotation import angles_from_rotation
+from photoplan.geometry.pose import angles_from_rotation
 from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation, write_orientation
 
 

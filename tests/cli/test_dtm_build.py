@@ -11,8 +11,8 @@ from tools.build_terrain import scattered
 from tools.command import Here
 from tools.landxml import write_landxml
 
-from photoplan.io.lock import FileLock
-from photoplan.io.terrain.model_read import ModelReader
+from photoplan.io.disk import FileLock
+from photoplan.io.terrain.model import ModelReader
 from photoplan.surfaces.hybrid import HybridSurface
 
 EAST, NORTH = 500_000.0, 5_300_000.0

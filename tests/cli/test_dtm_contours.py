@@ -17,8 +17,8 @@ from tools.small_model import write_small
 
 from photoplan.errors import UsageError
 from photoplan.io import disk
-from photoplan.io.contour_file import ContourRow, write_contours
-from photoplan.io.lock import FileLock
+from photoplan.io.disk import FileLock
+from photoplan.io.vector_layer import ContourRow, write_contours
 
 
 def hill_height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -165,7 +165,7 @@ def test_fault_04_a_full_disk_leaves_the_old_file(
 ) -> None:
     import errno
 
-    from photoplan.io import naming
+    from photoplan.io import store as naming
 
     out = tmp_path / "c.gpkg"
     out.write_bytes(b"old")

@@ -14,7 +14,7 @@ from tools.recorded import recorded
 from tools.small_block import write_terrain
 from tools.small_model import EMPTY, LAYOUT, hills, write_small, write_units_of
 
-from photoplan.io.terrain.model_read import ModelReader
+from photoplan.io.terrain.model import ModelReader
 from photoplan.surfaces.hybrid import HybridSurface
 
 INSIDE = (500_090.3, 5_299_990.4)
@@ -96,7 +96,7 @@ class TestSample:
 
     def test_many_parts(self, photoplan: Here, model: Path, tmp_path: Path) -> None:
         """The table is read in parts: none is lost or doubled between them."""
-        from photoplan.products.dtm import sample as dtm_sample
+        from photoplan.products.dtm import lines as dtm_sample
 
         points = table(tmp_path / "p.csv", "x,y\n" + "".join(f"{500_000 + i / 10},5299990\n" for i in range(1000)))
         photoplan("dtm", "sample", model, points, "-o", tmp_path / "a.csv")

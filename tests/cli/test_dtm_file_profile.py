@@ -16,7 +16,7 @@ from tools.recorded import recorded
 from tools.small_block import write_terrain
 from tools.small_model import CRS, LAYOUT, LINED, WALL, write_small
 
-from photoplan.io.terrain.model_read import ModelReader
+from photoplan.io.terrain.model import ModelReader
 from photoplan.surfaces.hybrid import HybridSurface
 
 ACROSS = [(500_045.0, 5_299_928.0), (500_078.0, 5_299_957.0)]

@@ -14,9 +14,8 @@ from tools.command import Here
 from tools.recorded import recorded
 from tools.small_model import LAYOUT, grid_unit, hills, parts, write_units_of
 
-from photoplan.io.terrain.model_read import ModelReader
-from photoplan.io.terrain.model_tables import GrossError
-from photoplan.project.open_terrain import open_terrain
+from photoplan.io.terrain.model import GrossError, ModelReader
+from photoplan.project.ground import open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.units import LineElement, UnitLayout
 
@@ -79,7 +78,7 @@ def test_gross_errors_and_lines_of_the_model_that_counts(files: tuple[Path, Path
     from dataclasses import replace
 
     from photoplan.io.terrain.model_write import ModelWriter
-    from photoplan.products.dtm.refine import RefineRequest, dtm_refine
+    from photoplan.products.dtm.build import RefineRequest, dtm_refine
 
     inside, outside = (500_070.0, 5_299_950.0, 0.0), (500_010.0, 5_299_890.0, 0.0)
 
@@ -95,7 +94,7 @@ def test_gross_errors_and_lines_of_the_model_that_counts(files: tuple[Path, Path
         with ModelWriter(path, layout, name, overwrite=True) as writer:
             for f in figures:
                 writer.add(units[f.column, f.row], f)
-            from photoplan.surfaces.mesh.lines import on_grid
+            from photoplan.surfaces.mesh import on_grid
 
             meshes = np.full((layout.rows, layout.columns), figures[0].meshes)
             header = replace(before.header, layout=layout)

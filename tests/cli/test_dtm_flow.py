@@ -76,7 +76,7 @@ def test_wrong_use(valley, tmp_path, photoplan):
         (("-o", out, "--outlets", twice), 3, "one cell"),
         (("-o", out, "--catchments", tmp_path / "a.shp"), 2, ".gpkg"),
         (("-o", out, "--snap", -1), 2, "snap"),
-        (("-o", tmp_path / "a.gpkg", "--catchments", tmp_path / "a.gpkg"), 2, ".tif"),
+        (("-o", tmp_path / "a.gpkg", "--catchments", tmp_path / "a.gpkg"), 2, "same file"),
     ]:
         said = photoplan("dtm", "flow", valley, *words)
         assert said.code == code and text in said.err, (words, said)

@@ -12,7 +12,7 @@ import shapely
 from tools.dem_file import write_dem, write_geojson
 from tools.events import Told
 
-from photoplan.products.dtm.volume import VolumeRequest, dtm_volume
+from photoplan.products.dtm.analyses import VolumeRequest, dtm_volume
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from tools.command import edit
 from tools.dem_file import X0, Y0, write_dem, write_geojson
 from tools.small_model import EMPTY, LAYOUT, LINED, WALL, grid_unit, write_units_of
 
-from photoplan.surfaces.mesh.faces import build_faces
+from photoplan.surfaces.mesh import build_faces
 from photoplan.surfaces.units import LineElement, Unit
 
 

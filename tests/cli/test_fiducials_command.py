@@ -13,8 +13,8 @@ from tools.command import Here
 from tools.mark_scans import ARM, CORNERS, FREE, LINE, RADIUS, Simulated, simulate
 from tools.recorded import recorded
 
-from photoplan.io.project.cameras import fiducial_fit
 from photoplan.io.project.file import load_project
+from photoplan.io.project.model import fiducial_fit
 
 MARKS = (
     f'marks = {{ type = "ring_cross", diameter = {2 * RADIUS + LINE}, width = {LINE}, arm = {ARM}, '

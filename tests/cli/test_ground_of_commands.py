@@ -15,13 +15,13 @@ from tools.real_projects import drone_project
 from tools.recorded import recorded
 from tools.small_block import CRS, X0, Y0, Z0, Block, make_project, write_terrain
 
-from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.project.file import load_project
 from photoplan.io.raster import RasterReader
-from photoplan.products.adjust.frame import nadir_heights
-from photoplan.products.control.patches import Ortho, choose_patches
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
+from photoplan.products.adjust.sensors import nadir_heights
+from photoplan.products.control import Ortho, choose_patches
 from photoplan.products.monoplot import _unknown_on_objects
-from photoplan.products.tie.inputs import _placed
+from photoplan.products.tie import _placed
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import ground_of
 from photoplan.project.scene import open_scene

@@ -367,8 +367,8 @@ def rendered(block: Path) -> list[str]:
     from photoplan.cameras.base import project as project_points
     from photoplan.cameras.build import oriented_camera
     from photoplan.geometry.pose import Pose
-    from photoplan.io.project.cameras import interior_of, lens_of
     from photoplan.io.project.file import load_project
+    from photoplan.io.project.model import interior_of, lens_of
 
     project = load_project(block / "project.toml")
     image = project.image("a2")

@@ -16,11 +16,10 @@ from tools.recorded import recorded
 from photoplan.cameras.base import project as project_points
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses import Brown
 from photoplan.cli.resect import command
 from photoplan.errors import GeometryError, InputError, TilesFailed, UsageError
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.geometry.pose import Pose, rotation_from_angles
 from photoplan.io.project.file import load_project
 from photoplan.project.scene import open_scene
 

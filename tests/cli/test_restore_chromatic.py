@@ -11,7 +11,7 @@ import rasterio
 from tools.command import Here
 from tools.formed import form_image
 
-from photoplan.io.whole_image import write_whole_image
+from photoplan.io.raster import write_whole_image
 from photoplan.products.chromatic import load_chromatic
 from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.parts import Gain, Lateral, Quantisation, Spread

@@ -13,8 +13,8 @@ from tools.command import Here
 from tools.huge_tiff import write_huge_tiff
 from tools.small_block import texture, write_image
 
-from photoplan.project.filter_files import load_filter, save_filter
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
+from photoplan.project.steps import load_filter, save_filter
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 
 WEIGHTS = np.array([[0.02, -0.15, 0.01], [-0.2, 1.62, -0.14], [0.03, -0.16, -0.03]])
 

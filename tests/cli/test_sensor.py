@@ -137,7 +137,7 @@ def test_missing_file(photoplan: Here, tmp_path: Path):
 
 
 def test_every_entry_is_on_the_reference_page():
-    from photoplan.io.sensor_file import SensorDescription
+    from photoplan.io.quality_files import SensorDescription
 
     schema = SensorDescription.model_json_schema()
     page = (TEMPLATES.parent / "reference" / "sensor.md").read_text("utf-8")

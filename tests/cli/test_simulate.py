@@ -12,8 +12,8 @@ import rasterio
 from tools.command import Here
 from tools.formed import form_image, form_series
 
-from photoplan.io.whole_image import write_whole_image
-from photoplan.products.simulate.model import entry_of, model_of, read_model
+from photoplan.io.raster import write_whole_image
+from photoplan.products.simulate import entry_of, model_of, read_model
 from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.scenes import PatternScene
 

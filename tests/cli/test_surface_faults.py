@@ -287,7 +287,7 @@ def test_a_run_that_is_ended_goes_on(project: Path, number: signal.Signals) -> N
     words = ["surface", project, "--resolution", 1.5, "--bounds", *bounds, "--workers", 1]
     products, begun = project.parent / "products", project.parent / "begun"
     begun.mkdir()
-    job = "photoplan.products.surface.job:SurfaceJob"
+    job = "photoplan.products.surface.plan:SurfaceJob"
     running = start(*words, "--no-quicklook", env=sabotage(job=job, hold=begun / "go", quick=1, begun=begun))
     wait_for(lambda: any(begun.iterdir()), running)
     os.kill(running.pid, number)

@@ -10,10 +10,10 @@ import pytest
 from tools.command import Here, edit
 from tools.real_projects import drone_project
 
-from photoplan.io.image_points import read_image_points
+from photoplan.io.points import read_image_points
 from photoplan.io.project.file import load_project
-from photoplan.io.run_record import record_path
-from photoplan.products.tie import inputs as tie_work
+from photoplan.io.store import record_path
+from photoplan.products import tie as tie_work
 
 NEAR = ("DJI_0025", "DJI_0026", "DJI_0033")
 FAST = ("--scale", 0.5, "--features", 1200, "--per-image", 150, "--workers", 1)
@@ -157,7 +157,7 @@ def test_unoriented_images_need_no_terrain(photoplan: Here, project: Path) -> No
 
 def test_small_standard_deviations_are_printed_with_two_figures(capsys: pytest.CaptureFixture[str]) -> None:
     from photoplan.cli.tie import _print
-    from photoplan.products.tie.run import TieReport
+    from photoplan.products.tie import TieReport
 
     none = {"output": None, "refined": None, "loops": None, "rays": {2: 7}, "notes": (), "parts": ()}
     counts = {"factor": 1, "pairs": 1, "verified": 1, "tracks": 7, "ambiguous": 0, "points": 7}

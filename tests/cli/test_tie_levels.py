@@ -13,8 +13,8 @@ from scipy.ndimage import gaussian_filter
 from tools.command import Here
 from tools.small_block import write_image
 
-from photoplan.io.image_points import read_image_points
-from photoplan.matching.tracks import Tracks, weak_images
+from photoplan.io.points import read_image_points
+from photoplan.matching.features import Tracks, weak_images
 
 SIZE, SHIFT = (640, 480), 110
 

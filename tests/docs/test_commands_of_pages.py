@@ -102,7 +102,7 @@ def mosaics(folder: Path) -> None:
     """The block, and the polygons of a map series."""
     import shapely
 
-    from photoplan.io.geopackage import VectorLayer, write_geopackage
+    from photoplan.io.vector_layer import VectorLayer, write_geopackage
 
     named_block(folder)
     squares = [shapely.box(576690 + 15 * k, 5188140, 576705 + 15 * k, 5188165) for k in range(2)]
@@ -424,7 +424,7 @@ def models(folder: Path) -> None:
         assert said.code == 0, said.err
     (folder / "points.csv").write_text("x,y\n500010,5300005\n500030.5,5300021\n")
     polygons(folder / "where.geojson", {"a": shapely.box(500020, 5300004, 500040, 5300014)}, "EPSG:25832")
-    from photoplan.io.geopackage import VectorLayer, write_geopackage
+    from photoplan.io.vector_layer import VectorLayer, write_geopackage
 
     axis = VectorLayer("axis", "LineString", [shapely.LineString([(500002, 5300005), (500050, 5300030)])], {})
     write_geopackage(folder / "axis.gpkg", [axis], "EPSG:25832")
@@ -457,7 +457,7 @@ def town(folder: Path) -> None:
     """The block with houses, and a bridge in a file of its own."""
     import shapely
 
-    from photoplan.io.geopackage import VectorLayer, write_geopackage
+    from photoplan.io.vector_layer import VectorLayer, write_geopackage
 
     project(folder)
     deck = shapely.Polygon(

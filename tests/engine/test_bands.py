@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.engine.bands import detail_bands
+from photoplan.engine.execute import detail_bands
 
 REACHES = (2, 4, 8, 16)
 

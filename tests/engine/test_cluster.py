@@ -13,9 +13,21 @@ import numpy as np
 import pytest
 from tools.events import Told
 
-from photoplan.engine import cluster as clusters
-from photoplan.engine.cluster import Answer, Cluster, Parcel, Question, RemoteJob, answer, judge, source_fingerprint
-from photoplan.engine.executors import Workers, executor_factory, open_workers, run_tiles
+from photoplan.engine import executors as clusters
+from photoplan.engine.executors import (
+    Answer,
+    Cluster,
+    Parcel,
+    Question,
+    RemoteJob,
+    Workers,
+    answer,
+    executor_factory,
+    judge,
+    open_workers,
+    run_tiles,
+    source_fingerprint,
+)
 from photoplan.errors import InputError, ResourceError, UsageError
 
 pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs distributed")
@@ -65,7 +77,7 @@ class TestAnswers:
         with pytest.raises(UsageError, match=r"tcp://a:1: worker w2 has another photoplan \(1, here is 1\)"):
             judge("tcp://a:1", self.OWN, {"w1": self.OWN, "w2": replace(self.OWN, fingerprint="abd")})
         with pytest.raises(UsageError, match=r"worker w1 has another photoplan .cannot be asked: no module"):
-            judge("tcp://a:1", self.OWN, {"w1": ImportError("no module photoplan.engine.cluster")})
+            judge("tcp://a:1", self.OWN, {"w1": ImportError("no module photoplan.engine.executors")})
 
     def test_another_gdal_is_named_once(self) -> None:
         other = replace(self.OWN, versions={**self.OWN.versions, "GDAL": "3.8"})

@@ -16,16 +16,13 @@ from tools.pinhole import Pinhole
 from tools.thinned import some
 from tools.twin import strict_positions, strict_scales, twin_reduce, twin_resample
 
-from photoplan.engine.arrays import ArrayReader
-from photoplan.engine.base import Source
-from photoplan.engine.execute import render
-from photoplan.geometry.grid import MapGrid, Window
-from photoplan.geometry.levels import level_size, means, reduced
+from photoplan.engine.execute import ArrayReader, Source, render
+from photoplan.geometry.grid import MapGrid, Window, level_size, means, reduced
 from photoplan.geometry.pose import Pose
 from photoplan.io.raster import RasterReader, best_overview
+from photoplan.plan.footprint import Tile
 from photoplan.plan.product import compile_tile
-from photoplan.plan.tiles import Tile
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 from photoplan.targets.map import MapTarget
 
 
@@ -51,7 +48,7 @@ def test_windows_of_a_reduced_image_are_cut_from_the_whole(monkeypatch: pytest.M
     reader = ArrayReader(noise(3, 83, 121, "uint8"), np.random.default_rng(0).random((83, 121)) > 0.5)
     whole, valid = reduced(reader, Window(0, 0, *level_size(reader.size, 2)), 2)
     assert valid is not None
-    monkeypatch.setattr("photoplan.geometry.levels.CHUNK", 2000)
+    monkeypatch.setattr("photoplan.geometry.grid.CHUNK", 2000)
     for window in Window(0, 0, *level_size(reader.size, 2)).tiles(9):
         part, good = reduced(reader, window, 2)
         cut = np.s_[window.row : window.stop[1], window.col : window.stop[0]]
@@ -170,6 +167,6 @@ def test_a_file_is_read_once_however_its_tiles_lie(tmp_path: Path, monkeypatch: 
     cam = Pinhole(Pose.from_angles((0, 0, 100), (0.01, 0.02, 0.8)), 2000.0, (2000, 2400))
     grid = MapGrid.covering((-100, -100, 100, 100), 0.5, "EPSG:32615")
     plan = product(grid, side=64)
-    for tile in plan.tiles:
+    for tile in plan.footprint:
         render(plan, tile, [Source(cam, reader)], LevelSurface(0.0), "bicubic")
     assert 0.9 * image.size < full.pixels < 1.2 * image.size

@@ -14,12 +14,11 @@ from tools.events import Told
 
 from photoplan.engine import executors
 from photoplan.engine.executors import Workers, executor_factory
-from photoplan.engine.run import Kept, Made, Runner, Tally, Work, tiles_in_flight
-from photoplan.engine.shares import Shared
+from photoplan.engine.run import Kept, Made, Runner, Shared, Tally, Work, tiles_in_flight
 from photoplan.errors import InputError, UsageError
 from photoplan.events import stretch, tell
 from photoplan.geometry.grid import Window
-from photoplan.plan.tiles import Tile
+from photoplan.plan.footprint import Tile
 
 TILES = tuple(Tile(i, Window(i * 4, 0, 4, 4)) for i in range(6))
 

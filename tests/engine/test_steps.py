@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from tools.events import Told
 
-from photoplan.engine.steps import steps
+from photoplan.engine.run import steps
 from photoplan.errors import TilesFailed
-from photoplan.io.result_log import ResultLog
+from photoplan.io.store import ResultLog
 
 
 def log(folder: Path) -> ResultLog:

@@ -9,14 +9,12 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 from tools.thinned import some
 
-from photoplan.engine.arrays import ArrayReader
-from photoplan.engine.base import Source
-from photoplan.engine.execute import Painted, render
+from photoplan.engine.execute import ArrayReader, Painted, Source, render
 from photoplan.geometry.grid import Placement, Window
 from photoplan.kernels.footprint import depth_tilt
-from photoplan.plan.compile import AnchorRule
+from photoplan.plan.anchors import AnchorRule
+from photoplan.plan.footprint import Tile, Tiles
 from photoplan.plan.product import CompiledTile, ProductPlan, compile_tile
-from photoplan.plan.tiles import Tile, Tiles
 from photoplan.targets.base import Target
 
 SIDE = 1600

@@ -15,16 +15,14 @@ from tools.pinhole import Pinhole
 from tools.thinned import examples, some
 from tools.twin import TwinSource, twin_compose
 
-from photoplan.engine.arrays import ArrayReader
-from photoplan.engine.base import Source
-from photoplan.engine.execute import render
+from photoplan.engine.execute import ArrayReader, Source, render
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.owner import GivenOwners, Share
+from photoplan.plan.footprint import Tile
 from photoplan.plan.product import ProductPlan, compile_tile
-from photoplan.plan.tiles import Tile
-from photoplan.surfaces.level import LevelSurface
+from photoplan.plan.sources import GivenOwners, Share
+from photoplan.surfaces.base import LevelSurface
 
 Kinds = list[list[str]]
 SMOOTH, SMOOTH_FEW = ([[name, dtype] for name, dtype in kinds if name != "nearest"] for kinds in (KINDS, FEW))

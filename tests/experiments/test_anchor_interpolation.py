@@ -7,10 +7,10 @@ import pytest
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses import NoLens
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.anchors import AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 

@@ -8,10 +8,10 @@ from tools.pinhole import Pinhole
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses import Brown
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.anchors import AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 

@@ -7,8 +7,7 @@ import pytest
 from scipy import ndimage
 
 from photoplan.geometry.grid import Window
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
-from photoplan.quality.restoration.restorer import Restorer
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter, Restorer
 
 SPREAD = np.array([0.02, 0.15, 0.66, 0.15, 0.02])
 #: Rules of `numpy.pad`: the edge repeated, mirrored with and without the outermost pixel.

@@ -10,7 +10,7 @@ from pyproj import CRS, Transformer
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import topocentric_poses
-from photoplan.geometry.earth_poses import (
+from photoplan.geometry.local import (
     enu_axes,
     enu_poses,
     geocentric_of_geodetic,

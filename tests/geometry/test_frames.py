@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from tools.small_block import X0, Y0
 
-from photoplan.geometry.cylinder import CylinderFrame
-from photoplan.geometry.frames import Frame, ImageFrame, WallFrame
+from photoplan.geometry.frames import CylinderFrame, Frame, ImageFrame, WallFrame
 
 WALL = WallFrame.facing((X0, Y0, 100.0), 163.0, -4.0)
 IMAGE = ImageFrame((X0, Y0, 300.0), WallFrame.facing((0.0, 0.0, 0.0), 200.0, 71.0).axes, 200.0)

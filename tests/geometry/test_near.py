@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.geometry.body import EARTH_RADII, BodyGround
-from photoplan.geometry.near import near_ground
+from photoplan.geometry.local import EARTH_RADII, BodyGround, near_ground
 
 UTM = BodyGround("EPSG:32633", "ellipsoidal", EARTH_RADII)
 MOON = BodyGround(

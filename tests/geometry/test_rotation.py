@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photoplan.errors import UsageError
-from photoplan.geometry.rotation import (
+from photoplan.geometry.pose import (
     ROTATION_ORDERS,
     angles_from_rotation,
     axes_of_angles,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import GeometryError
-from photoplan.surfaces.mesh.faces import constrained_faces
+from photoplan.surfaces.mesh import constrained_faces
 
 
 def area(xy, faces):

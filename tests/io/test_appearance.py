@@ -7,10 +7,8 @@ from pathlib import Path
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.io.appearance import looks_like
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.checks import raster_driver
-from photoplan.io.plain_files import decoded_text
+from photoplan.io.files import decoded_text, looks_like, raster_driver
 
 KINDS = {
     "bundle.out": (b"# Bundle file v0.3\n1 0\n500 0 0\n", "Bundler's bundle.out"),

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.io.balance_file import BalanceBand, read_balance_file, write_balance_file
-from photoplan.project.balance import load_balance
+from photoplan.io.quality_files import BalanceBand, read_balance_file, write_balance_file
+from photoplan.project.steps import load_balance
 
 BAND = BalanceBand(
     grey=(0.0, 128.0, 255.0), becomes=(12.5, 140.0, 240.0), sigma=(2.0, 0.5, 3.0), trend=((1, 0, 0.125),)

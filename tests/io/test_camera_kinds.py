@@ -12,11 +12,10 @@ from typing import get_args
 import pytest
 
 import photoplan
-from photoplan.cameras import corrected, curved, frame, warped
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.fisheye import Fisheye
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.cameras import corrected, frame
+from photoplan.cameras import curvature as curved
+from photoplan.cameras import curvature as warped
+from photoplan.cameras.lenses import Brown, Fisheye, NoLens, OpenCV
 from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import BrownLens, CameraEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
 
@@ -29,17 +28,14 @@ KINDS = {"FrameCamera", "WarpedCamera", "corrected_camera", "curved_camera", "Li
 }
 #: Files that may name a kind, and why.
 ALLOWED = {
-    "cameras/line.py": "a kind",
-    "cameras/line_chips.py": "a kind of several of a kind",
-    "cameras/line_correctable.py": "corrections of a kind",
-    "cameras/line_measured.py": "compares measured points with a kind",
+    "cameras/pushbroom.py": "a kind",
+    "cameras/correctable.py": "corrections of a kind",
     "io/camera/line/model.py": "makes a kind of what files state",
     "__init__.py": "public names",
     "cameras/__init__.py": "public names",
     "cameras/frame.py": "a kind",
-    "cameras/warped.py": "a kind",
+    "cameras/curvature.py": "a kind",
     "cameras/corrected.py": "a kind",
-    "cameras/curved.py": "a kind",
     "cameras/build.py": "registry of cameras that compute",
     "cameras/body_frame.py": "a kind in the axes of a body",
     "io/camera/csm_frame.py": "makes a kind of what files state",

@@ -15,8 +15,7 @@ from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.opencv import render
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.file import read_orientation, write_orientation
-from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.posed import Image
+from photoplan.io.project.model import Image, interior_of, lens_of
 
 YAML = """%YAML:1.0
 ---

@@ -14,7 +14,7 @@ from photoplan.errors import InputError
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.film import FilmEntry
 from photoplan.io.camera.usgs import distance_differences
-from photoplan.io.project.cameras import lens_of
+from photoplan.io.project.model import lens_of
 
 TEMPLATE = Path(__file__).resolve().parents[2] / "docs" / "templates" / "usgs-camera.toml"
 PRINTED = {"1-2": 311.128, "3-4": 311.116, "5-6": 224.002, "7-8": 223.996}

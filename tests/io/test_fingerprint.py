@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.io.fingerprint import fingerprint
+from photoplan.io.files import fingerprint
 
 
 def test_content_decides_not_time(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import same_crs
-from photoplan.io.gcp_list import read_gcp_list
+from photoplan.io.points import read_gcp_list
 
 #: The layout that the documentation shows, with made-up numbers.
 LIST = """EPSG:32616

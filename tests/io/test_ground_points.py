@@ -9,8 +9,8 @@ import pytest
 import shapely
 
 from photoplan.errors import InputError
-from photoplan.io.ground_points import read_ground_points, write_ground_points
-from photoplan.io.polygons import write_features
+from photoplan.io.points import read_ground_points, write_ground_points
+from photoplan.io.vector_layer import write_features
 
 HEAD = "name,x,y,z,sigma_xy,sigma_z,role\n"
 TABLE = HEAD + "A,1000.5,2000.25,300,0.02,0.03,control\nB,1,2,,,,\nC,,,5,,0.1,check\n"

@@ -18,16 +18,12 @@ import photoplan
 from photoplan.errors import InputError, PhotoplanError, UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io import disk
-from photoplan.io.disk import open_own, read_own, received
-from photoplan.io.lock import FileLock
-from photoplan.io.names import file_in
-from photoplan.io.naming import is_unfinished, scratch, together, write_atomically
+from photoplan.io.disk import FileLock, open_own, read_own, received
+from photoplan.io.files import file_in
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.product import ProductFile
-from photoplan.io.result_log import ResultLog
-from photoplan.io.table_lines import split_line
-from photoplan.io.tables import write_table
-from photoplan.io.tile_log import TileLog
+from photoplan.io.store import ResultLog, TileLog, is_unfinished, scratch, together, write_atomically
+from photoplan.io.tables import split_line, write_table
 from photoplan.report import page
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs links")
@@ -165,7 +161,7 @@ class TestDeadRuns:
     HOLDER = """
 import sys, time
 from pathlib import Path
-from photoplan.io.naming import scratch
+from photoplan.io.store import scratch
 with scratch(Path(sys.argv[1])) as folder:
     (folder / "x").write_text("1")
     print(folder, flush=True)
@@ -176,7 +172,7 @@ with scratch(Path(sys.argv[1])) as folder:
     def test_what_they_leave_goes_with_the_next_run_and_what_lives_stays(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("photoplan.io.naming._TIDIED", set())
+        monkeypatch.setattr("photoplan.io.store._TIDIED", set())
         children = [
             subprocess.Popen([sys.executable, "-c", self.HOLDER, tmp_path], stdout=subprocess.PIPE, text=True)
             for _ in range(2)

@@ -26,11 +26,11 @@ from tools.image_headers import (
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import topocentric_poses
-from photoplan.geometry.earth_poses import enu_poses
+from photoplan.geometry.local import enu_poses
 from photoplan.io.image_metadata import read_image_metadata
-from photoplan.io.observed_positions import read_observed_positions
 from photoplan.io.orientation.exif import read_folder, rotation_from_gimbal
 from photoplan.io.orientation.file import read_orientation, read_orientation_block
+from photoplan.io.points import read_observed_positions
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.image_points import named_as, read_image_points, write_image_points
+from photoplan.io.points import named_as, read_image_points, write_image_points
 
 TABLE = "point,image,x,y\nA,p1.tif,10.5,20.25\nA,p2.tif,11,21\nB,p1.tif,-0.5,3e2\n"
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from photoplan.io import kept_tiles
-from photoplan.io.kept_tiles import KeptTiles
+from photoplan.io import store as kept_tiles
+from photoplan.io.store import KeptTiles
 
 
 def test_a_record_that_unpacks_without_end_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

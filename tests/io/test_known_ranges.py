@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from rasterio.transform import from_origin
 
 from photoplan.geometry.grid import Window
-from photoplan.io.terrain import known_ranges
+from photoplan.io.terrain import options as known_ranges
 from photoplan.io.terrain.reader import TerrainReader
-from photoplan.project.open_terrain import open_terrain
-from photoplan.surfaces import grid_ranges
-from photoplan.surfaces.rays import Hits
+from photoplan.project.ground import open_terrain
+from photoplan.surfaces import raster as grid_ranges
+from photoplan.surfaces.base import Hits
 
 COLUMNS, ROWS = 600, 450
 WINDOWS = np.array([[0, 0, COLUMNS, ROWS], [10, 20, 140, 30], [400, 300, 401, 301], [130, 0, 250, 450]])

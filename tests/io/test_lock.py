@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from photoplan.errors import ResourceError, RunLocked, UsageError
-from photoplan.io.lock import FileLock
+from photoplan.io.disk import FileLock
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from photoplan.io.lock import FileLock
+from photoplan.io.disk import FileLock
 lock = FileLock(Path(sys.argv[1]))
 lock.acquire()
 print("held", flush=True)

@@ -11,12 +11,12 @@ import pytest
 import rasterio
 from pydantic import TypeAdapter, ValidationError
 
-from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
+from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.errors import InputError
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.film import FilmEntry
 from photoplan.io.mark_model import Mark
-from photoplan.io.project.write import camera_lines
+from photoplan.io.project.file import camera_lines
 from photoplan.project.camera_marks import mark_pattern, mark_patterns
 
 KINDS: list[dict[str, Any]] = [

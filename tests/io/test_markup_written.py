@@ -92,9 +92,9 @@ def landxml(folder: Path) -> tuple[Path, list[str], list[str]]:
 
 
 WRITERS: dict[str, Callable[[Path], tuple[Path, list[str], list[str]]]] = {
-    "products/view/overlay.py": svg,
-    "io/virtual.py": stacked,
-    "io/virtual.py: sheets": sheets,
+    "products/view/content.py": svg,
+    "io/product.py": stacked,
+    "io/product.py: sheets": sheets,
     "io/orientation/metashape.py": metashape,
     "io/terrain/export.py": landxml,
 }

@@ -21,7 +21,7 @@ from tools.effort import at_most
 from photoplan.errors import HeightSystemError, InputError, UsageError
 from photoplan.io.terrain import files
 from photoplan.io.terrain.options import CodeClass, CodeTable, ReadOptions
-from photoplan.surfaces.measured import MeasuredTerrain
+from photoplan.surfaces.units import MeasuredTerrain
 
 laspy = pytest.importorskip("laspy", reason="needs laspy")
 

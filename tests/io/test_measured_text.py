@@ -12,7 +12,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.io.tables import Dialect
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import CodeClass, CodeTable, ReadOptions, read_code_table
-from photoplan.surfaces.measured import MeasuredTerrain
+from photoplan.surfaces.units import MeasuredTerrain
 
 Write = Callable[..., Path]
 

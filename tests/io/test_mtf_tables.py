@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.io.mtf_file import read_mtf_table
-from photoplan.project.linearisation import read_linearisation_table
+from photoplan.io.quality_files import read_mtf_table
+from photoplan.project.steps import read_linearisation_table
 
 
 def written(folder: Path, text: str | bytes) -> Path:

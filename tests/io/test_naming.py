@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from photoplan.errors import RunLocked, UsageError
-from photoplan.io import naming
-from photoplan.io.lock import FileLock, lock_of
-from photoplan.io.naming import is_unfinished, locked, standing, together, write_atomically
+from photoplan.io import store as naming
+from photoplan.io.disk import FileLock, lock_of
+from photoplan.io.store import is_unfinished, locked, standing, together, write_atomically
 
 
 def names(folder: Path) -> list[str]:

@@ -13,9 +13,9 @@ import pytest
 import shapely
 
 from photoplan.errors import InputError, ResourceError, UsageError
-from photoplan.io.geopackage import VectorLayer, write_geopackage
-from photoplan.io.objects import mesh
-from photoplan.io.objects.file import read_objects
+from photoplan.io import objects as mesh
+from photoplan.io.objects import read_objects
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
 
 CUBE = [[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0], [0, 0, 10], [10, 0, 10], [10, 10, 10], [0, 10, 10]]
 SHELL = [[[0, 3, 2, 1]], [[4, 5, 6, 7]], [[0, 1, 5, 4]], [[1, 2, 6, 5]], [[2, 3, 7, 6]], [[3, 0, 4, 7]]]

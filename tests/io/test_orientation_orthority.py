@@ -18,8 +18,7 @@ from photoplan.cameras.frame import FrameCamera
 from photoplan.geometry.pose import Pose
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.orientation.file import read_orientation
-from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.posed import Image
+from photoplan.io.project.model import Image, interior_of, lens_of
 
 EXTERIOR = "filename,x,y,z,omega,phi,kappa\nimg.tif,500003,5400007,1300,2.0,-3.0,30.0\n"
 COMMON = "im_size: [400, 300], sensor_size: [36.0, 27.0], cx: 0.0125, cy: -0.02"

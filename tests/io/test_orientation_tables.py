@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.rotation import ROTATION_ORDERS, angles_from_rotation, rotation_opk
+from photoplan.geometry.pose import ROTATION_ORDERS, angles_from_rotation, rotation_opk
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 

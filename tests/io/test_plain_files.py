@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.io.plain_files import read_text
+from photoplan.io.files import read_text
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")

@@ -10,8 +10,8 @@ from tools.dem_file import write_geojson
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid
-from photoplan.io.polygons import label_polygons, read_features, write_features
 from photoplan.io.tables import Columns, read_table
+from photoplan.io.vector_layer import label_polygons, read_features, write_features
 
 CRS = "EPSG:31287"
 COLUMNS = Columns(roles={"x": ("x", "east"), "y": ("y", "north"), "h": ("h",), "name": ("name",)}, needed=("x", "y"))

@@ -18,8 +18,8 @@ from photoplan.errors import PhotoplanError, UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.product import ProductFacts, ProductFile
 from photoplan.io.raster import RasterReader
+from photoplan.io.raster_info import read_tiff_layouts
 from photoplan.io.storage import BlockCoder, nodata_for
-from photoplan.io.tiff_layout import read_tiff_layouts
 
 GRID = MapGrid(500_000.25, 5_200_000.5, 0.25, 600, 400, "EPSG:32633")
 PLACE = GRID.placement
@@ -248,7 +248,7 @@ import sys, numpy as np
 from pathlib import Path
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.product import ProductFile
-from photoplan.io.run_record import peak_memory_bytes
+from photoplan.io.store import peak_memory_bytes
 grid = MapGrid(0, 0, 0.1, 9000, 6000, "EPSG:32633")
 tile = np.random.default_rng(0).integers(1, 255, (3, 512, 512), dtype=np.uint8)
 with ProductFile(Path(sys.argv[1]), grid.placement, 3, np.dtype("uint8"), run_key="k", compress="lzw") as file:

@@ -15,8 +15,7 @@ from tools.thinned import some
 from photoplan.errors import ResourceError, RunLocked, UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io import product as product_module
-from photoplan.io.product import ProductFile, check_output
-from photoplan.io.product_check import check_product
+from photoplan.io.product import ProductFile, check_output, check_product
 
 GRID = MapGrid(1000, 2000, 1, 1200, 1000, "EPSG:32633")
 PLACE = GRID.placement

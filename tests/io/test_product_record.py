@@ -14,7 +14,7 @@ import pytest
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.run_record import input_entry, peak_memory_bytes, record_path, versions, write_run_record
+from photoplan.io.store import input_entry, peak_memory_bytes, record_path, versions, write_run_record
 
 
 def test_values_of_every_kind(tmp_path: Path) -> None:

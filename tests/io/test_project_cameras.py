@@ -14,8 +14,7 @@ from photoplan.geometry.pose import Pose
 from photoplan.io.camera.film import FilmEntry
 from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.camera.model import BrownLens, OpenCVLens, RadialTableLens
-from photoplan.io.project.cameras import fiducial_fit, image_size, interior_of, lens_of
-from photoplan.io.project.posed import Image
+from photoplan.io.project.model import Image, fiducial_fit, image_size, interior_of, lens_of
 
 IMAGE = Image(name="a", file="a.tif", camera="c", center=(0, 0, 0), angles=(0, 0, 0))
 # Ecker 1991, §8.1; rows counted upwards there, so the film counts as mirrored.

@@ -16,10 +16,9 @@ from photoplan.errors import HeightSystemError, InputError, UsageError
 from photoplan.io.camera.film import FilmEntry
 from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.camera.model import BrownLens, OpenCVFisheyeLens, OpenCVLens, RadialTableLens
-from photoplan.io.names import safe_stem
+from photoplan.io.files import safe_stem
 from photoplan.io.project.file import load_project, parse_project, project_schema, write_project
-from photoplan.io.project.model import Orientation, OrthoDefaults, Project, StatedTerrain
-from photoplan.io.project.posed import Image
+from photoplan.io.project.model import Image, Orientation, OrthoDefaults, Project, StatedTerrain
 
 MARKS = {"1": (105.999, -106.016), "2": (-106.012, -106.006), "3": (-105.997, 105.993), "4": (106.007, 105.993)}
 SCAN = {"1": (68.0, 131.5), "2": (62.0, 2248.0), "3": (2182.0, 2253.0), "4": (2189.0, 141.0)}

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from photoplan.errors import InputError
-from photoplan.io.names import (
+from photoplan.io.files import (
     ImageNames,
     check_input_name,
     match_key,

@@ -15,12 +15,10 @@ from rasterio.enums import ColorInterp
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io import raster_pixels as raster_module
+from photoplan.io import raster as raster_module
 from photoplan.io.gdal import close_handles, not_georeferenced
-from photoplan.io.raster import RasterReader
+from photoplan.io.raster import DecodedPicture, RasterReader, decoded_picture, not_nodata
 from photoplan.io.raster_info import read_info
-from photoplan.io.raster_pixels import DecodedPicture, decoded_picture
-from photoplan.io.validity import not_nodata
 
 WINDOW = Window(3, 5, 20, 11)
 

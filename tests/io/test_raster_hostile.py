@@ -16,12 +16,11 @@ from tools.thinned import some
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io import raster_pixels
-from photoplan.io.checks import RasterLimits, check_plain_file
+from photoplan.io import raster as raster_pixels
+from photoplan.io.files import RasterLimits, check_plain_file
 from photoplan.io.raster import RasterReader
-from photoplan.io.raster_info import read_info
+from photoplan.io.raster_info import read_info, read_tiff_layout
 from photoplan.io.terrain.reader import TerrainReader
-from photoplan.io.tiff_layout import read_tiff_layout
 
 SIDE = 256
 ALL = Window(0, 0, SIDE, SIDE)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.block_cache import BlockCache
+from photoplan.io.raster import BlockCache
 from photoplan.io.terrain.reader import TerrainReader
 
 

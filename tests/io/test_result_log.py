@@ -17,8 +17,7 @@ import photoplan
 from photoplan.codec import NotData, decode, encode
 from photoplan.errors import InputError, RunLocked
 from photoplan.geometry.grid import Window
-from photoplan.io.result_log import _FORM, ResultLog
-from photoplan.io.tile_log import TileLog
+from photoplan.io.store import _FORM, ResultLog, TileLog
 
 
 def log(tmp_path: Path, key: str = "k") -> ResultLog:

@@ -10,7 +10,7 @@ import pytest
 import rasterio
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.scan_pitch import parse_pitch, read_pitch
+from photoplan.io.raster_info import parse_pitch, read_pitch
 
 
 def image(path: Path, driver: str = "GTiff", **tags: object) -> Path:

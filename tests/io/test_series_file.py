@@ -10,11 +10,16 @@ import pytest
 from tools.camera_model import write_frame
 
 from photoplan.errors import InputError
-from photoplan.io.series.file import read_series
-from photoplan.io.series.model import StatisticsEntry
-from photoplan.io.series.names import find_files
-from photoplan.io.series.pixels import Plane, plane_mask, plane_pixels, series_planes
-from photoplan.io.series.statistics import read_statistics
+from photoplan.io.series import (
+    Plane,
+    StatisticsEntry,
+    find_files,
+    plane_mask,
+    plane_pixels,
+    read_series,
+    read_statistics,
+    series_planes,
+)
 
 PIXELS = np.arange(48, dtype=np.uint8).reshape(6, 8)
 
@@ -297,8 +302,7 @@ def test_patterns_do_not_leave_plain_files(tmp_path: Path):
 
 
 def test_every_entry_is_explained_on_the_reference_page():
-    from photoplan.io.series.model import KINDS, SeriesEntry
-    from photoplan.io.series.names import FIELDS
+    from photoplan.io.series import FIELDS, KINDS, SeriesEntry
 
     schema = SeriesEntry.model_json_schema()
     entries = {name for table in schema["$defs"].values() for name in table.get("properties", {})}

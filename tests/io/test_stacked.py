@@ -9,7 +9,7 @@ import pytest
 import rasterio
 
 from photoplan.errors import UsageError
-from photoplan.io.virtual import write_stacked
+from photoplan.io.product import write_stacked
 
 
 def raster(path: Path, left: float, value: int, count: int = 1) -> Path:

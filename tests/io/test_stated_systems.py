@@ -16,13 +16,12 @@ from tools.small_block import write_image
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, crs_step, split_compound
 from photoplan.geometry.units import metric_system
-from photoplan.io.gcp_list import read_gcp_list
 from photoplan.io.orientation.file import read_orientation
+from photoplan.io.points import read_gcp_list
 from photoplan.io.project.file import load_project
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import ReadOptions
-from photoplan.project.ground import ground_of
-from photoplan.project.open_terrain import open_terrain
+from photoplan.project.ground import ground_of, open_terrain
 
 LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]'
 LOCAL_FEET = LOCAL.replace('"metre",1', '"foot",0.3048')

@@ -13,12 +13,11 @@ from tools.thinned import some
 
 from photoplan.errors import UsageError
 from photoplan.geometry.crs import canonical_crs, same_crs
-from photoplan.io.terrain.export import replacing, write_points, write_tin
-from photoplan.io.terrain.export_mesh import mesh_parts
+from photoplan.io.terrain.export import mesh_parts, replacing, write_points, write_tin
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.mesh.faces import build_faces
+from photoplan.surfaces.mesh import build_faces
 from photoplan.surfaces.units import MemoryUnits, Unit, UnitLayout
 
 LOCAL = canonical_crs("+proj=tmerc +lat_0=48 +lon_0=16 +k=1 +x_0=1000 +y_0=2000 +ellps=GRS80 +units=m +type=crs")
@@ -175,7 +174,7 @@ def test_points_are_each_post_once_and_the_lines(model: MemoryUnits, tmp_path: P
 
 def test_memory_is_that_of_two_rows_of_units() -> None:
     """A hundred rows of units: the table of shared vertices never holds more than two rows' edges."""
-    from photoplan.io.terrain import export_mesh as module
+    from photoplan.io.terrain import export as module
 
     layout = UnitLayout(0.0, 0.0, 8.0, 3, 100)
     source = MemoryUnits(layout, {(c, r): grid_unit(layout, c, r, 4) for c in range(3) for r in range(100)})

@@ -19,9 +19,7 @@ from tools.small_model import LAYOUT, grid_unit, same_unit, unit_at, write_small
 
 from photoplan.errors import InputError, ResourceError, RunLocked, UsageError
 from photoplan.io.terrain import model_write as terrain_model_write
-from photoplan.io.terrain.model_blob import _UNIT, MOST_BYTES
-from photoplan.io.terrain.model_read import ModelReader, unit_checksum
-from photoplan.io.terrain.model_tables import HEADER, LINES, UNITS
+from photoplan.io.terrain.model import _UNIT, HEADER, LINES, MOST_BYTES, UNITS, ModelReader, unit_checksum
 from photoplan.io.terrain.model_write import ModelWriter
 
 PLACES = [(c, r) for r in range(LAYOUT.rows) for c in range(LAYOUT.columns)]
@@ -98,7 +96,7 @@ import resource, signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from tools import small_model
-from photoplan.io.terrain.model_read import ModelReader
+from photoplan.io.terrain.model import ModelReader
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), int(sys.argv[3])))
 from photoplan.errors import PhotoplanError
@@ -315,7 +313,7 @@ def spoilt_faces(name: str, value: Any) -> bytes:
     """The unit with the wall, with one array of its triangles spoilt, as bytes before compression."""
     from tools.small_model import LINED
 
-    from photoplan.io.terrain.model_blob import pack_unit
+    from photoplan.io.terrain.model import pack_unit
 
     unit = unit_at(*LINED)
     assert unit is not None and unit.faces is not None

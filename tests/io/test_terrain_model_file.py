@@ -35,8 +35,7 @@ from tools.small_model import (
 )
 
 from photoplan.errors import InputError, PhotoplanError, UsageError
-from photoplan.io.terrain.model_blob import check_unit, inflate, pack_unit, unit_of
-from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+from photoplan.io.terrain.model import ModelReader, check_unit, inflate, is_terrain_model, pack_unit, unit_of
 from photoplan.io.terrain.model_write import ModelWriter
 from photoplan.surfaces.units import Unit, UnitLayout
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from tools.small_model import EMPTY, LAYOUT, lines, unit_at, write_small
 
-from photoplan.surfaces.measured import LINE_KINDS
+from photoplan.surfaces.units import LINE_KINDS
 
 
 def section(raw: bytes, at: int, kind: str, count: int) -> tuple[list[float], int]:

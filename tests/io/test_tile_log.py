@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
-from photoplan.io.tile_log import TileLog
+from photoplan.io.store import TileLog
 
 PAYLOADS = {4: b"four" * 50, 0: b"", 7: bytes(range(256)), 2: b"x"}
 
@@ -123,7 +123,7 @@ def test_threads_append_whole_records(tmp_path: Path) -> None:
 WRITER = """
 import sys
 from pathlib import Path
-from photoplan.io.tile_log import TileLog
+from photoplan.io.store import TileLog
 log = TileLog(Path(sys.argv[1]), "run")
 index = max(log.finished, default=-1) + 1
 while True:
@@ -157,7 +157,7 @@ LIMITED = """
 import resource, signal, sys
 from pathlib import Path
 from photoplan.errors import ResourceError
-from photoplan.io.tile_log import TileLog
+from photoplan.io.store import TileLog
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 log = TileLog(Path(sys.argv[1]), "run")

@@ -9,8 +9,7 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.convolve import round_clipped
 from photoplan.kernels.jit import COMPILED
-from photoplan.quality.restoration.borders import LEFT, RIGHT, Convolution, Margin
-from photoplan.quality.restoration.filters import FilterKernel
+from photoplan.quality.restoration.restorer import LEFT, RIGHT, Convolution, FilterKernel, Margin
 
 NONE = np.empty((0, 0), bool)
 ROUNDING = 2e-7

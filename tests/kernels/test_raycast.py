@@ -12,7 +12,7 @@ from photoplan.geometry.crs import crs_step
 from photoplan.kernels.jit import COMPILED
 from photoplan.kernels.pyramid import pyramid_of
 from photoplan.kernels.raycast import MISS, SURFACE, WALL
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.shifted import ShiftedSurface
 from photoplan.surfaces.units import UnitLayout

@@ -10,11 +10,17 @@ from scipy import ndimage
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
-from photoplan.matching.control import FoundPatch, agree, best_place, correlate, find_patch
-from photoplan.matching.ortho import OrthoPatch, ground_covariances
+from photoplan.cameras.lenses import NoLens
+from photoplan.geometry.pose import Pose, rotation_opk
+from photoplan.matching.control import (
+    FoundPatch,
+    OrthoPatch,
+    agree,
+    best_place,
+    correlate,
+    find_patch,
+    ground_covariances,
+)
 
 
 def texture(side: int = 120, seed: int = 1) -> NDArray:

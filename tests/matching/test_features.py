@@ -12,8 +12,17 @@ from tools.ties import ArrayPixels
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.matching.features import DESCRIPTOR_UNIT, Features, FeatureSettings, extract_features, opencv
-from photoplan.matching.grey import GreyImage, ReducedImage, patches_at, to_bytes
+from photoplan.matching.features import (
+    DESCRIPTOR_UNIT,
+    Features,
+    FeatureSettings,
+    GreyImage,
+    ReducedImage,
+    extract_features,
+    opencv,
+    patches_at,
+    to_bytes,
+)
 
 
 def texture(width: int = 400, height: int = 300, seed: int = 1) -> NDArray:
@@ -106,7 +115,7 @@ def test_windows_beyond_the_image_have_no_values_there(monkeypatch: pytest.Monke
     part = image.read(Window(-1, 2, 3, 4))
     np.testing.assert_array_equal(part, [[np.nan, 10, 11], [np.nan, 15, 16], [np.nan] * 3, [np.nan] * 3])
     corners = np.array([[-1, 2], [3, -2], [0, 0]])
-    monkeypatch.setattr("photoplan.matching.grey.TILE", 4)
+    monkeypatch.setattr("photoplan.matching.features.TILE", 4)
     for patch, corner in zip(patches_at(image, corners, 3), corners):
         np.testing.assert_array_equal(patch, image.read(Window(*corner.tolist(), 3, 3)))
 

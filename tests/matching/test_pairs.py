@@ -9,19 +9,20 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
-from photoplan.matching.features import Features
-from photoplan.matching.pairs import (
+from photoplan.cameras.lenses import Brown
+from photoplan.geometry.pose import Pose, rotation_opk
+from photoplan.matching.features import (
+    Calibration,
+    Features,
     Guide,
+    VerifySettings,
     all_pairs,
     match_features,
     pairs_by_distance,
     pairs_by_footprints,
     pairs_by_likeness,
+    verify_pair,
 )
-from photoplan.matching.verify import Calibration, VerifySettings, verify_pair
 
 
 def features(descriptors: NDArray, xy: NDArray | None = None, scale: NDArray | None = None) -> Features:
@@ -46,7 +47,7 @@ def test_images_with_common_ground_are_paired() -> None:
 def test_neighbours_by_position_are_paired(monkeypatch: pytest.MonkeyPatch) -> None:
     X = np.array([[0, 0, 0], [10, 0, 0], [20, 0, 0], [1000, 0, 0.0]])
     assert pairs_by_distance(X) == [(0, 1), (0, 2), (1, 2)]
-    monkeypatch.setattr("photoplan.matching.pairs.NEIGHBOURS", 1)
+    monkeypatch.setattr("photoplan.matching.features.NEIGHBOURS", 1)
     assert pairs_by_distance(X) == [(0, 1), (1, 2)]
     assert pairs_by_distance(X[:1]) == [] and all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
 

@@ -12,10 +12,17 @@ from scipy import ndimage
 from tools.ties import ArrayPixels
 
 from photoplan.kernels.jit import COMPILED
-from photoplan.matching.grey import GreyImage
-from photoplan.matching.loops import ASSUMED, close_loops, latin_weights
-from photoplan.matching.refine import RefineSettings, disc, local_affines, reference_points, refine_tracks
-from photoplan.matching.tracks import Tracks
+from photoplan.matching.features import GreyImage, Tracks
+from photoplan.matching.refine import (
+    ASSUMED,
+    RefineSettings,
+    close_loops,
+    disc,
+    latin_weights,
+    local_affines,
+    reference_points,
+    refine_tracks,
+)
 
 pytestmark = pytest.mark.skipif(not COMPILED, reason="many patches")
 

@@ -10,7 +10,7 @@ from tools.thinned import some
 from tools.ties import ArrayPixels
 
 from photoplan.kernels.jit import COMPILED
-from photoplan.matching.grey import GreyImage
+from photoplan.matching.features import GreyImage
 from photoplan.matching.register import (
     APART,
     FOUND,

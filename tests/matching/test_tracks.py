@@ -7,9 +7,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.matching.features import Features
-from photoplan.matching.tracks import CELLS, GRUBER, Tracks, build_tracks, connected_parts, thin_tracks
-from photoplan.matching.verify import PairMatches
+from photoplan.matching.features import (
+    CELLS,
+    GRUBER,
+    Features,
+    PairMatches,
+    Tracks,
+    build_tracks,
+    connected_parts,
+    thin_tracks,
+)
 
 EMPTY = np.empty((0, 0), np.uint8)
 

@@ -9,17 +9,21 @@ import pytest
 from tools.sim_block import FOCAL, Simulated, simulate
 from tools.thinned import some, thinned
 
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.opencv import OpenCV
-from photoplan.cameras.plane import Bilinear2D
-from photoplan.geometry.rotation import rotation_vector
+from photoplan.cameras.fiducials import Bilinear2D
+from photoplan.cameras.lenses import Brown, OpenCV
+from photoplan.geometry.pose import rotation_vector
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import PARAMETERS, Active, Adjusted, AdjustSettings, BlockCamera
-from photoplan.orientation.bundle.model import build_model
-from photoplan.orientation.bundle.robust import weights_of
-from photoplan.orientation.bundle.rows import linearise, residuals_of, whitened
-from photoplan.orientation.bundle.select import select, start_points
-from photoplan.orientation.bundle.unknowns import start_state
+from photoplan.orientation.bundle.equations import linearise, residuals_of, whitened
+from photoplan.orientation.bundle.model import (
+    PARAMETERS,
+    Active,
+    Adjusted,
+    AdjustSettings,
+    BlockCamera,
+    build_model,
+    start_state,
+)
+from photoplan.orientation.bundle.robust import select, start_points, weights_of
 
 FILM = ("c", "x0", "y0")
 PLAIN = AdjustSettings(robust=False, variance_components=False)
@@ -294,7 +298,7 @@ def test_lever_arm_drift_and_boresight_are_recovered() -> None:
     simulated = simulate(4, strips=4, images=8, per_image=40, gnss=0.03, attitude=2e-4, cross=True, control=16)
     block = simulated.block
     lever, turn = np.array([0.4, -0.3, 1.2]), np.array([0.004, -0.002, 0.006])
-    from photoplan.geometry.rotation import small_rotations
+    from photoplan.geometry.pose import small_rotations
 
     R = np.array([p.R_ground_camera for p in simulated.poses])
     strips = np.array([int(s[1:]) for s in block.positions.strip])

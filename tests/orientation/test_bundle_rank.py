@@ -11,10 +11,10 @@ import pytest
 from scipy import sparse
 from tools.sim_block import simulate
 
-from photoplan.cameras.lenses.radial_table import RadialTable
+from photoplan.cameras.lenses import RadialTable
 from photoplan.errors import GeometryError, UsageError
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.normal import check_rank
+from photoplan.orientation.bundle.equations import check_rank
 
 
 def test_fault_16_a_block_without_control_has_no_datum() -> None:

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from tools.plain_block import FOCAL, Make, Truth, plain_block
 
-from photoplan.adjustment.components import variance_components
+from photoplan.adjustment.statistics import variance_components
 from photoplan.errors import GeometryError
-from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import Block
-from photoplan.orientation.bundle.causes import weighed_causes
+from photoplan.orientation.bundle.adjust import adjust_block, weighed_causes
+from photoplan.orientation.bundle.model import Block
 
 
 def spoilt(kind: str, seed: int) -> Block:

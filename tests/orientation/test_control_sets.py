@@ -9,7 +9,7 @@ from tools.thinned import some, thinned
 
 from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import Adjusted
+from photoplan.orientation.bundle.model import Adjusted
 
 
 def disturbed(seed: int, gnss: float | None) -> tuple[set[int], Adjusted]:

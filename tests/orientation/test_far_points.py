@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tools.plain_block import FOCAL, SIZE, Make, pixels, plain_block
 
-from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.fiducials import Affine2D
+from photoplan.cameras.lenses import NoLens
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedPositions
-from photoplan.cameras.plane import Affine2D
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import AdjustSettings, Block, BlockCamera, BlockImage
+from photoplan.orientation.bundle.model import AdjustSettings, Block, BlockCamera, BlockImage
 
 PLANE = Affine2D(1.0, 0.0, (SIZE[0] - 1) / 2, 0.0, -1.0, (SIZE[1] - 1) / 2)
 

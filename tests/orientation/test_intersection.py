@@ -7,8 +7,7 @@ import pytest
 from tools.effort import at_most
 from tools.photos import at
 
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.pose import Pose, rotation_opk
 from photoplan.orientation.intersection import REASONS, Intersected, MeasuredRays, intersect
 
 SIGMA = 5e-5

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from tools.thinned import some, thinned
 
-from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
+from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.errors import InputError
-from photoplan.orientation.marks import catalogue as free
-from photoplan.orientation.marks import silhouettes as frame
-from photoplan.orientation.marks.alone import find_mark
-from photoplan.orientation.marks.edges import fit_edges, pattern_edges
+from photoplan.orientation.marks import template as frame
+from photoplan.orientation.marks import template as free
 from photoplan.orientation.marks.locate import locate_mark
+from photoplan.orientation.marks.single import find_mark, fit_edges, pattern_edges
 from photoplan.orientation.marks.template import coverage, render
 
 SNR = 20.0

@@ -9,9 +9,13 @@ from scipy import ndimage
 from tools.mark_scans import Simulated, ring_cross_pattern, simulate
 
 from photoplan.errors import InputError
-from photoplan.orientation.marks.locate import locate_mark, paraboloid_peak
-from photoplan.orientation.marks.match import fine_template, match_template
-from photoplan.orientation.marks.target import locate_target
+from photoplan.orientation.marks.locate import (
+    fine_template,
+    locate_mark,
+    locate_target,
+    match_template,
+    paraboloid_peak,
+)
 
 PATTERN = ring_cross_pattern()
 

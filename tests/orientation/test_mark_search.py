@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from tools.mark_scans import CORNERS, ArrayScan, Simulated, ring_cross_pattern, simulate
 from tools.thinned import some, thinned
 
-from photoplan.cameras.mark_pattern import MarkPart, MarkPattern
+from photoplan.cameras.fiducials import MarkPart, MarkPattern
 from photoplan.errors import InputError
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
-from photoplan.orientation.marks.found import FiducialResult, MarksNotFound
-from photoplan.orientation.marks.layout import TURNS, MarkLayout, fit_placement
+from photoplan.orientation.marks.layout import TURNS, FiducialResult, MarkLayout, MarksNotFound, fit_placement
 
 PATTERN = ring_cross_pattern()
 LAYOUT = MarkLayout.of(CORNERS, dict.fromkeys(CORNERS, PATTERN))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from photoplan.cameras.mark_pattern import MarkExample, MarkPart, MarkPattern
+from photoplan.cameras.fiducials import MarkExample, MarkPart, MarkPattern
 from photoplan.errors import InputError
 from photoplan.orientation.marks.template import Template, coverage, render
 

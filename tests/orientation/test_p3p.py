@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.resection.p3p import bearings, three_point_poses
+from photoplan.geometry.pose import rotation_opk
+from photoplan.orientation.resection import bearings, three_point_poses
 
 
 def scenes(rng: np.random.Generator, n: int, tilt: float, flat: bool) -> tuple[np.ndarray, ...]:

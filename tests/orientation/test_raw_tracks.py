@@ -12,18 +12,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tools.thinned import some, thinned
 
-from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.fiducials import Affine2D
+from photoplan.cameras.lenses import Brown
 from photoplan.cameras.observed import GroundPoints, ImagePoints
-from photoplan.cameras.plane import Affine2D
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.bundle.adjust import _selected, _started, adjust_block
-from photoplan.orientation.bundle.block import Active, AdjustSettings, Block, BlockCamera, BlockImage
-from photoplan.orientation.bundle.far import loose_points
-from photoplan.orientation.bundle.loop import _left
-from photoplan.orientation.bundle.model import build_model
-from photoplan.orientation.bundle.robust import weights_of
-from photoplan.orientation.bundle.rows import linearise
+from photoplan.orientation.bundle.equations import linearise, loose_points
+from photoplan.orientation.bundle.model import Active, AdjustSettings, Block, BlockCamera, BlockImage, build_model
+from photoplan.orientation.bundle.robust import _left, weights_of
 
 SIZE, IMAGES, NEAR, FAR = (1024, 768), 12, 350, 60
 PLANE = Affine2D(1.0, 0.0, (SIZE[0] - 1) / 2, 0.0, -1.0, (SIZE[1] - 1) / 2)

@@ -11,17 +11,14 @@ from pyproj import Transformer
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses import Brown, NoLens
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, InputError
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import ANGLE_UNITS, ROTATION_ORDERS, angles_from_rotation, rotation_from_angles
-from photoplan.io.ground_points import read_ground_points
-from photoplan.io.image_points import read_image_points
+from photoplan.geometry.pose import ANGLE_UNITS, ROTATION_ORDERS, Pose, angles_from_rotation, rotation_from_angles
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import TableFormat
-from photoplan.orientation.readings import (
+from photoplan.io.points import read_ground_points, read_image_points
+from photoplan.orientation.conventions import (
     CAMERA_AXES,
     DIRECTIONS,
     TURNS,

@@ -8,9 +8,8 @@ from tools.photos import turned_by
 from tools.thinned import thinned
 
 from photoplan.errors import GeometryError
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.start.relative import five_point_essentials, relate
+from photoplan.geometry.pose import Pose, rotation_opk
+from photoplan.orientation.start import five_point_essentials, relate
 
 SIGMA = 5e-5
 

@@ -13,18 +13,13 @@ from photoplan.cameras.base import Camera
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.cameras.lenses import Brown, Lens, NoLens, OpenCV
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, UsageError
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.pose import Pose, rotation_opk
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import AdjustSettings, Block, BlockCamera, BlockImage
-from photoplan.orientation.resection.adjust import ResectSettings, resect, tangents_of
-from photoplan.orientation.resection.direct import resect_direct
+from photoplan.orientation.bundle.model import AdjustSettings, Block, BlockCamera, BlockImage
+from photoplan.orientation.resection import ResectSettings, resect, resect_direct, tangents_of
 
 UNKNOWN_C = ResectSettings(camera_constant_known=False)
 

@@ -9,14 +9,12 @@ import pytest
 from tools.photos import AERIAL, at, turned_by
 from tools.thinned import some
 
-from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses import Brown
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedPositions
 from photoplan.errors import GeometryError
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.bundle.block import BlockCamera
-from photoplan.orientation.start.block import Started, StartImage, start_block
-from photoplan.orientation.start.similarity import fit_similarity, robust_similarity
+from photoplan.geometry.pose import Pose, rotation_opk
+from photoplan.orientation.bundle.model import BlockCamera
+from photoplan.orientation.start import Started, StartImage, fit_similarity, robust_similarity, start_block
 
 LENS = Brown(k1=-0.02, k2=0.01)
 CAMERA = {"RC30": BlockCamera(AERIAL.c, AERIAL.principal_point, LENS)}

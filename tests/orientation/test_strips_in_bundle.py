@@ -10,21 +10,27 @@ from tools.sim_strip import ORIGIN, SimulatedStrips, lines, places, projection, 
 from tools.thinned import some, thinned
 
 from photoplan.cameras.base import project
+from photoplan.cameras.correctable import TrackPriors
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.line_correctable import TrackPriors
+from photoplan.cameras.lenses import NoLens
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import GeometryError
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.pose import Pose, rotation_opk
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import Active, AdjustSettings, Block, BlockCamera, BlockImage
-from photoplan.orientation.bundle.model import Model, build_model
-from photoplan.orientation.bundle.robust import weights_of
-from photoplan.orientation.bundle.rows import linearise, residuals_of, whitened
-from photoplan.orientation.bundle.select import select, start_points
-from photoplan.orientation.bundle.unknowns import State, start_state
+from photoplan.orientation.bundle.equations import linearise, residuals_of, whitened
+from photoplan.orientation.bundle.model import (
+    Active,
+    AdjustSettings,
+    Block,
+    BlockCamera,
+    BlockImage,
+    Model,
+    State,
+    build_model,
+    start_state,
+)
+from photoplan.orientation.bundle.robust import select, start_points, weights_of
 
 PLAIN = AdjustSettings(robust=False, variance_components=False, correlation=False)
 EVERYTHING = TrackPriors(

@@ -11,7 +11,7 @@ from tools.thinned import some
 
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import AdjustSettings, Block
+from photoplan.orientation.bundle.model import AdjustSettings, Block
 
 
 def scaled(block: Block, unit: float) -> Block:

@@ -12,13 +12,20 @@ from tools.source_errors import moved, pose_errors
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses import Brown, NoLens
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.accuracy import IndependentError, SourceErrors, figures_at, resampling_sigma, tile_accuracy
-from photoplan.plan.budget import displacement_by_height, displacement_by_kappa, displacement_by_tilt
+from photoplan.plan.accuracy import (
+    IndependentError,
+    SourceErrors,
+    displacement_by_height,
+    displacement_by_kappa,
+    displacement_by_tilt,
+    figures_at,
+    resampling_sigma,
+    tile_accuracy,
+)
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.monoplot import MonoplotErrors, monoplot
 

@@ -12,14 +12,14 @@ from tools.source_errors import moved, pose_errors
 from tools.thinned import some
 
 from photoplan.cameras.base import project
+from photoplan.cameras.fiducials import Affine2D, Bilinear2D
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.cameras.lenses import Brown
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.geometry.rotation import rotation_vector
+from photoplan.geometry.pose import rotation_vector
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import AdjustSettings
+from photoplan.orientation.bundle.model import AdjustSettings
 from photoplan.plan.accuracy import tile_accuracy
 from photoplan.targets.map import MapTarget
 

@@ -8,11 +8,9 @@ from tools.line_camera import LineCamera, line_camera
 from tools.pinhole import vertical
 
 from photoplan.cameras.base import project
-from photoplan.geometry.breaks import Breaks
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.grid import Breaks, MapGrid, Window
 from photoplan.kernels.position import positions
-from photoplan.plan.anchors import Anchors
-from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.anchors import AnchorRule, Anchors, compile_anchors
 from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 

@@ -14,9 +14,8 @@ from photoplan.cameras.base import project
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.choice import BestImage, Weights
 from photoplan.plan.ground import TileGround
-from photoplan.plan.visibility import hidden_pixels
+from photoplan.plan.sources import BestImage, Weights, hidden_pixels
 from photoplan.targets.map import MapTarget
 
 SIDE = 150

@@ -14,8 +14,7 @@ from photoplan.cameras.base import project
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.anchors import Anchors
-from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.anchors import AnchorRule, Anchors, compile_anchors
 from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 

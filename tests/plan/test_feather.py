@@ -7,9 +7,8 @@ import pytest
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.plan.feather import Feather, feather_of
-from photoplan.plan.owner import Share
-from photoplan.plan.tiles import Tiles
+from photoplan.plan.footprint import Tiles
+from photoplan.plan.sources import Feather, Share, feather_of
 
 SIDE = 120
 GRID = MapGrid.covering((0, 0, SIDE, SIDE), 1.0, "EPSG:32632")

@@ -11,28 +11,19 @@ from tools.thinned import examples, some
 from tools.twin import TwinSource, twin_compose
 
 from photoplan.cameras.base import project
+from photoplan.cameras.fiducials import Bilinear2D
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.fisheye import Fisheye
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.radial_table import RadialTable
-from photoplan.cameras.lenses.reversed import Reversed
-from photoplan.cameras.plane import Bilinear2D
-from photoplan.engine.arrays import ArrayReader
-from photoplan.engine.base import Source
-from photoplan.engine.execute import render
+from photoplan.cameras.lenses import Brown, Fisheye, Lens, NoLens, RadialTable, Reversed
+from photoplan.engine.execute import ArrayReader, Source, render
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.kernels.position import positions
-from photoplan.plan.anchors import Anchors
-from photoplan.plan.compile import AnchorRule, compile_anchors
-from photoplan.plan.field import field_grid
+from photoplan.plan.anchors import AnchorRule, Anchors, compile_anchors, field_grid
+from photoplan.plan.footprint import Tile
 from photoplan.plan.ground import TileGround
 from photoplan.plan.product import compile_tile
-from photoplan.plan.tiles import Tile
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 from photoplan.targets.map import MapTarget
 
 SIZE = (4000, 3000)

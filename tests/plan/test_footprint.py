@@ -15,12 +15,11 @@ from tools.thinned import some, thinned
 from photoplan.cameras.base import CentralCamera, project
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses import Lens, NoLens
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.footprint import FAR, covered_tiles, footprint, image_border
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.raster import RasterSurface
 
 GROUND = LevelSurface(100.0)

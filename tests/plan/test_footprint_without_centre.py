@@ -9,8 +9,8 @@ from tools.rpc_images import CRS, camera
 from photoplan.cameras.base import project
 from photoplan.geometry.grid import MapGrid
 from photoplan.plan.footprint import covered_tiles, footprint, mean_gsd
-from photoplan.surfaces.intersect import intersect
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
+from photoplan.surfaces.shifted import intersect
 
 
 def test_what_an_image_with_polynomials_sees_of_a_level() -> None:

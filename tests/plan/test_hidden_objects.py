@@ -16,8 +16,8 @@ from photoplan.cameras.base import project
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.ground import TileGround
-from photoplan.plan.visibility import hidden_pixels
-from photoplan.surfaces.level import LevelSurface
+from photoplan.plan.sources import hidden_pixels
+from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.objects import ObjectSurface
 from photoplan.targets.map import MapTarget
 

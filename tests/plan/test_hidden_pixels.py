@@ -14,10 +14,10 @@ from photoplan.cameras.base import project
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan import visibility
+from photoplan.plan import sources as visibility
 from photoplan.plan.ground import TileGround
-from photoplan.plan.visibility import hidden_pixels, sight_lines
-from photoplan.surfaces.level import LevelSurface
+from photoplan.plan.sources import hidden_pixels, sight_lines
+from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.shifted import ShiftedSurface
 from photoplan.targets.map import MapTarget
 

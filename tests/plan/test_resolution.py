@@ -14,7 +14,7 @@ from tools.resolution import (
 )
 
 from photoplan.errors import UsageError
-from photoplan.plan.budget import (
+from photoplan.plan.accuracy import (
     admissible_height_error,
     admissible_shift,
     displacement_by_height,
@@ -146,7 +146,7 @@ def test_formulas_of_the_angles_against_a_camera() -> None:
     from photoplan.cameras.base import project
     from photoplan.cameras.frame import FrameCamera
     from photoplan.cameras.interior import Interior
-    from photoplan.cameras.lenses.none import NoLens
+    from photoplan.cameras.lenses import NoLens
     from photoplan.geometry.pose import Pose
 
     c, w, small = 0.150, 0.733, 1e-6

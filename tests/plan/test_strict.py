@@ -8,12 +8,11 @@ import pytest
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses import Brown
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.kernels.position import positions
-from photoplan.plan.compile import AnchorRule, compile_anchors
-from photoplan.plan.field import field_grid
+from photoplan.plan.anchors import AnchorRule, compile_anchors, field_grid
 from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 

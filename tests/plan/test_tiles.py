@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.plan.tiles import Tile, Tiles
+from photoplan.plan.footprint import Tile, Tiles
 
 GRID = MapGrid(400_000.3, 5_400_000.1, 0.07, 1000, 730, "EPSG:32633")
 

@@ -7,14 +7,13 @@ import pytest
 from tools.shaken_strip import ShakenStrip
 
 from photoplan.cameras.base import project
-from photoplan.cameras.line import LineCamera
+from photoplan.cameras.pushbroom import LineCamera
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.camera.line.file import read_line
 from photoplan.kernels.position import positions
-from photoplan.plan.anchors import Anchors
-from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.anchors import AnchorRule, Anchors, compile_anchors
 from photoplan.plan.ground import TileGround
-from photoplan.plan.visibility import sight_lines
+from photoplan.plan.sources import sight_lines
 from photoplan.targets.map import MapTarget
 
 WINDOW = Window(64, 40, 220, 200)

@@ -15,15 +15,13 @@ from tools.adjust_project import CAMERA, FILM, Made, Make, misses, write_project
 from tools.thinned import some, thinned
 
 from photoplan.errors import GeometryError, InputError, UsageError
-from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation, rotation_from_angles
-from photoplan.io.image_points import read_image_points
+from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation, rotation_from_angles
+from photoplan.io.points import read_image_points
 from photoplan.io.project.file import load_project
-from photoplan.orientation.bundle.block import AdjustSettings
-from photoplan.orientation.bundle.frame import angle_derivatives
-from photoplan.products.adjust.block import adjust_prepared, map_result, prepare
-from photoplan.products.adjust.inputs import read_inputs
+from photoplan.orientation.bundle.adjust import angle_derivatives
+from photoplan.orientation.bundle.model import AdjustSettings
+from photoplan.products.adjust.inputs import adjust_prepared, map_result, prepare, read_inputs, started
 from photoplan.products.adjust.run import OUTPUTS, AdjustReport, AdjustRequest, adjust_project
-from photoplan.products.adjust.start import started
 
 pytest.importorskip("matplotlib")
 

@@ -10,10 +10,9 @@ from pydantic import TypeAdapter
 
 from photoplan.cameras.interior import Interior
 from photoplan.io.camera.kinds import Camera
-from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.posed import Image
-from photoplan.orientation.bundle.block import AdjustedCamera, BlockCamera
-from photoplan.products.adjust.cameras import block_camera, calibrated, camera_entries
+from photoplan.io.project.model import Image, interior_of, lens_of
+from photoplan.orientation.bundle.model import AdjustedCamera, BlockCamera
+from photoplan.products.adjust.sensors import block_camera, calibrated, camera_entries
 
 MARKS = {"a": [-100.0, -100.0], "b": [100.0, -100.0], "c": [100.0, 100.0], "d": [-100.0, 100.0]}
 FILM = {"type": "film", "size": [4000, 4000], "camera_constant_mm": 150.0, "fiducials_mm": MARKS}

@@ -15,9 +15,9 @@ from tools.rpc_images import CRS, SIZE, camera
 from tools.shaken_strip import ShakenStrip
 
 from photoplan.cameras.base import Camera, project
-from photoplan.cameras.line import LineCamera
-from photoplan.cameras.line_measured import measured as measured_of
-from photoplan.cameras.plane import Affine2D
+from photoplan.cameras.fiducials import Affine2D
+from photoplan.cameras.pushbroom import LineCamera
+from photoplan.cameras.pushbroom import measured as measured_of
 from photoplan.io.camera.line.file import read_line
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import StatedTerrain

@@ -17,16 +17,14 @@ from tools.rpc_files import as_text
 
 import photoplan as pp
 from photoplan.cameras.base import project
-from photoplan.cameras.rpc import RationalFunctions, RpcCamera
-from photoplan.cameras.rpc_fit import fit_rpc
+from photoplan.cameras.rpc import RationalFunctions, RpcCamera, fit_rpc
 from photoplan.geometry.crs import crs_step, nearest_turn, topocentric_poses, turn_of
-from photoplan.geometry.earth_poses import geocentric_of_geodetic, geocentric_poses, map_poses
-from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.geometry.local import GeodeticGround, geocentric_of_geodetic, geocentric_poses, map_poses
 from photoplan.io.image_metadata import ImageMetadata
 from photoplan.io.orientation.exif import map_positions
 from photoplan.io.orientation.table import OrientationTable, OrientedImage
-from photoplan.products.init.systems import placed
-from photoplan.project.open_terrain import open_terrain
+from photoplan.products.init import placed
+from photoplan.project.ground import open_terrain
 
 #: Zones of UTM that meet at 180°, and where on the earth the image lies.
 ZONES, LATITUDE = ("EPSG:32701", "EPSG:32760"), -17.0

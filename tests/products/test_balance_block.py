@@ -18,9 +18,9 @@ from tools.command import Here
 from tools.forked import Mishap, forked
 from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
 
-from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.disk import FileLock, lock_of
 from photoplan.io.project.file import load_project
-from photoplan.products.balance.run import BalanceRequest, balance_project
+from photoplan.products.balance import BalanceRequest, balance_project
 
 AWAY = (-60.0, 0.0, 60.0)
 NOISE = gaussian_filter(np.random.default_rng(5).normal(size=(3, 420, 420)), (0, 6, 6))

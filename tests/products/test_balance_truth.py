@@ -12,7 +12,7 @@ import tools.radiometric_block as blocks
 from tools.command import Here
 from tools.radiometric_block import RadiometricBlock, simulate
 
-from photoplan.products.balance.run import BalanceRequest, balance_project
+from photoplan.products.balance import BalanceRequest, balance_project
 
 CASES: dict[str, dict[str, Any]] = {
     "2 strips of 3": {"strips": 2, "along": 3, "seed": 1},

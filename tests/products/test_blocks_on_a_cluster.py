@@ -101,7 +101,7 @@ def test_reference_on_a_cluster(small: Block, capsys: pytest.CaptureFixture[str]
 def test_fault_05_an_image_that_no_worker_can_read(
     small: Block, capsys: pytest.CaptureFixture[str], address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from photoplan.products.seams import run
+    from photoplan.products import seams as run
 
     def broken(*given: Any) -> Any:
         raise OSError("the disk has gone")
@@ -131,8 +131,8 @@ def test_images_pickle_small(small: Block) -> None:
 
     from photoplan import load_project
     from photoplan.events import SILENT
-    from photoplan.products.balance.sample import survey
-    from photoplan.products.seams.run import _images, _Map
+    from photoplan.products.balance import survey
+    from photoplan.products.seams import _images, _Map
 
     project = load_project(small.project)
     found = survey(project, project.select(None), 8.0, SILENT)

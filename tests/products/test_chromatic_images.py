@@ -11,8 +11,7 @@ from tools.thinned import some
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.raster import RasterReader
-from photoplan.io.whole_image import write_whole_image
+from photoplan.io.raster import RasterReader, write_whole_image
 from photoplan.products.chromatic import (
     ChromaticRequest,
     load_chromatic,
@@ -22,8 +21,8 @@ from photoplan.products.chromatic import (
     save_chromatic,
 )
 from photoplan.project.align import AlignStep
-from photoplan.project.stepped import SteppedReader
-from photoplan.quality.colour.model import BandModel, ChromaticModel
+from photoplan.project.steps import SteppedReader
+from photoplan.quality.colour import BandModel, ChromaticModel
 from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.parts import Gain, Lateral, Quantisation, Spread
 from photoplan.quality.formation.scenes import PatternScene

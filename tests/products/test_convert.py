@@ -8,11 +8,11 @@ import pytest
 from tools.orientation_blocks import ANGLES, CAMERA, CENTERS, GROUND, NAMES, block, our_pixels
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
+from photoplan.geometry.pose import angles_from_rotation, rotation_from_angles
 from photoplan.io.camera.film import FilmEntry
 from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation.table import TableFormat
-from photoplan.orientation.readings import Reading
+from photoplan.orientation.conventions import Reading
 from photoplan.plain import json_text, plain
 from photoplan.products.convert import ConvertRequest, convert_orientation, list_readings
 
@@ -91,7 +91,7 @@ def test_a_lens_is_never_lost_in_silence(block, tmp_path):
 
 
 def test_a_whole_project_is_converted_with_its_camera_and_image_files(tmp_path, block):
-    from photoplan.products.init.run import InitRequest, init_project
+    from photoplan.products.init import InitRequest, init_project
 
     images = str(block / "images" / "*.jpg")
     request = InitRequest(

@@ -18,14 +18,13 @@ from tools.landxml import write_landxml
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses import NoLens
 from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.bounds import area_fault, area_note, beyond_area, is_no_fix
 from photoplan.geometry.crs import crs_step, grid_rotation, is_left_handed, require_projected_metres
 from photoplan.geometry.pose import Pose
-from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_metadata import read_image_metadata
-from photoplan.io.observed_positions import read_observed_positions
+from photoplan.io.points import read_ground_points, read_observed_positions
 
 IMAGES = Path(__file__).parents[1] / "data/drone_positions"
 LEFT = ("EPSG:5513", "EPSG:2065", "+proj=utm +zone=32 +axis=wnu", "+proj=tmerc +lon_0=15 +axis=esu")
@@ -146,7 +145,7 @@ GEOID = """
 import sys; from pathlib import Path; from pyproj import datadir
 from tools.geoid import write_geoid
 datadir.append_data_dir(sys.argv[1]); write_geoid(Path(sys.argv[1]), "EPSG:32632", (5e5, 5.2e6))
-from photoplan.io.ground_points import read_ground_points
+from photoplan.io.points import read_ground_points
 print(read_ground_points(Path(sys.argv[1]) / "c.csv", crs="EPSG:32632", height_system="EPSG:5773").XYZ[:, 2].tolist())
 """
 

@@ -10,7 +10,7 @@ from tools.small_block import write_terrain
 from tools.small_model import LAYOUT, grid_unit, write_small, write_units_of
 
 from photoplan.errors import InputError
-from photoplan.project.open_terrain import open_terrain
+from photoplan.project.ground import open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.raster import RasterSurface
 

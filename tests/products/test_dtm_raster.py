@@ -16,7 +16,7 @@ from tools.events import Told
 from photoplan.errors import ResourceError, TilesFailed, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io import disk
-from photoplan.products.dtm.raster import GridOptions, write_grid
+from photoplan.products.dtm.rasters import GridOptions, write_grid
 
 PARTS = (500_000.0, 5_200_000.0, 0.5, 700, 300, "EPSG:32633")
 GRID = MapGrid(*PARTS)

@@ -23,8 +23,8 @@ from tools.recorded import checked
 from tools.small_block import CRS, X0, Y0, texture, write_block, write_image
 from tools.town import write_town
 
-from photoplan.io.lock import FileLock, lock_of
-from photoplan.io.run_record import record_path
+from photoplan.io.disk import FileLock, lock_of
+from photoplan.io.store import record_path
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs fork, signals and limits")
 

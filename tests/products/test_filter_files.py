@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError, UsageError
-from photoplan.project.filter_files import load_filter, save_filter
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
+from photoplan.project.steps import load_filter, save_filter
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 
 WEIGHTS = np.random.default_rng(0).normal(size=(5, 3)) * np.array([1e-9, 1.0, 1e6])
 

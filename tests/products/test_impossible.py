@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from tools.plain_block import SIZE, pixels
 
-from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.products.resect import ResectRequest, resect_project
+from photoplan.geometry.pose import rotation_from_angles
+from photoplan.products.film import ResectRequest, resect_project
 
 CENTER = np.array([500_200.0, 500_900.0, 1400.0])
 

@@ -18,12 +18,12 @@ from rasterio.transform import from_origin
 from photoplan.cli.init import command
 from photoplan.errors import HeightSystemError, InputError, PhotoplanError, UsageError
 from photoplan.geometry.crs import crs_step
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.pose import rotation_opk
 from photoplan.io.camera.film import FilmEntry
 from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.project.file import load_project
-from photoplan.products.init.run import InitRequest, init_project, make_project
+from photoplan.products.init import InitRequest, init_project, make_project
 
 HEAD = "name,x,y,z,omega,phi,kappa\n"
 YAML = "cam:\n  type: pinhole\n  im_size: [40, 30]\n  focal_len: 50\n  sensor_size: [40, 30]\n"

@@ -21,15 +21,14 @@ from tools.small_block import hills
 from photoplan.cameras.base import project
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses import NoLens
 from photoplan.cli.main import run
 from photoplan.errors import UsageError
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import axes_of_angles
+from photoplan.geometry.pose import Pose, axes_of_angles
 from photoplan.io.project.file import load_project
 from photoplan.products.monoplot import MonoplotRequest, monoplot_file
 from photoplan.project.scene import open_scene
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 from photoplan.terrain.monoplot import MonoplotErrors, MonoplotPoints, monoplot
 
 X0, Y0, H = 500_000.0, 5_300_000.0, 900.0

@@ -11,11 +11,9 @@ import rasterio
 from tools.edge_scenes import blocks, noisy
 
 from photoplan.geometry.grid import Window
-from photoplan.products.mtf import search as mtf_search
-from photoplan.products.mtf.image import LightImage
-from photoplan.products.mtf.search import join_lines, parted, search_edges, select_spread, tiles_of
-from photoplan.quality.edges.candidates import StraightEdge
-from photoplan.quality.edges.find import EdgeRegion, EdgeRules
+from photoplan.products.mtf import edges as mtf_search
+from photoplan.products.mtf.edges import LightImage, join_lines, parted, search_edges, select_spread, tiles_of
+from photoplan.quality.edges.find import EdgeRegion, EdgeRules, StraightEdge
 from photoplan.quality.linearise import Linearisation
 
 

@@ -19,9 +19,9 @@ from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose
 from photoplan.io.project.file import load_project
 from photoplan.plan.accuracy import SourceErrors, tile_accuracy
-from photoplan.project.uncertain import object_errors
-from photoplan.surfaces.height_errors import StatedHeightErrors
-from photoplan.surfaces.level import LevelSurface
+from photoplan.project.error_model import object_errors
+from photoplan.surfaces.base import LevelSurface
+from photoplan.surfaces.hybrid import StatedHeightErrors
 from photoplan.surfaces.objects import ObjectSurface
 from photoplan.targets.map import MapTarget
 

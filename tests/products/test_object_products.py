@@ -18,7 +18,7 @@ from tools.small_block import CRS, FOCAL, NAMES, SIZE, X0, Y0, Z0, Block, make_p
 from tools.town import faces_of
 
 from photoplan.geometry.pose import Pose
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.objects import ObjectSurface
 
 AWAY = (-60.0, 0.0, 60.0)

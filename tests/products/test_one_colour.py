@@ -7,8 +7,8 @@ import pytest
 from tools.command import Here
 from tools.small_block import SIZE, Block, write_image
 
-from photoplan.engine.arrays import ArrayReader
-from photoplan.products.one_colour import one_colour
+from photoplan.engine.execute import ArrayReader
+from photoplan.products.plausibility import one_colour
 
 
 def test_a_black_image_is_named_by_a_mosaic(small: Block, capsys: pytest.CaptureFixture[str]) -> None:

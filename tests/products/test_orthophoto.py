@@ -20,10 +20,9 @@ from photoplan.errors import GeometryError, UsageError
 from photoplan.io.project.file import load_project
 from photoplan.plan.footprint import mean_gsd
 from photoplan.products.orthophoto.execution import Run, execute
-from photoplan.products.orthophoto.look import two_figures
-from photoplan.products.orthophoto.plan import plan_orthophotos, render
+from photoplan.products.orthophoto.plan import plan_orthophotos, render, two_figures
 from photoplan.project.scene import open_scene
-from photoplan.surfaces.intersect import intersect
+from photoplan.surfaces.shifted import intersect
 
 QUIET = Run(quicklook=False)
 

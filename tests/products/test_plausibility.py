@@ -12,16 +12,22 @@ import numpy as np
 import pytest
 from tools.thinned import some
 
-from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles, rotation_opk
+from photoplan.geometry.pose import angles_from_rotation, rotation_from_angles, rotation_opk
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.orientation.file import read_orientation
-from photoplan.io.project.model import Orientation
-from photoplan.io.project.posed import Image
+from photoplan.io.project.model import Image, Orientation
 from photoplan.io.terrain.reader import TerrainReader
-from photoplan.orientation.other_readings import DECLARED, readings
-from photoplan.orientation.plausibility import Heights, ImagePlausibility, JudgedView, look, other_reading
-from photoplan.project.posed import view_of
+from photoplan.orientation.conventions import (
+    DECLARED,
+    Heights,
+    ImagePlausibility,
+    JudgedView,
+    look,
+    other_reading,
+    readings,
+)
+from photoplan.project.cameras import view_of
 from photoplan.surfaces.raster import RasterSurface
 
 EAST = np.array([1100.0, 0, 0])

@@ -26,13 +26,12 @@ from tools.small_block import CRS, X0, Y0, write_image
 from tools.town import House
 
 from photoplan.cameras.base import project
-from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.project.file import load_project
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
 from photoplan.project.rendered import DrapedTexture, ProjectScene
 from photoplan.quality.formation.rendered import RenderedScene, SolidTexture
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import Hits, LevelSurface
 from photoplan.surfaces.objects import ObjectSurface
-from photoplan.surfaces.rays import Hits
 
 GROUND, GRAIN = 100.0, 8.0
 HOUSES = [

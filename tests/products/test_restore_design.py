@@ -7,7 +7,7 @@ from scipy.ndimage import convolve
 from tools.blurred_scenes import any_edges, discrete_spread, taken
 
 from photoplan.errors import InputError, UsageError
-from photoplan.products.restore.design import DesignRequest, design_restoration
+from photoplan.products.restore import DesignRequest, design_restoration
 from photoplan.quality.restoration.design import DesignOptions
 
 pytestmark = pytest.mark.usefixtures("searched_once")

@@ -13,16 +13,15 @@ from tools.command import Here
 from tools.thinned import some
 
 from photoplan.geometry.grid import Window
-from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
+from photoplan.io.quality_files import FallOffEntry, TermEntry, fall_off_text
 from photoplan.products.characterise.fall_off import correction_text
-from photoplan.products.restore.run import RestoreReport, RestoreRequest, plan_restoration, restore_images
-from photoplan.project.restored import restoration_of
-from photoplan.quality.camera.fall_off import fit_fall_off
-from photoplan.quality.camera.fall_off_adjust import FallOffSettings
+from photoplan.products.restore import RestoreReport, RestoreRequest, plan_restoration, restore_images
+from photoplan.project.steps import restoration_of
+from photoplan.quality.camera.fall_off import FallOffSettings, fit_fall_off
 from photoplan.quality.camera.fall_off_model import FallOffModel
-from photoplan.quality.colour.model import BandModel, ChromaticModel
+from photoplan.quality.colour import BandModel, ChromaticModel
 from photoplan.quality.linearise import Linearisation
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 
 SIZE, POINT, FOCAL = (350, 280), (180.0, 135.0), 400.0
 TERMS = {(2, 0): -0.08, (4, 0): -0.10, (1, 1): 0.05, (2, 2): 0.02}

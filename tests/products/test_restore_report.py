@@ -16,14 +16,14 @@ from tools.command import Here
 
 from photoplan.errors import UsageError
 from photoplan.io.raster import RasterReader
-from photoplan.products.restore.design import DesignedPart, DesignRequest
-from photoplan.products.restore.filter import FilterRequest, FoundFilter, requested_filter
+from photoplan.products.restore import DesignedPart, DesignRequest, FilterRequest, FoundFilter, requested_filter
 from photoplan.quality.restoration.design import DesignOptions, design_filter
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.scene import SceneStatistics
 from photoplan.report.page import open_report
-from photoplan.report.restore.page import (
+from photoplan.report.restore import (
     axis_pictures,
+    compare,
     distinct_kernels,
     distinct_parts,
     field_maps,
@@ -32,7 +32,6 @@ from photoplan.report.restore.page import (
     part_rows,
     plain_facts,
 )
-from photoplan.report.restore.plots import compare
 
 pytestmark = pytest.mark.usefixtures("searched_once")
 

@@ -12,16 +12,15 @@ from tools.small_block import Block, texture, write_image
 from tools.thinned import some
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.project.file import load_project
-from photoplan.io.project.write import project_text
+from photoplan.io.project.file import load_project, project_text
 from photoplan.products.check import check_project
 from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.products.orthophoto.plan import plan_orthophotos
-from photoplan.products.restore.run import RestoreRequest, restore_images
+from photoplan.products.restore import RestoreRequest, restore_images
 from photoplan.project import scene as scenes
-from photoplan.project.filter_files import save_filter
 from photoplan.project.scene import input_files, open_scene
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
+from photoplan.project.steps import save_filter
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 
 
 def sharpening(size: tuple[int, int] = (200, 150)) -> RestorationFilter:

@@ -12,10 +12,9 @@ from tools.thinned import some
 
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
-from photoplan.products.restore.run import RestoreRequest, restore_images
-from photoplan.project.restored import restored
-from photoplan.project.stepped import SteppedReader
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
+from photoplan.products.restore import RestoreRequest, restore_images
+from photoplan.project.steps import SteppedReader, restored
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 
 SIZE = (700, 560)
 

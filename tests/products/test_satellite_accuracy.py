@@ -12,7 +12,7 @@ from tools.command import inside
 from tools.rpc_images import CRS
 
 from photoplan.cameras.rpc import RpcCamera
-from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.geometry.local import GeodeticGround
 
 
 def accuracy_of(project: Path) -> tuple[np.ndarray, rasterio.Affine]:

@@ -21,9 +21,9 @@ from photoplan.cameras.rpc import RationalFunctions, RpcCamera
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.camera.rpc.file import read_rpc
-from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.project.file import load_project
-from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
+from photoplan.plan.anchors import AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
 from photoplan.products.orthophoto.plan import plan_orthophotos, render
 from photoplan.targets.map import MapTarget

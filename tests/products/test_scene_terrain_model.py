@@ -18,9 +18,9 @@ from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.project.file import load_project
-from photoplan.io.terrain.model_read import ModelReader
+from photoplan.io.terrain.model import ModelReader
 from photoplan.products.check import check_project
-from photoplan.products.init.run import InitRequest, init_project
+from photoplan.products.init import InitRequest, init_project
 from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.products.orthophoto.plan import plan_orthophotos
 from photoplan.project.ground import ground_of

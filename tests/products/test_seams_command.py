@@ -16,9 +16,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from tools.command import Here
 from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
 
-from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.disk import FileLock, lock_of
+from photoplan.products import seams as run
 from photoplan.products.orthophoto.shown import shown
-from photoplan.products.seams import run
 
 AWAY = (-60.0, 0.0, 60.0)
 NOISE = gaussian_filter(np.random.default_rng(5).normal(size=(3, 420, 420)), (0, 3, 3))

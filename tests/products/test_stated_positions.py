@@ -17,9 +17,9 @@ from photoplan.io.orientation.table import TableFormat
 from photoplan.io.project.file import load_project
 from photoplan.products.check import check_project
 from photoplan.products.convert import ConvertRequest, convert_orientation
-from photoplan.products.init.run import InitRequest, init_project
-from photoplan.products.judged import common_differences, differences
+from photoplan.products.init import InitRequest, init_project
 from photoplan.products.orthophoto.plan import plan_orthophotos
+from photoplan.products.plausibility import common_differences, differences
 
 TO_EARTH = Transformer.from_crs(CRS, "EPSG:4326", always_xy=True)
 

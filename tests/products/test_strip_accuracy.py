@@ -14,18 +14,18 @@ from tools.line_strip import Strip
 from tools.sim_strip import lines, places, projection, seen_by, simulated
 
 from photoplan.cameras.base import project
-from photoplan.cameras.line import LineCamera
-from photoplan.cameras.line_correctable import TrackPriors
+from photoplan.cameras.correctable import TrackPriors
 from photoplan.cameras.line_correction import PoseErrors, displaced, map_axes
+from photoplan.cameras.pushbroom import LineCamera
 from photoplan.io.camera.line.correction import read_pose_errors
 from photoplan.io.project.file import load_project
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import AdjustSettings
-from photoplan.products.adjust.by_line import LINES
+from photoplan.orientation.bundle.model import AdjustSettings
 from photoplan.products.adjust.run import AdjustRequest, adjust_project
+from photoplan.products.adjust.sensors import LINES
 from photoplan.project.cameras import camera_without_pixels
+from photoplan.project.error_model import source_errors
 from photoplan.project.ground import ground_of
-from photoplan.project.uncertain import source_errors
 
 HEIGHT = 100.0
 PRIORS = TrackPriors(

@@ -16,7 +16,7 @@ from tools.shaken_strip import ShakenStrip
 from tools.small_block import write_image
 from tools.town import House
 
-from photoplan.io.geopackage import VectorLayer, write_geopackage
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
 
 GROUND, ROOF, PIXEL = 100.0, 110.0, 0.29
 CENTRE = np.array([600_000.0, 5_340_000.0])

@@ -23,16 +23,21 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.project.file import load_project
 from photoplan.matching.facets.observe import facets_of, look
 from photoplan.matching.facets.reconstruct import Scheme
-from photoplan.plan.tiles import Tile
-from photoplan.products.surface import job as surface_job
-from photoplan.products.surface.findings import findings
-from photoplan.products.surface.job import SurfaceJob
-from photoplan.products.surface.plan import plan_surface
-from photoplan.products.surface.scheme import finer_levels, pixels_of_places, scheme_of
-from photoplan.products.surface.settings import SurfaceSettings
-from photoplan.products.surface.spread import counted, median
-from photoplan.products.surface.target import over_map
-from photoplan.project.scenes import ScenesAddress
+from photoplan.plan.footprint import Tile
+from photoplan.products.surface import plan as surface_job
+from photoplan.products.surface.plan import (
+    SurfaceJob,
+    SurfaceSettings,
+    counted,
+    finer_levels,
+    median,
+    over_map,
+    pixels_of_places,
+    plan_surface,
+    scheme_of,
+)
+from photoplan.products.surface.run import findings
+from photoplan.project.scene import ScenesAddress
 from photoplan.report import surface as report
 
 CLOUDS = (".las", ".laz", ".ply")

@@ -16,7 +16,7 @@ from tools.facet_scene import GROUND, HEIGHT, Scene, write_scene
 from tools.small_block import X0, Y0, write_image
 
 from photoplan.geometry.frames import WallFrame
-from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
+from photoplan.geometry.pose import angles_from_rotation, rotation_from_angles
 from photoplan.report import maps
 
 KINDS = ("", "_sigma", "_count", "_fit", "_grey", "_grey_sigma")

@@ -15,8 +15,8 @@ from tools.facet_scene import CONTRAST, waves
 from tools.small_block import CRS, X0, Y0, write_image
 
 from photoplan.cameras.framed import FramedCamera
-from photoplan.geometry.cylinder import CylinderFrame
-from photoplan.geometry.rotation import angles_from_rotation
+from photoplan.geometry.frames import CylinderFrame
+from photoplan.geometry.pose import angles_from_rotation
 from photoplan.io.project.file import load_project
 from photoplan.matching.facets.observe import Facets, Relief, View, look
 from photoplan.matching.facets.pyramid import Pyramid

@@ -10,8 +10,8 @@ from tools.small_block import BASE, X0, Y0, Z0, Block, texture, write_block, wri
 
 from photoplan.errors import InputError
 from photoplan.io.project.file import load_project
-from photoplan.matching.pairs import Guide
-from photoplan.products.tie.inputs import TieImage, chosen_pairs, guide_of, open_images
+from photoplan.matching.features import Guide
+from photoplan.products.tie import TieImage, chosen_pairs, guide_of, open_images
 
 NAMES = ["one", "two", "three"]
 FILM = """format = 1

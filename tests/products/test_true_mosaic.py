@@ -16,8 +16,8 @@ from tools.thinned import some
 from tools.town import House, faces_of
 
 from photoplan.geometry.pose import Pose
-from photoplan.io.geopackage import VectorLayer, write_geopackage
-from photoplan.surfaces.level import LevelSurface
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
+from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.objects import ObjectSurface
 
 GROUND = 100.0

@@ -15,8 +15,8 @@ from tools.small_block import CRS, FOCAL, SIZE, X0, Y0, Z0, Block, make_project,
 from tools.town import House, faces_of
 
 from photoplan.geometry.pose import Pose
-from photoplan.io.geopackage import VectorLayer, write_geopackage
-from photoplan.surfaces.level import LevelSurface
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
+from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.objects import ObjectSurface
 
 GROUND = 100.0

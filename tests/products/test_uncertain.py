@@ -12,24 +12,20 @@ from tools.small_model import CRS, write_small
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses import Brown
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose
 from photoplan.io.project.file import load_project, parse_project
 from photoplan.io.project.model import StatedTerrain
-from photoplan.io.terrain.model_read import ModelReader
-from photoplan.orientation.bundle.block import AdjustSettings
-from photoplan.products.adjust.block import adjust_prepared, map_result, prepare, stated_accuracy
-from photoplan.products.adjust.inputs import read_inputs
-from photoplan.products.adjust.start import started
+from photoplan.io.terrain.model import ModelReader
+from photoplan.orientation.bundle.model import AdjustSettings
+from photoplan.products.adjust.inputs import adjust_prepared, map_result, prepare, read_inputs, started, stated_accuracy
 from photoplan.project.cameras import camera_without_pixels
+from photoplan.project.error_model import ScenesErrors, height_errors, source_errors
 from photoplan.project.ground import ground_of
-from photoplan.project.scene import input_files
-from photoplan.project.scenes import ScenesAddress
-from photoplan.project.uncertain import ScenesErrors, height_errors, source_errors
-from photoplan.surfaces.height_errors import StatedHeightErrors
-from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.project.scene import ScenesAddress, input_files
+from photoplan.surfaces.hybrid import HybridSurface, StatedHeightErrors
 from photoplan.targets.map import MapTarget
 
 

@@ -15,9 +15,9 @@ from tools.command import inside
 from tools.recorded import checked, recorded
 
 from photoplan.errors import UsageError
-from photoplan.products.view.area import AreaRequest, visible_area
 from photoplan.products.view.camera import CameraRequest
 from photoplan.products.view.make import ViewRequest
+from photoplan.products.view.measure import AreaRequest, visible_area
 
 CRS, X0, Y0 = "EPSG:32633", 500_000.0, 5_300_000.0
 #: Eye 20 m above level ground, level view, 30° to both sides.

@@ -19,12 +19,9 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.products.run import Run
 from photoplan.products.view.camera import CameraRequest
-from photoplan.products.view.content import ContentRequest
-from photoplan.products.view.job import LookRequest
+from photoplan.products.view.content import ContentRequest, Letters, Overlay, dashed, placed
 from photoplan.products.view.lines import LinesRequest
-from photoplan.products.view.make import ViewRequest, draw, make_view, plan_view
-from photoplan.products.view.overlay import Letters, Overlay, dashed, placed
-from photoplan.products.view.result import ViewResult
+from photoplan.products.view.make import LookRequest, ViewRequest, ViewResult, draw, make_view, plan_view
 
 STAND = CameraRequest(position=(X0 - 80, Y0 - 60), height=40.0, look_at=(X0 + 20, Y0 + 10), size=(240, 160))
 LOOK = LookRequest((ContentRequest("shade"),), samples=1)

@@ -18,14 +18,12 @@ from photoplan.io.orientation.table import TableFormat
 from photoplan.io.orientation.toml import read as read_toml_orientation
 from photoplan.io.quicklook import write_png
 from photoplan.orientation.skyline import fit_skyline
-from photoplan.products.init.run import InitRequest, init_project
-from photoplan.products.view.camera import CameraRequest, view_camera
-from photoplan.products.view.ground import open_view_ground
-from photoplan.products.view.job import seen_surface
-from photoplan.products.view.make import ViewRequest
-from photoplan.products.view.photo_skyline import PhotoSkylineRequest, doubt, turned
+from photoplan.products.init import InitRequest, init_project
+from photoplan.products.view.camera import CameraRequest, open_view_ground, view_camera
+from photoplan.products.view.make import ViewRequest, seen_surface
+from photoplan.products.view.photo import PhotoSkylineRequest, doubt, turned
 from photoplan.products.view.skyline import Skyline, SkylineRequest, skyline
-from photoplan.surfaces.skyline import skyline_of
+from photoplan.surfaces.seen import skyline_of
 from photoplan.targets.view import FrameBundle
 
 TRUE = CameraRequest(

@@ -16,12 +16,10 @@ from tools.small_block import SIZE, X0, Y0, Block, write_block
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.plan import product
 from photoplan.products.run import Run
-from photoplan.products.view.camera import CameraRequest, view_camera
+from photoplan.products.view.camera import CameraRequest, open_view_ground, view_camera
 from photoplan.products.view.content import ContentRequest, class_colours
-from photoplan.products.view.ground import open_view_ground
-from photoplan.products.view.job import LookRequest, ViewAddress, hazy
-from photoplan.products.view.make import ViewPlan, ViewRequest, make_view, plan_view
-from photoplan.products.view.pick import PickRequest, pick
+from photoplan.products.view.make import LookRequest, ViewAddress, ViewPlan, ViewRequest, hazy, make_view, plan_view
+from photoplan.products.view.measure import PickRequest, pick
 from photoplan.surfaces.seen import best_photos
 
 STAND = CameraRequest(position=(X0 - 80, Y0 - 60), height=40.0, look_at=(X0 + 20, Y0 + 10), size=(60, 40))

@@ -11,9 +11,7 @@ from tools.thinned import some, thinned
 
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
-from photoplan.quality.patterns.bar_curve import bar_curve, coltman_factor, coltman_mtf
-from photoplan.quality.patterns.bars import measure_bars
-from photoplan.quality.patterns.pixels import clipped_pixels
+from photoplan.quality.patterns.bars import bar_curve, clipped_pixels, coltman_factor, coltman_mtf, measure_bars
 
 SIGMA, LEVELS = 0.6, (40.0, 200.0)
 TRANSFER = gauss_box(SIGMA)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.brightness_drift import brightness_drift
+from photoplan.quality.camera.drift import brightness_drift
 
 #: Behr 1989, table 4.1: mean, minimum, maximum, sigma, largest step of both cameras.
 TABLE = {"left": (170.0, 163.8, 176.6, 2.1, 5.3), "right": (181.2, 178.6, 183.7, 2.0, 2.9)}

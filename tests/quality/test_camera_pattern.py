@@ -8,18 +8,21 @@ from scipy import ndimage
 from tools.camera_model import Sensor, gathered
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.blooming import find_blooming
-from photoplan.quality.camera.defects import find_blinking, find_defects, find_lines, log_histogram
-from photoplan.quality.camera.fixed_pattern import (
+from photoplan.quality.camera.dark_signal import (
     LINE_SHARE,
     WHITE_SHARE,
     background,
+    find_blinking,
+    find_defects,
+    find_lines,
     high_pass,
+    log_histogram,
     pattern_variance,
     prnu_percent,
     signed_root,
     spectrogram,
 )
+from photoplan.quality.camera.drift import find_blooming
 
 RUNS = 150
 

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from tools.formed import form_image, form_series
 
-from photoplan.quality.camera.fall_off import fit_fall_off
-from photoplan.quality.camera.fall_off_adjust import FallOffSettings
-from photoplan.quality.camera.gain_control import gain_control
-from photoplan.quality.camera.line_jitter import line_jitter
-from photoplan.quality.camera.plumb_edge import correlate_edge, fit_edge
+from photoplan.quality.camera.fall_off import FallOffSettings, fit_fall_off
+from photoplan.quality.camera.straight_lines import correlate_edge, fit_edge
+from photoplan.quality.camera.video import gain_control, line_jitter
 from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.parts import (
     AutomaticGain,

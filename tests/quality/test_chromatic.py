@@ -6,9 +6,16 @@ from scipy import ndimage
 from tools.formed import ArrayScene, form_image
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.colour.discs import disc_displacements, find_discs
-from photoplan.quality.colour.displacements import edge_displacements, patch_displacements
-from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
+from photoplan.quality.colour import (
+    BandModel,
+    ChromaticModel,
+    Displacements,
+    disc_displacements,
+    edge_displacements,
+    find_discs,
+    fit_band,
+    patch_displacements,
+)
 from photoplan.quality.edges.find import EdgePicture, find_edges
 from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.parts import Falloff, Gain, Lateral, Quantisation, Spread

@@ -10,8 +10,7 @@ from tools.edge_scenes import blocks, half_plane, noisy
 from tools.thinned import some
 
 from photoplan.errors import InputError
-from photoplan.quality.edges.candidates import find_lines, noise_of
-from photoplan.quality.edges.find import EdgePicture, EdgeRegion, EdgeRules, find_edges
+from photoplan.quality.edges.find import EdgePicture, EdgeRegion, EdgeRules, find_edges, find_lines, noise_of
 
 
 def one_edge(angle: float = 8.0, sigma: float = 0.8, snr: float = 50.0, size: tuple[int, int] = (90, 80)) -> np.ndarray:

@@ -10,8 +10,7 @@ from tools.thinned import some
 
 from photoplan.errors import InputError
 from photoplan.quality.edges.groups import combine, field_cell, fit_gaussian, mean_curve, quantiles, sigma_of_interval
-from photoplan.quality.mtf_curve import MtfCurve
-from photoplan.quality.spread import gaussian_modulation
+from photoplan.quality.mtf_curve import MtfCurve, gaussian_modulation
 
 
 class TestCombine:

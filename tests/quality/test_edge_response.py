@@ -10,7 +10,7 @@ import pytest
 from tools.edges import TAILED, edge_image, gaussian, line_spread, modulation, true_fwhm, true_mtf50
 from tools.thinned import some, thinned
 
-from photoplan.quality.edges.model import PixelEdge
+from photoplan.quality.edges.line import PixelEdge
 from photoplan.quality.edges.response import EdgeSettings, measure_edge
 
 SNR = 50.0

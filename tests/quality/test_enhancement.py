@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from tools.edge_scenes import half_plane, noisy
 
 from photoplan.errors import InputError
-from photoplan.quality.edges.enhancement import enhancement_of
+from photoplan.quality.edges.groups import enhancement_of
 from photoplan.quality.edges.response import measure_edge
 
 

@@ -9,8 +9,7 @@ from tools.thinned import some, thinned
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.grid import Window
-from photoplan.quality.camera.fall_off import fit_fall_off
-from photoplan.quality.camera.fall_off_adjust import FallOffSettings
+from photoplan.quality.camera.fall_off import FallOffSettings, fit_fall_off
 from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off, gain_image, surface_terms
 
 SIZE, POINT, FOCAL = (320, 240), (165.0, 118.0), 350.0

@@ -7,8 +7,8 @@ import pytest
 from tools.thinned import thinned
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.approach import fit_approach
-from photoplan.quality.camera.gain_control import compare_transitions, gain_control
+from photoplan.quality.camera.drift import fit_approach
+from photoplan.quality.camera.video import compare_transitions, gain_control
 
 TIMES = np.arange(80) * 0.2
 STEP = 4.0

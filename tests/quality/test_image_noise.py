@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from tools.blurred_scenes import any_edges, taken
 
-from photoplan.quality.restoration.image_noise import BLOCK, block_noise, image_noise
+from photoplan.quality.restoration.design import BLOCK_IMAGE_NOISE as BLOCK
+from photoplan.quality.restoration.design import block_noise, image_noise
 
 
 def test_pure_noise():

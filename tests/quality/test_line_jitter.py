@@ -10,10 +10,8 @@ from tools.camera_series import edge_lines
 from tools.thinned import thinned
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.line_jitter import line_jitter
-from photoplan.quality.camera.line_period import Harmonic, Waves, spectrum
-from photoplan.quality.camera.parallel_edges import above_control, compare_edges
-from photoplan.quality.camera.plumb_edge import correlate_edge, fit_edge
+from photoplan.quality.camera.straight_lines import correlate_edge, fit_edge
+from photoplan.quality.camera.video import Harmonic, Waves, above_control, compare_edges, line_jitter, spectrum
 from photoplan.quality.sensor import jitter_grey, jitter_pixels
 
 LINES = np.arange(400.0)

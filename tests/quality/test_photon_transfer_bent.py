@@ -7,7 +7,7 @@ import pytest
 from tools.camera_model import Sensor, gathered
 from tools.thinned import some, thinned
 
-from photoplan.quality.camera.frame_statistics import Level
+from photoplan.quality.camera.dark_signal import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
 
 PHOTONS = tuple(np.linspace(600, 16000, 16))

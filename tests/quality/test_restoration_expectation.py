@@ -22,10 +22,18 @@ from tools.unsupervised_wiener import unsupervised_wiener
 
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
-from photoplan.quality.restoration.compression import at_frequencies, kept_by_compression
-from photoplan.quality.restoration.design import DesignOptions, Sharpness, design_filter
-from photoplan.quality.restoration.image_noise import block_noise, image_noise
-from photoplan.quality.restoration.regularised import Expectation, curve_transfer, sharpest
+from photoplan.quality.restoration.design import (
+    DesignOptions,
+    Expectation,
+    Sharpness,
+    at_frequencies,
+    block_noise,
+    curve_transfer,
+    design_filter,
+    image_noise,
+    kept_by_compression,
+    sharpest,
+)
 from photoplan.quality.restoration.scene import SceneStatistics, block_spectra, fit_scene, scenes_of
 
 SCENE = SceneStatistics(2.0, 12.0, 2.6)

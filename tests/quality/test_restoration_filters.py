@@ -5,11 +5,18 @@ import pytest
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.quality.restoration.aperture import aperture_filter
-from photoplan.quality.restoration.design import point_spread, radial_filter, separable_filter
-from photoplan.quality.restoration.filters import FilterKernel
-from photoplan.quality.restoration.inverse import BAND_ROWS, band_matrix, condition_of, exact_inverse
-from photoplan.quality.spread import SpreadFunction, gaussian_modulation
+from photoplan.quality.mtf_curve import SpreadFunction, gaussian_modulation
+from photoplan.quality.restoration.design import (
+    BAND_ROWS,
+    aperture_filter,
+    band_matrix,
+    condition_of,
+    exact_inverse,
+    point_spread,
+    radial_filter,
+    separable_filter,
+)
+from photoplan.quality.restoration.restorer import FilterKernel
 
 # Kölbl 2006, figures 4 and 6: the octant's rows from the centre outwards, [distance down][distance right].
 FIGURE_4 = [

@@ -9,10 +9,9 @@ from tools.blurred_scenes import FINE, NOISE, SIZE, any_edges, sharpness, taken,
 from tools.thinned import some
 
 from photoplan.errors import InputError
-from photoplan.quality.restoration.design import DesignOptions, Sharpness, design_filter
-from photoplan.quality.restoration.regularised import curve_transfer
+from photoplan.quality.mtf_curve import SpreadFunction
+from photoplan.quality.restoration.design import DesignOptions, Sharpness, curve_transfer, design_filter
 from photoplan.quality.restoration.scene import SceneStatistics, block_spectra, fit_scene
-from photoplan.quality.spread import SpreadFunction
 
 INSIDE = np.s_[24:-24, 24:-24]
 

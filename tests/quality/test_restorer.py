@@ -9,8 +9,7 @@ from scipy import ndimage
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.quality.linearise import Linearisation
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
-from photoplan.quality.restoration.restorer import Restorer, field_weights
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter, Restorer, field_weights
 
 TYPES = ("uint8", "uint16", "int16", "float32")
 #: Inverse of the spread function 0.02, 0.15, 0.66, 0.15, 0.02 (Kölbl 2006, tab. 1), eleven elements.

@@ -8,13 +8,13 @@ from tools.formed import ArrayScene, form_image
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.products.simulate.form import check_fit
+from photoplan.products.simulate import check_fit
 from photoplan.quality.formation import optics
 from photoplan.quality.formation.kernels import pixel_kernel
 from photoplan.quality.formation.model import ImageModel, model_modulation, model_mtf50, model_transfer
 from photoplan.quality.formation.parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
 from photoplan.quality.formation.scenes import PatternScene, parse_pattern
-from photoplan.quality.spread import GAUSSIAN_WIDTH
+from photoplan.quality.mtf_curve import GAUSSIAN_WIDTH
 
 
 def wave(frequency, size=(256, 8), k=8, phase=0.0):

@@ -10,9 +10,8 @@ from tools.patterns import bars, star, three_bars, usaf_chart
 from tools.thinned import some
 
 from photoplan.errors import InputError
-from photoplan.quality.patterns.pixels import clipped_pixels
-from photoplan.quality.patterns.usaf import UsafRules, measure_usaf
-from photoplan.quality.patterns.usaf_find import usaf_frequency
+from photoplan.quality.patterns.bars import clipped_pixels
+from photoplan.quality.patterns.usaf import UsafRules, measure_usaf, usaf_frequency
 
 SCALE, ORIGIN, SHAPE = 22.3, (230.4, 205.7), (420, 440)
 

@@ -7,7 +7,7 @@ import pytest
 from tools.thinned import thinned
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.camera.warm_up import warm_up
+from photoplan.quality.camera.drift import warm_up
 
 #: Nine hours, every five minutes, five repetitions of 0.02 px in rows and 0.03 px in columns, drift of 0.3 px.
 TIMES = np.arange(0.0, 9 * 3600.0, 300.0)

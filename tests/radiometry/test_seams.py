@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from photoplan.errors import PhotoplanError
-from photoplan.io.result_log import ResultLog
+from photoplan.io.store import ResultLog
 from photoplan.radiometry import seams
 from photoplan.radiometry.seams import SeamParts, _Level, standing_out
 from photoplan.radiometry.shown import SeamLayer, Shown, features_of

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from tools.overlaps import IMAGE, PLACES, POWERS, block_of
 
-from photoplan.radiometry import adjust
+from photoplan.radiometry import balance as adjust
 from photoplan.radiometry.balance import balanced, even_images, pairs_of, parts_of, shoulder
-from photoplan.radiometry.cells import LEVELS, PIXELS, SIDE, Cells, cells_of
-from photoplan.radiometry.ratio import factors
+from photoplan.radiometry.equations import LEVELS, PIXELS, SIDE, Cells, cells_of, factors
 from photoplan.radiometry.tone import surface
 
 LIMITS = (0.0, 255.0)

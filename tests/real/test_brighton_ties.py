@@ -15,9 +15,9 @@ from tools.real_projects import drone_project
 from tools.ties import reprojection
 
 from photoplan.cameras.observed import ImagePoints
-from photoplan.io.image_points import read_image_points
+from photoplan.io.points import read_image_points
 from photoplan.io.project.file import load_project
-from photoplan.products.tie.run import TieReport, TieRequest, find_ties
+from photoplan.products.tie import TieReport, TieRequest, find_ties
 from photoplan.project.scene import open_scene
 
 IMAGES = tuple(f"DJI_00{k}" for k in (25, 26, 27, 32, 33))

@@ -11,12 +11,11 @@ from tools.thinned import some
 
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose
-from photoplan.io.objects.file import read_objects
+from photoplan.io.objects import read_objects
 from photoplan.plan.ground import TileGround
-from photoplan.plan.visibility import hidden_pixels
-from photoplan.surfaces.faces import Faces
-from photoplan.surfaces.level import LevelSurface
-from photoplan.surfaces.objects import ObjectSurface
+from photoplan.plan.sources import hidden_pixels
+from photoplan.surfaces.base import LevelSurface
+from photoplan.surfaces.objects import Faces, ObjectSurface
 from photoplan.targets.map import MapTarget
 
 

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from tools.command import Here
 
-from photoplan.io.series.model import StatisticsEntry
-from photoplan.io.series.statistics import read_statistics
-from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet
+from photoplan.io.series import StatisticsEntry, read_statistics
+from photoplan.quality.camera.photon_transfer import EmvaPoints, EmvaSheet, emva_sheet
 
 #: By `emva1288` 0.6.3.
 ORACLE = {

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from photoplan.quality.colour.discs import disc_displacements, find_discs
-from photoplan.quality.colour.model import ChromaticModel, fit_band
+from photoplan.quality.colour import ChromaticModel, disc_displacements, find_discs, fit_band
 
 SIZE = (408, 344)
 PLANES = {"G": (0, 3), "B": (1,), "R": (2,)}

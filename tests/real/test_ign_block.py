@@ -14,8 +14,8 @@ from tools.command import peak_of
 from tools.ign_block import Published, ign_project, published
 from tools.kept import kept
 
-from photoplan.geometry.rotation import rotation_opk
-from photoplan.io.image_points import read_image_points
+from photoplan.geometry.pose import rotation_opk
+from photoplan.io.points import read_image_points
 from photoplan.io.project.file import load_project
 
 GIB = 2**30

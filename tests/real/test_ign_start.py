@@ -10,11 +10,9 @@ import pytest
 from tools.ign_block import ign_project, published
 from tools.photos import turned_by
 
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.geometry.pose import Pose, rotation_from_angles
 from photoplan.io.project.file import load_project
-from photoplan.products.adjust.inputs import read_inputs
-from photoplan.products.adjust.start import started
+from photoplan.products.adjust.inputs import read_inputs, started
 
 
 @pytest.mark.slow

@@ -20,10 +20,10 @@ from tools.tin_volume import exact_volume, read_landxml_tin, tin_heights, tin_ou
 
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import ReadOptions
-from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, Tin
-from photoplan.surfaces.mesh.faces import constrained_faces
+from photoplan.surfaces.mesh import constrained_faces
+from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, Tin
 from photoplan.terrain.build import Built, build_terrain, plan_build
-from photoplan.terrain.clean.run import clean
+from photoplan.terrain.clean import clean
 from photoplan.terrain.settings import BuildSettings
 
 CELL = 0.25

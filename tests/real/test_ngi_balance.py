@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from tools.real_projects import dmc_project
 
 from photoplan.io.project.file import load_project
-from photoplan.products.balance.reference import open_reference
-from photoplan.products.balance.run import BalanceRequest, balance_project
+from photoplan.products.balance import BalanceRequest, balance_project, open_reference
 from photoplan.products.orthophoto.plan import plan_orthophotos, render
 
 R = 20.0

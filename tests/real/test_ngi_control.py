@@ -9,8 +9,8 @@ import pytest
 from tools.proposed import residuals, spoilt
 from tools.real_projects import dmc_project
 
-from photoplan.io.ground_points import read_ground_points
-from photoplan.products.control.run import ControlRequest, propose_control
+from photoplan.io.points import read_ground_points
+from photoplan.products.control import ControlRequest, propose_control
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,9 @@ from rasterio.transform import RPCTransformer
 from scipy.ndimage import map_coordinates, spline_filter
 
 from photoplan.cameras.base import project
-from photoplan.cameras.plane import Affine2D
-from photoplan.cameras.rpc import RpcCamera
-from photoplan.cameras.rpc_fit import fitted_functions
-from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.cameras.fiducials import Affine2D
+from photoplan.cameras.rpc import RpcCamera, fitted_functions
+from photoplan.geometry.local import GeodeticGround
 from photoplan.io.camera.rpc.file import read_rpc
 
 

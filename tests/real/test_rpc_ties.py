@@ -15,7 +15,7 @@ from real.test_rpc_of_satellites import offsets, spread
 from photoplan.cameras.base import project
 from photoplan.io.project.file import load_project
 from photoplan.products.adjust.run import AdjustRequest, adjust_project
-from photoplan.products.tie.run import TieRequest, find_ties
+from photoplan.products.tie import TieRequest, find_ties
 from photoplan.project.cameras import camera_without_pixels
 
 pytest.importorskip("cv2")

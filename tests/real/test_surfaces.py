@@ -16,7 +16,7 @@ from tools.command import inside
 from tools.real_projects import dmc_project
 
 from photoplan.geometry.frames import WallFrame
-from photoplan.geometry.rotation import angles_from_rotation
+from photoplan.geometry.pose import angles_from_rotation
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.slow

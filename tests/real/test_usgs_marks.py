@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from tools.thinned import some
 
-from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
+from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.geometry.grid import Window
 from photoplan.io.mark_model import Mark
-from photoplan.orientation.marks.alone import AloneMark, find_mark
+from photoplan.orientation.marks.single import AloneMark, find_mark
 from photoplan.project.camera_marks import ScanImage, mark_pattern
 
 HERE = Path(__file__).resolve().parent / "usgs_marks"

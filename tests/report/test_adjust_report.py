@@ -9,10 +9,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from photoplan.orientation.bundle.block import Group
-from photoplan.orientation.check_points import check_accuracy
-from photoplan.products.adjust.cameras import Calibrated
-from photoplan.products.adjust.figures import (
+from photoplan.orientation.bundle.model import Group
+from photoplan.orientation.intersection import check_accuracy
+from photoplan.products.adjust.findings import (
     AdjustFigures,
     CorrectionFigures,
     GroundFigures,
@@ -21,9 +20,8 @@ from photoplan.products.adjust.figures import (
     ResidualField,
     StripFigures,
 )
-from photoplan.products.adjust.geometry import FoundParameter
-from photoplan.report.adjust.page import adjust_page
-from photoplan.report.adjust.plots import draw_control
+from photoplan.products.adjust.sensors import Calibrated, FoundParameter
+from photoplan.report.adjust import adjust_page, draw_control
 
 pytest.importorskip("matplotlib")
 

@@ -13,14 +13,13 @@ from tools.sketched import drawn
 from photoplan.errors import ResourceError, UsageError
 from photoplan.kernels.collocation import correlation
 from photoplan.products.dtm.build import BuildReport
-from photoplan.report.dtm import covariance as dtm_covariance
-from photoplan.report.dtm import samples
-from photoplan.report.dtm.page import build_page, open_build_report
-from photoplan.report.dtm.plots import draw_covariance, draw_filter_histograms, draw_heights
+from photoplan.report import dtm as dtm_covariance
+from photoplan.report import dtm as samples
+from photoplan.report.dtm import build_page, draw_covariance, draw_filter_histograms, draw_heights, open_build_report
 from photoplan.report.page import ReportFile, text
-from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
+from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.terrain.build import build_terrain, plan_build
-from photoplan.terrain.clean.run import Finding, clean
+from photoplan.terrain.clean import Finding, clean
 from photoplan.terrain.settings import FAMILIES, BuildSettings
 
 pytest.importorskip("matplotlib")

@@ -12,12 +12,11 @@ from tools.command import peak_of
 from tools.real_projects import drone_project
 from tools.twin import strict_positions, strict_scales, twin_resample
 
-from photoplan.engine.base import Source
-from photoplan.engine.execute import render
+from photoplan.engine.execute import Source, render
 from photoplan.geometry.grid import Window
 from photoplan.io.project.file import load_project
-from photoplan.plan.tiles import Tile
-from photoplan.products.init.run import InitRequest, init_project
+from photoplan.plan.footprint import Tile
+from photoplan.products.init import InitRequest, init_project
 from photoplan.products.orthophoto.plan import plan_orthophotos
 from photoplan.project.scene import open_scene
 

@@ -14,10 +14,8 @@ from tools.small_block import CRS, X0, Y0
 
 from photoplan.geometry.grid import Window
 from photoplan.io.project.file import load_project
-from photoplan.plan.tiles import Tile
-from photoplan.products.surface.job import SurfaceJob
-from photoplan.products.surface.plan import plan_surface
-from photoplan.products.surface.settings import SurfaceSettings
+from photoplan.plan.footprint import Tile
+from photoplan.products.surface.plan import SurfaceJob, SurfaceSettings, plan_surface
 
 pytestmark = pytest.mark.slow
 BOUNDS = (X0 - 30, Y0 - 45, X0 + 30, Y0 + 45)

@@ -35,37 +35,33 @@ from tools.small_model import write_small
 from photoplan.codec import NotData, decode, encode
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.balance_file import read_balance_file
 from photoplan.io.camera.csm_frame import read_frame
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.line.file import read_line
 from photoplan.io.camera.rpc.file import read_rpc
-from photoplan.io.chromatic_file import read_chromatic
-from photoplan.io.drawn_features import read_drawn_features
-from photoplan.io.fall_off_file import read_fall_off_entry
-from photoplan.io.filter_file import read_filter_file
-from photoplan.io.gcp_list import read_gcp_list
-from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_metadata import read_image_metadata
-from photoplan.io.image_points import read_image_points
-from photoplan.io.mtf_file import read_mtf_table
-from photoplan.io.objects.file import read_objects
-from photoplan.io.observed_positions import read_observed_positions
+from photoplan.io.objects import read_objects
 from photoplan.io.orientation.file import read_orientation_block, write_orientation
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
-from photoplan.io.polygons import read_features, write_features
+from photoplan.io.points import read_gcp_list, read_ground_points, read_image_points, read_observed_positions
 from photoplan.io.project.file import load_project
-from photoplan.io.regions import read_regions
-from photoplan.io.result_log import ResultLog
-from photoplan.io.sensor_file import read_sensor
-from photoplan.io.series.file import read_series
+from photoplan.io.quality_files import (
+    read_balance_file,
+    read_chromatic,
+    read_fall_off_entry,
+    read_filter_file,
+    read_mtf_table,
+    read_sensor,
+)
+from photoplan.io.series import read_series
+from photoplan.io.store import ResultLog, TileLog
 from photoplan.io.terrain.files import read_measured
-from photoplan.io.terrain.model_read import ModelReader
+from photoplan.io.terrain.model import ModelReader
 from photoplan.io.terrain.options import ReadOptions, read_code_table
-from photoplan.io.tile_log import TileLog
+from photoplan.io.vector_layer import read_drawn_features, read_features, read_regions, write_features
 from photoplan.products.describe import describe
-from photoplan.project.open_terrain import open_terrain
+from photoplan.project.ground import open_terrain
 
 pytestmark = [
     pytest.mark.slow,

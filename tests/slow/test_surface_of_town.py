@@ -14,7 +14,7 @@ from tools.rendered_block import Flight, write_project
 from tools.small_block import CRS, X0, Y0
 from tools.town import House
 
-from photoplan.io.geopackage import VectorLayer, write_geopackage
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
 
 pytestmark = pytest.mark.slow
 GROUND, SIDE, POST = 100.0, 48.0, 0.75

@@ -10,7 +10,7 @@ import pytest
 from real.test_m3_terrain import Survey, compared, folder, survey  # noqa: F401
 from tools.command import peak_of
 
-from photoplan.io.terrain.model_read import ModelReader
+from photoplan.io.terrain.model import ModelReader
 from photoplan.surfaces.hybrid import HybridSurface
 
 pytestmark = pytest.mark.slow

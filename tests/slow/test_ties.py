@@ -9,9 +9,9 @@ import pytest
 from tools.real_projects import drone_project
 from tools.ties import reprojection
 
-from photoplan.io.image_points import read_image_points
+from photoplan.io.points import read_image_points
 from photoplan.io.project.file import load_project
-from photoplan.products.tie.run import TieRequest, find_ties
+from photoplan.products.tie import TieRequest, find_ties
 from photoplan.project.scene import open_scene
 
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from photoplan.surfaces.rays import STRAIGHT, chords
+from photoplan.surfaces.base import STRAIGHT, chords
 
 #: Curvature of the earth less that of a line of sight, per metre.
 BEND = -6.8e-8

@@ -9,7 +9,7 @@ from tools.pinhole import Pinhole
 
 from photoplan.cameras.base import project
 from photoplan.geometry.pose import Pose
-from photoplan.surfaces.intersect import intersect
+from photoplan.surfaces.shifted import intersect
 from photoplan.surfaces.units import UnitLayout
 
 LAYOUT = UnitLayout(0.0, 40.0, 20.0, 2, 2)

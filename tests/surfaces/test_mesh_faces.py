@@ -14,9 +14,7 @@ from tools.thinned import examples
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.mesh.faces import build_faces
-from photoplan.surfaces.mesh.lines import on_grid
-from photoplan.surfaces.mesh.thin import thin
+from photoplan.surfaces.mesh import build_faces, on_grid, thin
 from photoplan.surfaces.units import UnitLayout
 
 LAYOUT = UnitLayout(500_000.3, 5_300_000.7, 12.34, 2, 2)

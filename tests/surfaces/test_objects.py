@@ -11,9 +11,8 @@ from tools.town import DECK, faces_of, houses, town_faces
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.surfaces.faces import Faces
-from photoplan.surfaces.level import LevelSurface
-from photoplan.surfaces.objects import ObjectSurface, painted_surface
+from photoplan.surfaces.base import LevelSurface
+from photoplan.surfaces.objects import Faces, ObjectSurface, painted_surface
 from photoplan.targets.map import MapTarget
 
 FAR = np.array([500_000.0, 5_400_000.0, 0.0])

@@ -16,10 +16,9 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.surfaces.intersect import intersect
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.raster import RasterSurface
-from photoplan.surfaces.shifted import ShiftedSurface
+from photoplan.surfaces.shifted import ShiftedSurface, intersect
 from photoplan.targets.map import MapTarget
 
 CRS = "EPSG:32633"

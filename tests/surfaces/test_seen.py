@@ -8,23 +8,20 @@ from tools.function_surface import raster_surface
 from tools.ray_twin import over_patches, over_triangles
 from tools.thinned import some
 
+from photoplan.cameras.curvature import EarthBend, Exaggeration
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.risen import EarthBend, Exaggeration
+from photoplan.cameras.lenses import Brown, NoLens
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose
 from photoplan.kernels.jit import COMPILED
-from photoplan.surfaces.faces import Faces
-from photoplan.surfaces.level import LevelSurface
-from photoplan.surfaces.objects import ObjectSurface
+from photoplan.surfaces.base import LevelSurface
+from photoplan.surfaces.objects import Faces, ObjectSurface
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.seen import SeenSurface, ground_size
 from photoplan.targets.map import MapTarget
-from photoplan.targets.panorama import Panorama
-from photoplan.targets.view import FrameBundle, ViewTarget
+from photoplan.targets.view import FrameBundle, Panorama, ViewTarget
 
 LEFT, TOP, MESH, SIDE = 600_000.0, 5_200_000.0, 25.0, 24
 SIZE = (60, 40) if COMPILED else (8, 6)

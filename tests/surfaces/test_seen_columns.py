@@ -10,20 +10,17 @@ from tools.function_surface import ArrayGrid
 from tools.ray_twin import over_patches
 from tools.thinned import examples, some
 
+from photoplan.cameras.curvature import EarthBend, Exaggeration
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.risen import EarthBend, Exaggeration
+from photoplan.cameras.lenses import Brown, NoLens
 from photoplan.geometry.grid import Window
 from photoplan.geometry.local import LocalFrame
 from photoplan.geometry.pose import Pose
 from photoplan.kernels.jit import COMPILED
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.seen import Seen, SeenSurface
-from photoplan.targets.fan import fan_of
-from photoplan.targets.panorama import Panorama
-from photoplan.targets.view import FrameBundle, ViewTarget
+from photoplan.targets.view import FrameBundle, Panorama, ViewTarget, fan_of
 
 MESH = 10.0
 SIDE, SIZE = (50, (64, 40)) if COMPILED else (20, (9, 7))

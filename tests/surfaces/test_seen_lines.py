@@ -9,13 +9,11 @@ import pytest
 from surfaces.test_seen import BOUNDS, MIDDLE, hills, looking, near
 from tools.function_surface import raster_surface
 
-from photoplan.cameras.risen import EarthBend
+from photoplan.cameras.curvature import EarthBend
 from photoplan.kernels.jit import COMPILED
 from photoplan.kernels.strokes import draw_strokes
-from photoplan.surfaces.seen import SeenSurface
-from photoplan.surfaces.seen_lines import Lines, LinesOfSight, SeenLines
-from photoplan.targets.panorama import Panorama
-from photoplan.targets.view import FrameBundle, ViewTarget
+from photoplan.surfaces.seen import Lines, LinesOfSight, SeenLines, SeenSurface
+from photoplan.targets.view import FrameBundle, Panorama, ViewTarget
 
 pytestmark = pytest.mark.skipif(not COMPILED, reason="thousands of rays")
 

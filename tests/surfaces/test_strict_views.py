@@ -9,9 +9,8 @@ import pytest
 import rasterio
 
 from photoplan.geometry.grid import Window
-from photoplan.products.view.camera import CameraRequest, view_camera
-from photoplan.products.view.ground import open_view_ground
-from photoplan.products.view.job import seen_surface
+from photoplan.products.view.camera import CameraRequest, open_view_ground, view_camera
+from photoplan.products.view.make import seen_surface
 from photoplan.targets.view import ViewTarget
 
 CRS = "EPSG:31287"

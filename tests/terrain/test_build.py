@@ -12,7 +12,7 @@ from tools.thinned import some
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.products.dtm.build import describe_plan
-from photoplan.surfaces.measured import MeasuredTerrain
+from photoplan.surfaces.units import MeasuredTerrain
 from photoplan.terrain.build import Built, plan_build
 from photoplan.terrain.settings import BuildSettings
 

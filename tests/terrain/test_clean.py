@@ -14,9 +14,9 @@ from tools.effort import at_most
 from tools.thinned import examples
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
-from photoplan.surfaces.mesh.faces import constrained_faces
-from photoplan.terrain.clean.run import Finding, clean, domain_of
+from photoplan.surfaces.mesh import constrained_faces
+from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, PointGroup
+from photoplan.terrain.clean import Finding, clean, domain_of
 
 EAST, NORTH = 21_530_000.0, 6_782_000.0
 SHIFT = np.array([EAST, NORTH, 0.0])
@@ -328,7 +328,7 @@ def test_fault_19_any_lines_can_be_triangulated_after_cleaning(case: tuple[Measu
 
 
 def test_work_that_does_not_end_is_ended_by_joining_vertices(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photoplan.terrain.clean.nodes.ROUNDS", 1)
+    monkeypatch.setattr("photoplan.terrain.clean.ROUNDS", 1)
     rng = np.random.default_rng(7)
     lines = [line(np.column_stack([rng.uniform(0, 0.02, (3, 2)), np.zeros(3)]), name=str(i)) for i in range(40)]
     out, found = cleaned(*lines)

@@ -12,11 +12,10 @@ from tools.thinned import some
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.surfaces.mesh.faces import constrained_faces
+from photoplan.surfaces.mesh import constrained_faces
 from photoplan.surfaces.units import MeshFaces
-from photoplan.terrain.contours import run as contours
-from photoplan.terrain.contours.parts import SurfacePart, grid_parts
-from photoplan.terrain.contours.run import ContourLine, ContourOptions, trace_contours
+from photoplan.terrain import contours as contours
+from photoplan.terrain.contours import ContourLine, ContourOptions, SurfacePart, grid_parts, trace_contours
 
 CORNER = (512_000.0, 5_200_000.0)
 

@@ -11,9 +11,7 @@ import shapely.affinity
 from tools.hybrid_models import model, random_lines
 
 from photoplan.surfaces.units import UnitLayout
-from photoplan.terrain.contours.labels import Labeller, decimals_of
-from photoplan.terrain.contours.parts import unit_parts
-from photoplan.terrain.contours.run import ContourLine, ContourOptions, trace_contours
+from photoplan.terrain.contours import ContourLine, ContourOptions, Labeller, decimals_of, trace_contours, unit_parts
 
 LAYOUT = UnitLayout(512_000.0, 5_200_060.0, 20.0, 3, 3)
 WIDTHS = np.array([[4, 8, 4], [8, 16, 8], [4, 4, 8]])

@@ -13,11 +13,11 @@ from tools.random_field import random_field
 from tools.rough_terrain import dunes, sampled
 from tools.thinned import some, thinned
 
-from photoplan.surfaces.measured import MeasuredLine
+from photoplan.surfaces.units import MeasuredLine
 from photoplan.terrain.build import Built, plan_build
 from photoplan.terrain.covariance import Covariance, Neighbours, estimate_all
 from photoplan.terrain.fit import _members, unit_of
-from photoplan.terrain.leaves import quadtree
+from photoplan.terrain.observations import quadtree
 from photoplan.terrain.settings import FAMILIES, BuildSettings
 
 STEP = 0.2

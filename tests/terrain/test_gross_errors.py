@@ -18,8 +18,7 @@ from tools.rough_terrain import Ground, bench_edges, benches, dunes, fractal, ri
 from tools.thinned import some
 
 from photoplan.terrain.build import plan_build
-from photoplan.terrain.fit import TerrainFit
-from photoplan.terrain.screen import Neighbourhoods, Screened, screen
+from photoplan.terrain.fit import Neighbourhoods, Screened, TerrainFit, screen
 from photoplan.terrain.settings import BuildSettings
 
 SIDE, NOISE = 60.0, 0.1

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tools.build_terrain import built, directly, line, scattered, terrain
 from tools.rough_terrain import Ground, bench_edges, benches, fractal, sampled
 
-from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain
+from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain
 from photoplan.terrain.build import Built
 
 SIDE = 60.0

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photoplan.surfaces.units import UnitLayout
-from photoplan.terrain.leaves import CAPACITY, Leaves, quadtree
+from photoplan.terrain.observations import CAPACITY, Leaves, quadtree
 
 LAYOUT = UnitLayout(-20.0, 64.0, 32.0, 3, 2)
 

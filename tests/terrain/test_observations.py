@@ -9,7 +9,7 @@ import pytest
 from tools.build_terrain import line, scattered, terrain
 
 from photoplan.errors import GeometryError
-from photoplan.surfaces.measured import MeasuredTerrain, PointGroup
+from photoplan.surfaces.units import MeasuredTerrain, PointGroup
 from photoplan.terrain.observations import Observations, observe, spacing_of
 from photoplan.terrain.settings import SHARE, BuildSettings
 

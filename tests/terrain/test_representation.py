@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tools.build_terrain import built, line, scattered, surface_of, terrain
 
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.representation import representation
+from photoplan.surfaces.units import representation
 from photoplan.terrain.build import Built
 from photoplan.terrain.observations import observe
 from photoplan.terrain.settings import BuildSettings

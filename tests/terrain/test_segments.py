@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from photoplan.io.terrain.files import read_measured
-from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
-from photoplan.terrain.clean.run import HEIGHT_TOLERANCE, TOLERANCE, Finding, clean
-from photoplan.terrain.clean.segments import joined_segments
+from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, PointGroup
+from photoplan.terrain.clean import HEIGHT_TOLERANCE, TOLERANCE, Finding, clean, joined_segments
 
 CORNERS = PointGroup("p", "mass", np.array([[-99.0, -99, 0], [99, -99, 0], [0, 99, 0]]), np.arange(1, 4))
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from photoplan.engine.steps import steps
+from photoplan.engine.run import steps
 from photoplan.errors import InputError, UsageError
 from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights
 

@@ -14,8 +14,8 @@ from tools.tin_volume import exact_volume, faces_near, read_landxml_tin, tin_hei
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid
-from photoplan.surfaces.level import LevelSurface
-from photoplan.surfaces.measured import Tin
+from photoplan.surfaces.base import LevelSurface
+from photoplan.surfaces.units import Tin
 from photoplan.terrain.volume import VolumeSettings, cover, volume_between
 
 X0, Y0 = 456_000.0, 5_340_000.0

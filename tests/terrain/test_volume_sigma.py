@@ -11,7 +11,7 @@ from tools.function_surface import FunctionSurface
 from tools.thinned import some
 
 from photoplan.errors import UsageError
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface
 from photoplan.terrain.volume import ErrorModel, volume_sigma
 
 FLAT = LevelSurface(0.0)

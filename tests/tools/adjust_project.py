@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.base import project
 from photoplan.cameras.build import oriented_camera
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation, rotation_from_angles
-from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.model import Project
-from photoplan.io.project.write import toml_value
+from photoplan.geometry.pose import ANGLE_UNITS, Pose, angles_from_rotation, rotation_from_angles
+from photoplan.io.project.file import toml_value
+from photoplan.io.project.model import Project, interior_of, lens_of
 
 #: Far from the central meridian, so that convergence and scale of the map are large.
 CRS = "EPSG:25832"

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.grid import MapGrid
-from photoplan.plan.compile import AnchorRule
+from photoplan.plan.anchors import AnchorRule
+from photoplan.plan.footprint import Tiles
 from photoplan.plan.product import ProductPlan
-from photoplan.plan.tiles import Tiles
 from photoplan.targets.map import MapTarget
 
 

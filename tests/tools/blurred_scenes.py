@@ -3,9 +3,8 @@
 import numpy as np
 from scipy.special import ndtr
 
-from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.mtf_curve import MtfCurve, SpreadFunction
 from photoplan.quality.restoration.design import Sharpness
-from photoplan.quality.spread import SpreadFunction
 
 FINE = 8
 SIZE = 256

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.line import LineCamera
+from photoplan.cameras.pushbroom import LineCamera
 from photoplan.geometry.local import Ellipsoid
 from photoplan.io.camera.line.model import StatedLine
 

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.engine.steps import steps
+from photoplan.engine.run import steps
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
-from photoplan.surfaces.units import MemoryUnits
+from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, MemoryUnits, PointGroup
 from photoplan.terrain.build import Built, build_terrain, plan_build
 from photoplan.terrain.predict import heights_at
 from photoplan.terrain.settings import BuildSettings

@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import project as project_points
-from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.geometry.pose import rotation_from_angles
 from photoplan.io.project.file import load_project
 from photoplan.project.scene import open_scene
 

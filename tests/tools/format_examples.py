@@ -18,8 +18,7 @@ from photoplan.io.camera.model import BrownLens, IdealLens, OpenCVFisheyeLens, O
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.file import read_orientation_block, write_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
-from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.posed import Image
+from photoplan.io.project.model import Image, interior_of, lens_of
 
 LENSES: dict[str, Any] = {
     "none": IdealLens(),

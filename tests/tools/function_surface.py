@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photoplan.surfaces.lattice import Lattice
+from photoplan.surfaces.base import Hits, Lattice
 from photoplan.surfaces.raster import RasterSurface
-from photoplan.surfaces.rays import Hits
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.mesh.faces import build_faces
-from photoplan.surfaces.mesh.lines import on_grid
+from photoplan.surfaces.mesh import build_faces, on_grid
 from photoplan.surfaces.units import LineElement, MemoryUnits, Unit, UnitLayout
 
 Height = Callable[[Any, Any], Any]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pyproj import Transformer
 
 from photoplan.geometry.local import LocalFrame
-from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
+from photoplan.geometry.pose import angles_from_rotation, rotation_from_angles
 
 __all__ = ["CRS", "Published", "ign_project", "published"]
 

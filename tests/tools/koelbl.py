@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from photoplan.adjustment.linear import solve
+from photoplan.adjustment.least_squares import solve
 from photoplan.errors import InputError
-from photoplan.quality.spread import SpreadFunction
+from photoplan.quality.mtf_curve import SpreadFunction
 
 
 @dataclass(frozen=True, eq=False)

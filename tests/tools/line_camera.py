@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.geometry.breaks import Breaks
+from photoplan.geometry.grid import Breaks
 
 _ITERATIONS = 30
 

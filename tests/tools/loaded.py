@@ -4,8 +4,7 @@ import importlib
 
 from tools.command import verbs
 
-for name in ("orthophoto.execution", "restore.run", "simulate.run", "tie.run", "dtm.build", "dtm.export", "dtm.flow",
-             "dtm.shading", "dtm.visible", "dtm.volume"):  # fmt: skip
+for name in ("orthophoto.execution", "restore", "simulate", "tie", "dtm.build", "dtm.rasters", "dtm.analyses"):
     importlib.import_module(f"photoplan.products.{name}")
 importlib.import_module("photoplan.project.objects")
 verbs()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from photoplan.cameras.mark_pattern import MarkPart, MarkPattern
+from photoplan.cameras.fiducials import MarkPart, MarkPattern
 from photoplan.geometry.grid import Window
 
 __all__ = ["CORNERS", "ArrayScan", "Simulated", "ring_cross_pattern", "ring_cross_tone", "simulate"]

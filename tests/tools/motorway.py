@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.io.geopackage import VectorLayer, write_geopackage
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
 from tools.command import inside
 from tools.rendered_block import Flight, write_project
 

@@ -10,8 +10,7 @@ from photoplan.geometry.pose import Pose
 from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.table import OrientationTable, OrientedImage
-from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.posed import Image
+from photoplan.io.project.model import Image, interior_of, lens_of
 
 CAMERA = FrameEntry(
     size=(13824, 7680), camera_constant_mm=120.01, pixel_size_um=12.0, principal_point_mm=(0.024, -0.036)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from photoplan.radiometry.adjust import AdjustedBand
-from photoplan.radiometry.cells import Cells, cells_of
+from photoplan.radiometry.balance import AdjustedBand
+from photoplan.radiometry.equations import Cells, cells_of
 from photoplan.radiometry.tone import Tone, powers_of, surface
 
 #: Pixels of the map along the sides of an image, and from one to the next: 62 % overlap in both directions.

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from photoplan.quality.patterns.usaf_find import usaf_layout
+from photoplan.quality.patterns.usaf import usaf_layout
 
 
 def gauss_box(sigma):

@@ -8,11 +8,9 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Camera, project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.resection.adjust import MeasuredPoints
+from photoplan.cameras.lenses import Lens, NoLens
+from photoplan.geometry.pose import Pose, rotation_opk
+from photoplan.orientation.resection import MeasuredPoints
 
 #: A wide-angle aerial camera: 153 mm, 230 mm format scanned with 20 µm.
 AERIAL = Interior.metric((11500, 11500), 153.0, 0.02)

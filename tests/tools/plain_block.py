@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.fiducials import Affine2D
+from photoplan.cameras.lenses import NoLens
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedPositions
-from photoplan.cameras.plane import Affine2D
 from photoplan.geometry.pose import Pose
-from photoplan.orientation.bundle.block import Block, BlockCamera, BlockImage
+from photoplan.orientation.bundle.model import Block, BlockCamera, BlockImage
 
 FOCAL, SIZE = 3600.0, (4000, 3000)
 

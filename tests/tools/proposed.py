@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import project as into_image
-from photoplan.io.ground_points import read_ground_points
-from photoplan.io.image_points import read_image_points
+from photoplan.io.points import read_ground_points, read_image_points
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.project.scene import open_scene

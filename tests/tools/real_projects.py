@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from photoplan.products.init.run import InitRequest, init_project
+from photoplan.products.init import InitRequest, init_project
 
 __all__ = ["dmc_project", "drone_project"]
 

@@ -11,8 +11,8 @@ import shapely
 from numpy.typing import NDArray
 from rasterio.transform import from_origin
 
-from photoplan.io.geopackage import VectorLayer, write_geopackage
-from photoplan.io.objects.file import read_objects
+from photoplan.io.objects import read_objects
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
 from tools.rendered_block import Flight, write_project
 
 #: Sides of a lot that a house of Zurich gets, metres, and how many there are in a row.

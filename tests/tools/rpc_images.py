@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from photoplan.cameras.rpc import RationalFunctions, RpcCamera
-from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.geometry.local import GeodeticGround
 
 CRS = "EPSG:32633"
 #: Of the whole image, pixels of about 5 m.

@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 
 from photoplan.geometry.grid import Window
-from photoplan.products.mtf import measure
-from photoplan.products.mtf.image import LightImage
-from photoplan.products.mtf.search import FoundEdges, tiles_of
+from photoplan.products.mtf import edges as measure
+from photoplan.products.mtf.edges import FoundEdges, LightImage, tiles_of
 from photoplan.quality.edges.find import EdgeRules
 
 

@@ -9,11 +9,10 @@ import numpy as np
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses import Brown
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk, small_rotations
-from photoplan.orientation.bundle.block import Block, BlockCamera, BlockImage
+from photoplan.geometry.pose import Pose, rotation_opk, small_rotations
+from photoplan.orientation.bundle.model import Block, BlockCamera, BlockImage
 
 SIZE = (4000, 3000)
 FOCAL = 3600.0

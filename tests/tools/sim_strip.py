@@ -9,20 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import Camera, project
-from photoplan.cameras.correctable import Correctable
-from photoplan.cameras.line import LineCamera
-from photoplan.cameras.line_correctable import CorrectableLine, TrackPriors
+from photoplan.cameras.correctable import Correctable, CorrectableLine, CorrectableRpc, TrackPriors
 from photoplan.cameras.line_correction import TURNED, LineCorrection
-from photoplan.cameras.line_look import LineLook
-from photoplan.cameras.line_track import LineTrack
 from photoplan.cameras.observed import GroundPoints, ImagePoints
+from photoplan.cameras.pushbroom import LineCamera
+from photoplan.cameras.pushbroom_rays import LineLook, LineTrack
 from photoplan.cameras.rpc import RpcCamera
-from photoplan.cameras.rpc_correctable import CorrectableRpc
-from photoplan.geometry.body import EARTH_RADII, BodyGround
-from photoplan.geometry.geodetic import GeodeticGround
-from photoplan.geometry.motion import between, continuous, cubic, quaternions
-from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.orientation.bundle.block import Block, BlockProjection
+from photoplan.geometry.local import EARTH_RADII, BodyGround, GeodeticGround
+from photoplan.geometry.pose import between, continuous, cubic, quaternions, rotation_from_angles
+from photoplan.orientation.bundle.model import Block, BlockProjection
 from tools.rpc_images import functions
 
 CRS = "EPSG:32633"

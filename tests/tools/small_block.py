@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rasterio.transform import from_origin
 from scipy.ndimage import gaussian_filter
 
-from photoplan.products.init.run import InitRequest, init_project
+from photoplan.products.init import InitRequest, init_project
 
 SIZE = (200, 150)
 """Width and height of an image, pixels."""

@@ -12,10 +12,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from photoplan.io.terrain.model_read import ModelReader
-from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures
+from photoplan.io.terrain.model import GrossError, ModelHeader, ModelReader, empty_figures
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
-from photoplan.surfaces.mesh.faces import build_faces
+from photoplan.surfaces.mesh import build_faces
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
 CRS = "EPSG:32633"

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from photoplan.cameras.frame import FrameCamera
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import small_rotations
+from photoplan.geometry.pose import Pose, small_rotations
 from photoplan.plan.accuracy import IndependentError, SourceErrors
 
 _STEP = 1 / 16

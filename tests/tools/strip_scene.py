@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from photoplan.cameras.rpc_fit import fit_rpc
-from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.cameras.rpc import fit_rpc
+from photoplan.geometry.local import GeodeticGround
 from photoplan.io.project.file import load_project
 from photoplan.project.cameras import central_without_pixels
 from tools.facet_scene import CONTRAST, GROUND, Field, Scene, rendered, waves

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain
+from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain
 from photoplan.terrain.build import Built
 from tools.build_terrain import built, directly, line, scattered, terrain
 from tools.rough_terrain import Ground, bench_edges, benches, fractal, sampled

@@ -10,7 +10,7 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from photoplan.surfaces.measured import Tin
+from photoplan.surfaces.units import Tin
 
 __all__ = ["exact_volume", "faces_near", "read_landxml_tin", "tin_heights", "tin_outline", "tin_posts"]
 

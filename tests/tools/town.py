@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from photoplan.io.geopackage import VectorLayer, write_geopackage
-from photoplan.surfaces.faces import Faces
+from photoplan.io.vector_layer import VectorLayer, write_geopackage
+from photoplan.surfaces.objects import Faces
 from photoplan.surfaces.polygon_faces import cannot_be_used, filled
 
 

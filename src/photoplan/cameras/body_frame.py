@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import ImageField, Vantage
-from photoplan.cameras.body_sight import heights_of, meet, vantage_over
 from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.pushbroom_rays import heights_of, meet, vantage_over
 from photoplan.errors import UsageError
-from photoplan.geometry.body import BodyGround
+from photoplan.geometry.local import BodyGround
 
 _Floats = NDArray[np.float64]
 #: Points on a side of the grid over an image that is followed to the ground: a body may fill little of it.

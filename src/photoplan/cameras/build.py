@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from photoplan.cameras.base import CentralCamera, Projection
 from photoplan.cameras.corrected import corrected_camera
-from photoplan.cameras.curved import curved_camera
+from photoplan.cameras.curvature import Refraction, Warp, WarpedCamera, curved_camera
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.refraction import Refraction
-from photoplan.cameras.warped import Warp, WarpedCamera
+from photoplan.cameras.lenses import Lens
 from photoplan.errors import UsageError
 from photoplan.geometry.local import MEAN_RADIUS, LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose

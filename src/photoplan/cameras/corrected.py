@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.cameras.curvature import Warp, WarpedCamera, inverse_by_newton
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.warped import Warp, WarpedCamera, inverse_by_newton
 from photoplan.errors import InputError
 
 

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import ImageField, Vantage
+from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.field import FieldLimited, field_limited
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.plane import Affine2D
+from photoplan.cameras.lenses import FieldLimited, Lens, NoLens, field_limited
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose
 

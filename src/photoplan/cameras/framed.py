@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from photoplan.cameras.base import Camera, ImageField, Parts, Tremor, Vantage, project
 from photoplan.errors import UsageError
-from photoplan.geometry.breaks import Breaks
 from photoplan.geometry.frames import Frame
+from photoplan.geometry.grid import Breaks
 
 _Doubles = NDArray[np.float64]
 

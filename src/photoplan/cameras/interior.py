@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.cameras.fiducials import Affine2D, Bilinear2D
 from photoplan.errors import InputError
 
 

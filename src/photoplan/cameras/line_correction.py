@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.line_track import LineTrack
+from photoplan.cameras.pushbroom_rays import LineTrack
 from photoplan.errors import InputError
-from photoplan.geometry.motion import Course, rotations, times
+from photoplan.geometry.pose import Course, rotations, times
 
 _Floats = NDArray[np.float64]
 #: From the axes of frame images (x along the flight, y to the left, z up) to those of a line camera.

@@ -47,9 +47,9 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """
     from photoplan.cli.telling import Telling
     from photoplan.errors import ImagesLeftOut
-    from photoplan.io.naming import together
+    from photoplan.io.store import together
     from photoplan.products.adjust.run import AdjustRequest, adjust_project
-    from photoplan.report.adjust.page import adjust_page
+    from photoplan.report.adjust import adjust_page
     from photoplan.report.page import open_report
 
     for name in ("robust", "variance_components", "correlation"):

@@ -10,7 +10,7 @@ from photoplan.cli.options import NEW_FOLDER, PATH, PROJECT, ending, images_opti
 from photoplan.cli.output import can_draw, say, show, show_json, talking
 
 if TYPE_CHECKING:
-    from photoplan.products.balance.run import BalanceReport
+    from photoplan.products.balance import BalanceReport
 
 #: Pairs that are listed; all are in the table.
 _LISTED = 12
@@ -36,8 +36,8 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     from then on.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.io.naming import together
-    from photoplan.products.balance.run import BalanceRequest, balance_project
+    from photoplan.io.store import together
+    from photoplan.products.balance import BalanceRequest, balance_project
     from photoplan.project.scene import refuse_unusable
     from photoplan.report.balance import draw_balance
     from photoplan.report.page import open_picture

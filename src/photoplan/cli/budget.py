@@ -32,8 +32,7 @@ def command(tables: bool, picture: Path | None, overwrite: bool, as_json: bool, 
 
     For the images of PROJECT, or for a vertical image by numbers: --camera-constant and --height.
     """
-    from photoplan.products.budget import BudgetRequest, make_budget
-    from photoplan.products.budget_tables import source_tables
+    from photoplan.products.budget import BudgetRequest, make_budget, source_tables
 
     tell = show_json if as_json else show
     if tables:
@@ -49,7 +48,7 @@ def command(tables: bool, picture: Path | None, overwrite: bool, as_json: bool, 
         load_matplotlib("a picture of a budget", "leave `picture` out")
     found = make_budget(request)
     if picture is not None:
-        from photoplan.io.naming import write_atomically
+        from photoplan.io.store import write_atomically
         from photoplan.report.budget import draw_picture
 
         write_atomically(picture, draw_picture(found.typical))

@@ -27,8 +27,8 @@ def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     exposed. Every analysis that they allow is made; the others are listed with what is missing.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.io.run_record import recording
-    from photoplan.io.series.file import read_series
+    from photoplan.io.series import read_series
+    from photoplan.io.store import recording
     from photoplan.products.characterise.run import CharacteriseRequest, characterise
     from photoplan.report.characterise import characterise_page
     from photoplan.report.page import open_report

@@ -75,7 +75,7 @@ def command(
 
 
 def _convert(request: Any, as_json: bool, quiet: bool) -> None:
-    from photoplan.io.run_record import recording
+    from photoplan.io.store import recording
     from photoplan.products.convert import convert_orientation
 
     with recording("convert", request, [request.orientation, request.camera]) as record:
@@ -99,7 +99,7 @@ def _nothing(request: Any) -> str:
 
 
 def _polynomials(request: Any, as_json: bool, quiet: bool) -> None:
-    from photoplan.products.polynomials import PolynomialsRequest, write_polynomials
+    from photoplan.products.budget import PolynomialsRequest, write_polynomials
 
     done = write_polynomials(
         PolynomialsRequest(request.orientation, request.output, request.overwrite, request.dry_run)

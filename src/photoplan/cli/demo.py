@@ -25,11 +25,10 @@ def command(folder: Path, resolution: float, overwrite: bool, quiet: bool) -> No
     from photoplan.engine.executors import available_cpus
     from photoplan.errors import UsageError
     from photoplan.io.disk import make_folder, received
-    from photoplan.io.naming import write_atomically
-    from photoplan.io.project.file import load_project
-    from photoplan.io.project.write import project_text
+    from photoplan.io.project.file import load_project, project_text
+    from photoplan.io.store import write_atomically
     from photoplan.products.check import check_project
-    from photoplan.products.init.run import InitRequest, make_project
+    from photoplan.products.init import InitRequest, make_project
     from photoplan.products.orthophoto.plan import plan_orthophotos
 
     how = running.How(

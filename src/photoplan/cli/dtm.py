@@ -22,7 +22,7 @@ VERBS: dict[str, str | Verb] = {
         polygons' border the difference of the two is blended in; outside nothing changes.
         """,
         "requests.terrain:RefineRequest",
-        "products.dtm.refine:dtm_refine",
+        "products.dtm.build:dtm_refine",
         record="refine",
     ),
     "sample": Verb(
@@ -33,7 +33,7 @@ VERBS: dict[str, str | Verb] = {
         Both are empty where there is no model; a raster has no sigma.
         """,
         "requests.terrain:SampleRequest",
-        "products.dtm.sample:dtm_sample",
+        "products.dtm.lines:dtm_sample",
         record="sample",
     ),
     "profile": Verb(
@@ -44,8 +44,8 @@ VERBS: dict[str, str | Verb] = {
         There is a point wherever the surface bends: at grid lines, breaklines and edges of triangles; at a wall two.
         """,
         "requests.terrain:ProfileRequest",
-        "products.dtm.profile:dtm_profile",
-        {"outputs.png": "report.dtm.profile:profile_picture"},
+        "products.dtm.lines:dtm_profile",
+        {"outputs.png": "report.dtm:profile_picture"},
         record="profile",
     ),
     "contours": Verb(
@@ -56,8 +56,8 @@ VERBS: dict[str, str | Verb] = {
         above it.
         """,
         "requests.terrain:ContourRequest",
-        "products.dtm.contours:make_contours",
-        {"preview": "report.dtm.profile:contours_picture"},
+        "products.dtm.lines:make_contours",
+        {"preview": "report.dtm:contours_picture"},
         record="contours",
     ),
     "shade": Verb(
@@ -67,7 +67,7 @@ VERBS: dict[str, str | Verb] = {
         Slopes are those of the model's surface at each pixel, so breaklines stay sharp.
         """,
         "requests.terrain:ShadeRequest",
-        "products.dtm.shading:dtm_shade",
+        "products.dtm.rasters:dtm_shade",
     ),
     "slope": Verb(
         "Slope, slope classes or aspect.",
@@ -76,13 +76,13 @@ VERBS: dict[str, str | Verb] = {
         Places without terrain are NaN, or class 0.
         """,
         "requests.terrain:SlopeRequest",
-        "products.dtm.shading:dtm_slope",
+        "products.dtm.rasters:dtm_slope",
     ),
     "tint": Verb(
         "Height tints.",
         "Colour MODEL by height: red, green, blue, with a mask where it has no terrain.",
         "requests.terrain:TintRequest",
-        "products.dtm.shading:dtm_tint",
+        "products.dtm.rasters:dtm_tint",
     ),
     "volume": Verb(
         "Cut and fill between two models.",
@@ -91,7 +91,7 @@ VERBS: dict[str, str | Verb] = {
         Cut is where A lies above B. Where one of the models has no height nothing is counted; that area is printed.
         """,
         "requests.terrain:VolumeRequest",
-        "products.dtm.volume:dtm_volume",
+        "products.dtm.analyses:dtm_volume",
     ),
     "visible": Verb(
         "What can be seen from points.",
@@ -100,7 +100,7 @@ VERBS: dict[str, str | Verb] = {
         Places without terrain block nothing.
         """,
         "requests.terrain:VisibleRequest",
-        "products.dtm.visible:dtm_visible",
+        "products.dtm.analyses:dtm_visible",
     ),
     "flow": Verb(
         "Catchments and flow lengths.",
@@ -109,7 +109,7 @@ VERBS: dict[str, str | Verb] = {
         Pits are filled first; area and volume of the filling are printed.
         """,
         "requests.terrain:FlowRequest",
-        "products.dtm.flow:dtm_flow",
+        "products.dtm.analyses:dtm_flow",
     ),
     "export": Verb(
         "GeoTIFF, TIN or XYZ of a model.",
@@ -118,7 +118,7 @@ VERBS: dict[str, str | Verb] = {
         Triangulations hold walls as vertical triangles (LandXML cannot); points are the posts and the lines' vertices.
         """,
         "requests.terrain:ExportRequest",
-        "products.dtm.export:dtm_export",
+        "products.dtm.rasters:dtm_export",
     ),
 }
 

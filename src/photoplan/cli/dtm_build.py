@@ -59,10 +59,9 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     interrupted while it wrote.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.io.naming import together
+    from photoplan.io.store import together
     from photoplan.products.dtm.build import describe_plan, dtm_build, load, plan_facts
-    from photoplan.report.dtm.page import build_page, open_build_report
-    from photoplan.report.dtm.samples import samples_of
+    from photoplan.report.dtm import build_page, open_build_report, samples_of
     from photoplan.terrain.build import plan_build
 
     wanted = options.pop("report")

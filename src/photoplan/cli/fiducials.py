@@ -36,10 +36,10 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     marks. An image that fails does not stop the others; they are listed at the end (exit code 4).
     """
     from photoplan.cli.telling import Telling
-    from photoplan.io.names import unique_stems
-    from photoplan.io.naming import together
+    from photoplan.io.files import unique_stems
+    from photoplan.io.store import together
     from photoplan.plain import plain
-    from photoplan.products.fiducials import FiducialsRequest, locate_fiducials, scans_of
+    from photoplan.products.film import FiducialsRequest, locate_fiducials, scans_of
     from photoplan.report.fiducials import marks_picture, unfound_picture
     from photoplan.report.page import open_picture
 

@@ -19,7 +19,7 @@ def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool, quiet
     from photoplan.products.describe import describe, readable
 
     if plot is not None:
-        from photoplan.report.restore.filters import draw_filter
+        from photoplan.report.restore import draw_filter
 
         draw_filter(file, plot, overwrite=overwrite)
     facts = describe(file)

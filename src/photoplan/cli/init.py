@@ -54,7 +54,7 @@ def command(folder: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     Prints the path of the project file on stdout. Height systems must be stated by the files or declared. Without
     --orientation the images are to be oriented (tie, resect, adjust), and --crs is needed.
     """
-    from photoplan.products.init.run import InitRequest, init_project
+    from photoplan.products.init import InitRequest, init_project
 
     form = table_format(options)
     options["scene"] = {"z<0": "z < 0", "z>0": "z > 0"}[options["scene"]]

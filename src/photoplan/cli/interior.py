@@ -29,8 +29,8 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
     An image whose marks are missing, exchanged, mirrored or wrong does not stop the others; they are listed at the end
     (exit code 4).
     """
-    from photoplan.io.run_record import recording
-    from photoplan.products.interior import InteriorRequest, interior_orientations
+    from photoplan.io.store import recording
+    from photoplan.products.film import InteriorRequest, interior_orientations
     from photoplan.report.interior import draw_residuals, interior_page
     from photoplan.report.page import open_picture, open_report
 

@@ -41,7 +41,7 @@ class LazyGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """The verb and what follows it, with the numbers of options that take several written apart."""
         if args and args[0] not in self.verbs and not args[0].startswith("-"):
-            ctx.fail(f"no command {args[0]!r}{self._meant(args[0], ctx)}")
+            ctx.fail(f"No such command {args[0]!r}{self._meant(args[0], ctx)}")
         name, command, rest = super().resolve_command(ctx, args)
         return name, command, rest if command is None else apart(command, rest)
 

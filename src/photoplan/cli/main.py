@@ -35,7 +35,7 @@ VERBS: dict[str, str | Verb] = {
         not agree on one correction of an image's orientation are left out.
         """,
         "requests.orient:ControlRequest",
-        "products.control.run:propose_control",
+        "products.control:propose_control",
     ),
     "resect": "Orient single images by control points.",
     "adjust": "Adjust a block of images (bundle adjustment).",
@@ -50,7 +50,7 @@ VERBS: dict[str, str | Verb] = {
         a column `image`, which `photoplan mosaic --seams` takes and QGIS edits.
         """,
         "requests.ortho:SeamsRequest",
-        "products.seams.run:make_seams",
+        "products.seams:make_seams",
         {"picture": "report.maps:seams_picture"},
     ),
     "ortho": "Make orthophotos.",
@@ -76,7 +76,7 @@ VERBS: dict[str, str | Verb] = {
         of a patch from its expected place in SECOND, with its standard deviation.
         """,
         "requests.measure:RegisterRequest",
-        "products.register.run:register",
+        "products.register:register",
         {"picture": "report.register:draw_vectors"},
     ),
     "run": "Execute a plan written by `ortho --plan`.",

@@ -33,7 +33,7 @@ def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str,
     from photoplan.cli import running
     from photoplan.io.project.file import load_project
     from photoplan.products.orthophoto.mosaic import plan_mosaic
-    from photoplan.products.orthophoto.settings import Choice
+    from photoplan.products.orthophoto.plan import Choice
 
     choice = Choice(
         name=name,

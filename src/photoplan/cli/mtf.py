@@ -77,9 +77,9 @@ def edge_options(options: dict[str, Any]) -> dict[str, Any]:
 
 def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: dict[str, Any]) -> None:
     """Measure the patterns of images and print what was found."""
-    from photoplan.io.run_record import recording
+    from photoplan.io.store import recording
     from photoplan.products.mtf.patterns import PatternRequest, measure_patterns
-    from photoplan.report.mtf.patterns import pattern_page
+    from photoplan.report.mtf import pattern_page
     from photoplan.report.page import open_report
 
     _refuse(_OF_EDGES, f"is for edges, not for --pattern {options['pattern']}")
@@ -142,10 +142,10 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
         run_patterns(images, as_json, quiet, options)
         return
     from photoplan.cli.telling import Telling
-    from photoplan.io.run_record import recording
+    from photoplan.io.store import recording
+    from photoplan.products.mtf.edges import MtfRequest, measure_mtf
     from photoplan.products.mtf.result import group_lines
-    from photoplan.products.mtf.run import MtfRequest, measure_mtf
-    from photoplan.report.mtf.page import mtf_page
+    from photoplan.report.mtf import mtf_page
     from photoplan.report.page import open_report
 
     inputs = [*images, options["linearisation"], options["lab"]]

@@ -34,8 +34,8 @@ def command(project: Path, polygons: Path, score: tuple[str, ...], prefer: tuple
     from photoplan.cli import running
     from photoplan.io.project.file import load_project
     from photoplan.io.project.model import Objects
-    from photoplan.products.orthophoto.objects import plan_objects
-    from photoplan.products.orthophoto.settings import Choice
+    from photoplan.products.orthophoto.mosaic import plan_objects
+    from photoplan.products.orthophoto.plan import Choice
 
     names = ("layer", "crs", "height_system", "offset", "sigma")
     stated = {name: value for name in names if (value := options.pop(name)) is not None}

@@ -226,7 +226,7 @@ choosing_options = several(
 
 def weights(given: Sequence[str]) -> Any:
     """Weights of the score from NAME=WEIGHT."""
-    from photoplan.plan.choice import Weights
+    from photoplan.plan.sources import Weights
 
     values: dict[str, float] = {}
     for text in given:

@@ -12,7 +12,7 @@ from photoplan.cli.output import end_with_failures, say, show, show_json
 from photoplan.plain import shown_metres
 
 if TYPE_CHECKING:
-    from photoplan.products.resect import ResectedImage, ResectResult
+    from photoplan.products.film import ResectedImage, ResectResult
 
 _DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 
@@ -41,7 +41,7 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
     they are listed at the end (exit code 4).
     """
     from photoplan.cli.telling import Telling
-    from photoplan.products.resect import ResectRequest, resect_project
+    from photoplan.products.film import ResectRequest, resect_project
     from photoplan.report.page import open_report
     from photoplan.report.resect import resect_page
 

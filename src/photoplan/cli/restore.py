@@ -12,9 +12,8 @@ from photoplan.cli.options import NEW_FOLDER, PATH, ending, memory_option
 from photoplan.cli.output import end_with_failures, show, show_json
 
 if TYPE_CHECKING:
-    from photoplan.products.restore.filter import FilterRequest
-    from photoplan.products.restore.run import RestoredImage, RestorePlan
-    from photoplan.project.stepped import SteppedReader
+    from photoplan.products.restore import FilterRequest, RestoredImage, RestorePlan
+    from photoplan.project.steps import SteppedReader
 
 _OPTIONS = (
     click.option("--filter", "filter_file", type=PATH, metavar="FILE|none",
@@ -48,8 +47,7 @@ def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def filter_request(images: tuple[Path, ...], options: dict[str, Any]) -> FilterRequest:
     """What the options ask for; takes them out of `options`, but for those that others need too."""
-    from photoplan.products.restore.design import DesignRequest
-    from photoplan.products.restore.filter import FilterRequest
+    from photoplan.products.restore import DesignRequest, FilterRequest
     from photoplan.quality.restoration.design import DesignOptions
 
     file, aperture = options.pop("filter_file"), options.pop("aperture")
@@ -116,10 +114,16 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     image that fails does not stop the others (exit code 4). The same command continues a run that was interrupted.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.products.restore.filter import FILTER_NAME, keep_filter, requested_filter
-    from photoplan.products.restore.run import RestoreRequest, plan_restoration, restore_images
+    from photoplan.products.restore import (
+        FILTER_NAME,
+        RestoreRequest,
+        keep_filter,
+        plan_restoration,
+        requested_filter,
+        restore_images,
+    )
     from photoplan.report.page import open_report
-    from photoplan.report.restore.page import restore_page
+    from photoplan.report.restore import restore_page
 
     if options["chromatic"] not in (None, "measure"):
         options["chromatic"] = Path(options["chromatic"])
@@ -161,8 +165,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
 
 def _before(plan: RestorePlan) -> list[str]:
     """What a user should know before the filter is used."""
-    from photoplan.products.restore.filter import NO_FILTER
-    from photoplan.products.restore.run import filter_figures
+    from photoplan.products.restore import NO_FILTER, filter_figures
 
     figures = filter_figures(plan.filter)
     sums = ", ".join(f"{total:.4g}" for total in figures["sums"][:6])
@@ -185,7 +188,7 @@ def _corrections(reader: SteppedReader) -> list[str]:
     """What is corrected in an image before the filter."""
     from photoplan.products.chromatic import model_lines
     from photoplan.project.align import AlignStep
-    from photoplan.project.fall_off import FallOffStep, fall_off_line
+    from photoplan.project.steps import FallOffStep, fall_off_line
 
     lit, aligned = reader.step(FallOffStep), reader.step(AlignStep)
     lines = [] if lit is None else [fall_off_line(lit.fall_off)]
@@ -194,7 +197,7 @@ def _corrections(reader: SteppedReader) -> list[str]:
 
 
 def _show(plan: RestorePlan, as_json: bool) -> None:
-    from photoplan.products.restore.run import filter_figures
+    from photoplan.products.restore import filter_figures
 
     rows: list[dict[str, Any]] = [
         {

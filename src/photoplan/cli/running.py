@@ -127,7 +127,7 @@ def _tell_accuracy(results: list[ProductResult], draw: bool, events: Telling) ->
 
 def _draw_sources(results: list[ProductResult], events: Telling) -> None:
     """A picture of each mosaic's regions, where pictures can be made."""
-    from photoplan.io.polygons import read_features
+    from photoplan.io.vector_layer import read_features
     from photoplan.report.maps import draw_regions
 
     draw = bool(results) and can_draw(True, events.talk)

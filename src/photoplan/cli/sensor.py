@@ -17,7 +17,7 @@ from photoplan.cli.output import say, show, show_json
 @ending("Print the figures, write nothing.")
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes."""
-    from photoplan.io.run_record import recording
+    from photoplan.io.store import recording
     from photoplan.products.sensor import SensorRequest, describe_sensor
     from photoplan.report.page import open_report
     from photoplan.report.sensor import sensor_page

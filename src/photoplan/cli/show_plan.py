@@ -7,7 +7,7 @@ from pathlib import Path
 from photoplan.cli.options import How
 from photoplan.cli.output import can_draw, show, show_json
 from photoplan.events import Events
-from photoplan.io.naming import together
+from photoplan.io.store import together
 from photoplan.products.orthophoto.plan import OrthoPlan
 from photoplan.products.orthophoto.plan_file import PlanFigures, check_plan_path, compile_figures, write_plan
 from photoplan.products.orthophoto.quadtree import PlanSquares, plan_squares

@@ -63,7 +63,7 @@ def command(scene: str | None, project: Path | None, as_json: bool, quiet: bool,
 def _pattern(scene: str, as_json: bool, quiet: bool, options: dict[str, Any]) -> None:
     """Images of a file or a pattern."""
     from photoplan.cli.telling import Telling
-    from photoplan.products.simulate.run import SimulateRequest, simulate
+    from photoplan.products.simulate import SimulateRequest, simulate
 
     options["frames"] = 1 if options["frames"] is None else options["frames"]
     with Telling(quiet) as events:
@@ -81,7 +81,7 @@ def _pattern(scene: str, as_json: bool, quiet: bool, options: dict[str, Any]) ->
 def _project(project: Path, as_json: bool, quiet: bool, options: dict[str, Any]) -> None:
     """Images of a project."""
     from photoplan.cli.telling import Telling
-    from photoplan.products.simulate.project import SceneRequest, simulate_project
+    from photoplan.products.simulate import SceneRequest, simulate_project
 
     with Telling(quiet) as events:
         report = simulate_project(SceneRequest(project, **options), events)

@@ -68,11 +68,10 @@ def command(project: Path, **options: Any) -> None:
     from photoplan.cli import running
     from photoplan.cli.output import can_draw, show, show_json
     from photoplan.cli.telling import Telling
-    from photoplan.io.naming import together
     from photoplan.io.project.file import load_project
-    from photoplan.products.surface.plan import plan_surface
+    from photoplan.io.store import together
+    from photoplan.products.surface.plan import SurfaceSettings, plan_surface
     from photoplan.products.surface.run import make_surface
-    from photoplan.products.surface.settings import SurfaceSettings
     from photoplan.project.scene import Attempts, refuse_unusable
     from photoplan.report.maps import draw_surface
     from photoplan.report.page import open_report

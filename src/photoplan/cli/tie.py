@@ -10,7 +10,7 @@ from photoplan.cli.options import PATH, PROJECT, ending, images_option
 from photoplan.cli.output import can_draw, say, show, show_json, talking
 
 if TYPE_CHECKING:
-    from photoplan.products.tie.run import TieReport
+    from photoplan.products.tie import TieReport
 
 
 @click.command("tie")
@@ -39,8 +39,8 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     [observations] in PROJECT. Images that hang together with no other are named.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.io.naming import together
-    from photoplan.products.tie.run import TieRequest, find_ties
+    from photoplan.io.store import together
+    from photoplan.products.tie import TieRequest, find_ties
     from photoplan.report.page import open_picture
     from photoplan.report.tie import draw_ties
 

@@ -83,8 +83,7 @@ def load(place: str) -> Any:
 def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     """Run the operation of a verb, draw what is drawn, and print the result."""
     from photoplan.cli.telling import Telling
-    from photoplan.io.naming import together
-    from photoplan.io.run_record import recording
+    from photoplan.io.store import recording, together
     from photoplan.report.page import open_picture, open_report
 
     dry_run, overwrite = getattr(request, "dry_run", False), getattr(request, "overwrite", False)

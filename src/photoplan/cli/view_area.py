@@ -21,7 +21,7 @@ def command(matrix: Path | None, **options: Any) -> None:
     """The visible area: where on the map lies what the picture shows. 1 seen, 0 not seen, 255 no terrain."""
     from photoplan.cli.output import say, show, show_json
     from photoplan.cli.telling import Telling
-    from photoplan.products.view.area import AreaRequest, visible_area
+    from photoplan.products.view.measure import AreaRequest, visible_area
 
     as_json, quiet = options.pop("as_json"), options.pop("quiet")
     own = {name: options.pop(name) for name in ("output", "resolution", "workers", "overwrite")}

@@ -58,10 +58,9 @@ def take_look(options: dict[str, Any], photo: str | None = None) -> dict[str, An
     """Fields of a request of views, taken out of the options of a verb."""
     from photoplan.errors import UsageError
     from photoplan.products.view.content import ContentRequest
-    from photoplan.products.view.job import LookRequest
     from photoplan.products.view.lines import LinesRequest
+    from photoplan.products.view.make import LookRequest, Stereo
     from photoplan.products.view.photo import PhotoRequest
-    from photoplan.products.view.stereo import Stereo
 
     look = {name: value for name in _LOOK if (value := options.pop(name)) is not None}
     contents, sun, how, base = (options.pop(name) for name in ("contents", "sun", "stereo", "base"))
@@ -84,7 +83,7 @@ def take_look(options: dict[str, Any], photo: str | None = None) -> dict[str, An
     if out["lines"]:
         out["lines"] = tuple(LinesRequest.parse(text) for text in out["lines"])
         if any("label" in dict(each.options) for each in out["lines"]):
-            from photoplan.report.lettering import lettering
+            from photoplan.report.drawing import lettering
 
             out["lettering"] = lettering(out["text_size"])
     return out

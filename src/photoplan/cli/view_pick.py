@@ -27,7 +27,7 @@ def command(matrix: Path | None, **options: Any) -> None:
     (0, 0) is the centre of the upper-left pixel.
     """
     from photoplan.cli.output import show, show_json
-    from photoplan.products.view.pick import PickRequest, pick
+    from photoplan.products.view.measure import PickRequest, pick
 
     as_json, _ = options.pop("as_json"), options.pop("quiet")
     own = {name: options.pop(name) for name in ("pixels", "points", "file", "output", "overwrite")}

@@ -35,7 +35,7 @@ def command(matrix: Path | None, output: Path, overwrite: bool, **options: Any) 
     """
     from photoplan.cli.output import say, show, show_json
     from photoplan.errors import UsageError
-    from photoplan.products.view.photo_skyline import PhotoSkylineRequest
+    from photoplan.products.view.photo import PhotoSkylineRequest
     from photoplan.products.view.skyline import SkylineRequest, skyline
 
     as_json, quiet, photo = options.pop("as_json"), options.pop("quiet"), options.pop("photo")

@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import CentralCamera, project
-from photoplan.engine.base import Source
-from photoplan.engine.execute import Painted
-from photoplan.engine.holes import fill_by_distance
+from photoplan.engine.execute import Painted, Source, fill_by_distance
 from photoplan.geometry.grid import Window
+from photoplan.plan.footprint import Tile
 from photoplan.plan.product import CompiledTile, ProductPlan, compile_tile
-from photoplan.plan.tiles import Tile
 from photoplan.surfaces.base import Surface, Terrain
-from photoplan.surfaces.intersect import intersect
+from photoplan.surfaces.shifted import intersect
 from photoplan.targets.map import MapTarget
 
 #: Pixels of the image that are carried at once.

@@ -1,38 +1,258 @@
-"""Execute tiles: the one place where pixels are resampled."""
+"""One tile: compile, read source windows, resample, fill holes, and give the outputs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Part
-from photoplan.engine.bands import detail_bands
-from photoplan.engine.base import Reader, Source
-from photoplan.engine.holes import (
-    FROM_IMAGE,
-    FROM_SURROUNDINGS,
-    Mask,
-    fill_from_surroundings,
-    halo,
-    rise_of_holes,
-    small_holes,
-)
+from photoplan.cameras.base import Part, Projection
 from photoplan.engine.run import Made, Output
-from photoplan.geometry.grid import Window
-from photoplan.geometry.levels import Pixels
+from photoplan.errors import UsageError
+from photoplan.geometry.grid import FullSize, Pixels, Window, reduced
 from photoplan.kernels.position import ALL_MINE
 from photoplan.kernels.rectify import rectify_tile
 from photoplan.plan.accuracy import DepthErrors, SourceErrors, radial_counts, tile_accuracy
+from photoplan.plan.footprint import Tile
 from photoplan.plan.product import CompiledTile, Layer, ProductPlan, compile_next, compile_tile
-from photoplan.plan.tiles import Tile
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.objects import RaisedSurface
 from photoplan.targets.map import MapTarget
+
+
+@runtime_checkable
+class Reader(FullSize, Protocol):
+    """A source image of uint8, uint16, int16 or float32, alpha not counted; safe to call from several threads."""
+
+    def read(self, window: Window, level: int = 0) -> Pixels:
+        """Pixels of a window inside the image, shape (bands, height, width), and their validity."""
+        ...
+
+
+class Step(Protocol):
+    """Pixels into pixels, on their way from a file to whoever reads it: the grid of the image stays.
+
+    What becomes of a pixel does not depend on the window in which it is asked for.
+    """
+
+    def check(self, size: tuple[int, int], bands: int) -> None:
+        """Refuse images that the step is not for."""
+        ...
+
+    def result(self, stored: np.dtype[Any]) -> np.dtype[Any]:
+        """Type of the pixels that come of pixels of a type."""
+        ...
+
+    def around(self, window: Window, size: tuple[int, int], gaps: bool) -> Window:
+        """Pixels of an image of `size` that those of a window depend on; `gaps`: if some of them are invalid."""
+        ...
+
+    def apply(self, window: Window, at: Window, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> Pixels:
+        """Pixels of a window and their validity, from those of the window `at` around it."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A row of the table of sources as the engine needs it."""
+
+    camera: Projection
+    reader: Reader
+
+
+_TYPES = ("uint8", "uint16", "int16", "float32")
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayReader:
+    """A source image in memory, behind the engine's `Reader`."""
+
+    image: NDArray[Any]
+    """(bands, height, width): uint8, uint16, int16 or float32."""
+    valid: NDArray[np.bool_] | None = None
+    """(height, width), True = valid; None: all are."""
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 3 or self.image.dtype.name not in _TYPES or not self.image.size:
+            advice = "" if self.image.dtype.name in _TYPES else "; convert it, for instance with astype('float32')"
+            raise UsageError(
+                f"image of shape {self.image.shape} and type {self.image.dtype}; needed are (bands, height, width) of "
+                f"{', '.join(_TYPES)}{advice}"
+            )
+        if self.valid is not None and (self.valid.shape != self.image.shape[1:] or self.valid.dtype != bool):
+            raise UsageError(f"validity of shape {self.valid.shape}; needed is bool of {self.image.shape[1:]}")
+
+    @classmethod
+    def of(cls, values: NDArray[Any]) -> ArrayReader:
+        """From (height, width) or (bands, height, width); what is masked in any band, or NaN, is invalid."""
+        image = values[None] if values.ndim == 2 else values
+        bad = np.asarray(np.ma.getmaskarray(image).any(axis=0), bool)
+        plain = np.ma.getdata(image)
+        plain = plain.astype(plain.dtype.newbyteorder("="), copy=False)  # files of other machines
+        if plain.dtype.kind == "f":
+            bad |= ~np.isfinite(plain).all(axis=0)
+        return cls(plain, ~bad if bad.any() else None)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.image.shape[2], self.image.shape[1]
+
+    @property
+    def bands(self) -> int:
+        """Number of bands."""
+        return int(self.image.shape[0])
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the pixels."""
+        return self.image.dtype
+
+    def read(self, window: Window, level: int = 0) -> Pixels:
+        """Pixels of a window and their validity, see `engine.base.Reader`."""
+        if level:
+            return reduced(self, window, level)
+        if window & Window(0, 0, *self.size) != window:
+            raise UsageError(f"{window} is not inside the image of {self.size[0]} × {self.size[1]} pixels")
+        rows, cols = window.slices(Window(0, 0, *self.size))
+        return self.image[:, rows, cols], None if self.valid is None else self.valid[rows, cols]
+
+
+_Floats = NDArray[np.float64]
+
+
+def detail_bands(
+    values: NDArray[Any], usable: NDArray[np.bool_], reaches: Sequence[int], at: tuple[slice, slice]
+) -> Iterator[_Floats]:
+    """Bands of a picture whose sum it is (Burt and Adelson 1983), from the finest.
+
+    Each is what one smoothing takes away that the finer one has left; the last is what the coarsest has left. Smoothed
+    is over usable pixels alone, by weights that fall along rows and columns to nothing beyond a reach; a pixel's bands
+    depend on what lies within the last but one of the reaches, in a sum of always the same order.
+    """
+    picture = np.where(usable, values, 0).astype(np.float64)
+    before = picture[(slice(None), *at)]
+    for reach in reaches[:-1]:
+        known = np.maximum(_smooth(usable.astype(np.float64), reach, at), 1.0)
+        after = np.stack([_smooth(band, reach, at) for band in picture]) / known
+        yield before - after
+        before = after
+    yield before
+
+
+def _smooth(values: _Floats, reach: int, at: tuple[slice, slice]) -> _Floats:
+    """Sums by whole weights that fall from reach + 1 to 0 on both sides, along both axes, of a part."""
+    # Products without bands do without it: a tenth of a second of their start.
+    from scipy.ndimage import correlate1d  # noqa: PLC0415
+
+    weights = reach + 1.0 - np.abs(np.arange(-reach, reach + 1))
+    down = correlate1d(values, weights, axis=0, mode="constant")[at[0]]
+    return np.asarray(correlate1d(down, weights, axis=1, mode="constant")[:, at[1]])
+
+
+#: In a raster of sources: added to the number of the image that fills a pixel; the number of pixels that are filled
+#: from their surroundings; and how many images a product can have so that these differ.
+FROM_IMAGE, FROM_SURROUNDINGS, MOST_IMAGES = 32768, 65535, 32766
+#: Holes are looked at from the level around them if that is no more than this above their ground: pixels.
+_RAISED = 8.0
+#: Surroundings of holes are pixels no further away than this and half the largest side: pixels.
+_AROUND = 3
+
+
+def halo(largest: int) -> int:
+    """Pixels around a pixel that decide whether and with what it is filled, for holes of a largest side."""
+    return largest + _AROUND
+
+
+def small_holes(hidden: NDArray[np.bool_], largest: int) -> NDArray[np.bool_]:
+    """Pixels of those holes (pixels that touch at sides or corners) whose width and height are at most `largest`."""
+    # Products that fill nothing do without it.
+    from scipy.ndimage import find_objects, label  # noqa: PLC0415
+
+    labels, _ = label(hidden, np.ones((3, 3), int))
+    small = [max(part.stop - part.start for part in box) <= largest for box in find_objects(labels)]
+    return np.asarray(np.array([False, *small])[labels])
+
+
+class Mask:
+    """Pixels of a window that a product shows, as `ProductPlan.clip` has them."""
+
+    def __init__(self, window: Window, shown: NDArray[np.bool_]) -> None:
+        self.window, self.shown = window, shown
+
+    def rows(self, window: Window) -> NDArray[np.uint16]:
+        """1 for pixels of a window that are shown, else 0."""
+        found, common = np.zeros((window.height, window.width), np.uint16), self.window & window
+        if common.size:
+            found[common.slices(window)] = self.shown[common.slices(self.window)]
+        return found
+
+    def digest(self, margin: float) -> str:
+        """Return nothing: it decides no key."""
+        return ""
+
+
+def rise_of_holes(
+    level: NDArray[np.floating], valid: NDArray[np.bool_], holes: NDArray[np.bool_], largest: int
+) -> NDArray[np.float64]:
+    """How far the valid pixels around each pixel of holes lie above it, pixels; 0 if they lie below it or far above.
+
+    Roughness of a surface hides its lower places; the level around them is nearer to the truth.
+    """
+    around = np.array(level[None], float)
+    fill_by_distance(around, valid, holes, largest // 2 + _AROUND)
+    rise = np.where(holes, around[0] - level, 0.0)
+    return np.where((rise > 0) & (rise <= _RAISED), rise, 0.0)
+
+
+def fill_from_surroundings(
+    values: NDArray[Any], valid: NDArray[np.bool_], holes: NDArray[np.bool_], largest: int, level: NDArray[np.floating]
+) -> NDArray[np.bool_]:
+    """Fill holes from valid pixels around them, those of similar height (`level`, in pixels) before others; returns the
+    pixels that are filled."""
+    return fill_by_distance(values, valid, holes, largest // 2 + _AROUND, level)
+
+
+def fill_by_distance(
+    values: NDArray[Any],
+    valid: NDArray[np.bool_],
+    holes: NDArray[np.bool_],
+    reach: int,
+    level: NDArray[np.floating] | None = None,
+) -> NDArray[np.bool_]:
+    """Fill holes with the mean of valid pixels within reach, weighted by one over the square of the distance, or with
+    heights by one over the fourth power of the distance in space; returns the pixels that are filled.
+
+    `values` are changed, `valid` is not.
+    """
+    row, col = np.nonzero(holes)
+    height, width = valid.shape
+    sums, weights = np.zeros((len(values), len(row))), np.zeros(len(row))
+    for dv in range(-reach, reach + 1):
+        for du in range(-reach, reach + 1):
+            square = du * du + dv * dv
+            if not 0 < square <= reach * reach:
+                continue
+            r, c = row + dv, col + du
+            inside = (r >= 0) & (r < height) & (c >= 0) & (c < width)
+            r, c = np.where(inside, r, 0), np.where(inside, c, 0)
+            usable = inside & valid[r, c]
+            weight = usable / square
+            if level is not None:
+                weight = usable / (square + (level[r, c] - level[row, col]) ** 2) ** 2
+            sums += values[:, r, c] * weight
+            weights += weight
+    found = weights > 0
+    mean = sums[:, found] / weights[found]
+    values[:, row[found], col[found]] = mean if values.dtype.kind == "f" else np.rint(mean)
+    filled = np.zeros(valid.shape, bool)
+    filled[row[found], col[found]] = True
+    return filled
+
 
 OutputName = Literal["picture", "hidden", "sources", "accuracy"]
 
@@ -52,9 +272,9 @@ class Painted:
     """(height, width); None if no pixel is valid."""
     owner: NDArray[np.uint16] | None
     """(height, width): row of the table of sources, plus one, that painted each pixel; 0 where invalid. Filled: with
-    codes of `photoplan.engine.holes`. None if there is one source, or no pixel is valid."""
+    codes of `photoplan.engine.execute`. None if there is one source, or no pixel is valid."""
     hidden: NDArray[np.bool_] | None
-    """(height, width): pixels that no source sees, see `photoplan.plan.owner.Share`; None if nobody has asked."""
+    """(height, width): pixels that no source sees, see `photoplan.plan.sources.Share`; None if nobody has asked."""
     bare: int
     """Pixels with a surface that lie in no source; 0 if there is one source and nobody has asked."""
     residual: float

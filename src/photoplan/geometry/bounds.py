@@ -14,7 +14,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
 from photoplan.geometry.crs import crs_label, fitting_utm, nearest_turn, parse_crs, utm_codes
-from photoplan.geometry.rotation import ANGLE_UNITS
+from photoplan.geometry.pose import ANGLE_UNITS
 
 #: Map coordinates beyond this lie on no map of the earth, metres.
 _FAR = 1e8

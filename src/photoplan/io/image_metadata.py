@@ -27,8 +27,7 @@ from xml.etree.ElementTree import Element
 
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import is_no_fix
-from photoplan.io.markup_files import NotWellFormed, parse_xml
-from photoplan.io.plain_files import whole_number
+from photoplan.io.files import NotWellFormed, parse_xml, whole_number
 
 _DJI = "dji.com/drone-dji"
 _CAMERA = "pix4d.com/camera"

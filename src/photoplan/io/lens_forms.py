@@ -8,15 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.fisheye import Fisheye
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.cameras.lenses import Brown, Fisheye, NoLens, OpenCV
 from photoplan.errors import InputError
 from photoplan.io.camera.frame import frame_in_pixels
 from photoplan.io.camera.model import CameraEntry, InPixels
 from photoplan.io.orientation.block import Loss, OrientationBlock
-from photoplan.io.project.cameras import lens_of
+from photoplan.io.project.model import lens_of
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class _Free(_MarkEntry):
 
 
 class Cross(_Free):
-    """Four arms; see `photoplan.orientation.marks.catalogue` for every number of this and the following marks."""
+    """Four arms; see `photoplan.orientation.marks.template` for every number of this and the following marks."""
 
     type: Literal["cross"]
     arm: Length

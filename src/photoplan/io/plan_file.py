@@ -14,13 +14,11 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.checks import open_database, plain_tables
 from photoplan.io.disk import make_parents
+from photoplan.io.files import json_object, open_database, plain_tables
 from photoplan.io.gdal import FIXED_DATE
-from photoplan.io.geopackage import write_vector
-from photoplan.io.naming import give_name, scratch
-from photoplan.io.plain_files import json_object
-from photoplan.io.vector_layer import read_columns
+from photoplan.io.store import give_name, scratch
+from photoplan.io.vector_layer import read_columns, write_vector
 
 FORMAT = 2
 _HEADER = "photoplan_plan"

@@ -18,7 +18,7 @@ from photoplan.geometry.crs import parse_crs
 from photoplan.geometry.frames import Frame
 from photoplan.io.disk import disk_error
 from photoplan.io.gdal import open_raster
-from photoplan.io.naming import give_name, scratch, standing
+from photoplan.io.store import give_name, scratch, standing
 
 CLOUD_SUFFIXES = (".las", ".laz", ".ply")
 #: What a point has: metres, standard deviation of z in metres, grey value.

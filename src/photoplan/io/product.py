@@ -1,29 +1,173 @@
-"""A product file that appears under its name only when it is complete."""
+"""Products as cloud-optimised GeoTIFFs and virtual rasters: layout and verification."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import errno
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
 import rasterio.crs
+import rasterio.enums
 import rasterio.transform
+import rasterio.windows
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError, PhotoplanError, UsageError
 from photoplan.geometry.grid import Placement, Window
-from photoplan.io.gdal import GDAL_ERRORS, open_raster
-from photoplan.io.image_form import ImageForm, dress
-from photoplan.io.kept_tiles import KeptTiles
-from photoplan.io.naming import is_unfinished, standing, when_named
-from photoplan.io.plain_tiff import write_plain_tiff
-from photoplan.io.product_check import check_product
-from photoplan.io.run_record import record_path, refuse_foreign_record
+from photoplan.io.gdal import GDAL_ERRORS, gdal_settings, not_georeferenced, open_raster
+from photoplan.io.raster_info import ImageForm, TiffArray, dress, read_tiff_layout, read_tiff_layouts
 from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, CogOptions, Nodata, nodata_for, write_cog, write_picture
-from photoplan.io.tile_log import TileLog, log_of
-from photoplan.io.unfinished import Unfinished
+from photoplan.io.store import (
+    KeptTiles,
+    TileLog,
+    Unfinished,
+    is_unfinished,
+    log_of,
+    record_path,
+    refuse_foreign_record,
+    standing,
+    when_named,
+    write_atomically,
+)
+from photoplan.plain import xml_text
+
+_CHUNK = 8 << 20
+_NO_KERNEL_COPY = {errno.EXDEV, errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.EPERM}
+
+
+def write_plain_tiff(
+    path: Path,
+    profile: dict[str, Any],
+    tags: dict[str, str],
+    blocks: Iterable[tuple[int, int, int]],
+    source: int,
+    dress: Callable[[Any], None] | None = None,
+) -> None:
+    """Write a tiled TIFF."""
+    path.unlink(missing_ok=True)
+    fixed = {"driver": "GTiff", "tiled": True, "interleave": "pixel", "sparse_ok": True, "compress": "none"}
+    colours = profile.get("colormap")
+    fixed = {name: value for name, value in (profile | fixed).items() if name != "colormap"}
+    with gdal_settings(GDAL_PAM_ENABLED=False), not_georeferenced(), rasterio.open(path, "w", **fixed) as dataset:
+        if colours is not None:
+            dataset.write_colormap(1, colours)
+        if dress is not None:
+            dress(dataset)
+        dataset.update_tags(**tags)
+    layout = read_tiff_layout(path)
+    offsets, counts = np.zeros_like(layout.offsets), np.zeros_like(layout.counts)
+    descriptor = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
+    try:
+        end = -(-os.lseek(descriptor, 0, os.SEEK_END) // 16) * 16
+        for block, position, length in blocks:
+            _copy(source, position, descriptor, end, length)
+            offsets[block], counts[block] = end, length
+            end += length
+        _fill(descriptor, path, layout.offsets_array, offsets)
+        _fill(descriptor, path, layout.counts_array, counts)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _fill(descriptor: int, path: Path, place: TiffArray, values: Any) -> None:
+    """Write a block table where GDAL left room for it."""
+    dtype = np.dtype(place.dtype)
+    if values.max(initial=0) > np.iinfo(dtype).max:
+        raise PhotoplanError(
+            f"{path}: block positions do not fit into {dtype}; this is a fault of photoplan, report it"
+        )
+    os.lseek(descriptor, place.position, os.SEEK_SET)
+    raw = memoryview(values.astype(dtype).tobytes())
+    while raw:
+        raw = raw[os.write(descriptor, raw) :]
+
+
+def _copy(source: int, position: int, target: int, end: int, length: int) -> None:
+    """Copy bytes between two files, inside the kernel where it can."""
+    while length > 0:
+        done = 0
+        if sys.platform == "linux":
+            try:
+                done = os.copy_file_range(source, target, length, position, end)
+            except OSError as error:
+                if error.errno not in _NO_KERNEL_COPY:
+                    raise
+        if not done:
+            os.lseek(source, position, os.SEEK_SET)
+            os.lseek(target, end, os.SEEK_SET)
+            done = os.write(target, os.read(source, min(length, _CHUNK)))
+        position, end, length = position + done, end + done, length - done
+
+
+_SIDE = 16
+_LOSSY = 16.0
+"""Difference in grey values of means over 16 × 16 pixels up to which a tile compressed with losses counts as the one
+that was computed: compression changes fine detail and noise, means hardly."""
+
+
+def check_product(
+    path: Path,
+    profile: dict[str, Any],
+    samples: Sequence[Window],
+    expected: Callable[[Window], tuple[NDArray[Any], NDArray[np.bool_]]],
+    *,
+    lossy: bool,
+    overviews: bool,
+    driver: str = "COG",
+) -> None:
+    """Compare a file with what it must hold."""
+    if driver == "COG":
+        read_tiff_layouts(path)
+    with open_raster(path, "GTiff" if driver == "COG" else driver) as dataset, gdal_settings():
+        for name in ("width", "height", "count", "transform"):
+            if getattr(dataset, name) != profile[name]:
+                raise PhotoplanError(f"{path}: {name} is {getattr(dataset, name)}, not {profile[name]}")
+        if dataset.dtypes[0] != profile["dtype"]:
+            raise PhotoplanError(f"{path}: pixels are {dataset.dtypes[0]}, not {profile['dtype']}")
+        if profile["crs"] is not None and (
+            dataset.crs is None or dataset.crs.to_epsg() != rasterio.crs.CRS.from_user_input(profile["crs"]).to_epsg()
+        ):
+            raise PhotoplanError(f"{path}: the reference system {profile['crs']} was not kept")
+        if overviews and not dataset.overviews(1):
+            raise PhotoplanError(f"{path}: the overviews are missing")
+        for factor in dataset.overviews(1):
+            shape = -(-dataset.height // factor), -(-dataset.width // factor)
+            if shape[0] * shape[1] <= 1 << 20:
+                dataset.read(1, out_shape=shape)
+        for window in samples:
+            _compare(path, dataset, window, *expected(window), lossy=lossy)
+
+
+def _compare(
+    path: Path, dataset: Any, window: Window, wanted: NDArray[Any], seen: NDArray[np.bool_], *, lossy: bool
+) -> None:
+    """Compare one window of a file with what was computed."""
+    area = rasterio.windows.Window(window.col, window.row, window.width, window.height)
+    pixels, valid = dataset.read(window=area), (dataset.read_masks(window=area) > 0).any(axis=0)
+    good = np.array_equal(valid, seen)
+    if good and lossy:
+        good = float(np.abs(_block_means(pixels * valid) - _block_means(wanted * valid)).max()) <= _LOSSY
+    elif good:
+        good = np.array_equal(pixels[:, valid], wanted[:, valid], equal_nan=pixels.dtype.kind == "f")
+    if not good:
+        raise PhotoplanError(f"{path}: {window} is not what was computed; the disk or a library is at fault, run again")
+
+
+def _block_means(pixels: NDArray[Any]) -> NDArray[np.float64]:
+    """Means over blocks of 16 × 16 pixels, shape (bands, rows, columns) of blocks; the last ones are smaller."""
+    rows, cols = (np.arange(0, length, _SIDE) for length in pixels.shape[1:])
+    sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float64), rows, axis=1), cols, axis=2)
+    heights = np.diff([*rows, pixels.shape[1]])
+    widths = np.diff([*cols, pixels.shape[2]])
+    return np.asarray(sums / (heights[:, None] * widths))
+
 
 #: The tag in which a product describes itself, where its place does not.
 DESCRIPTION = "PHOTOPLAN_VIEW"
@@ -322,3 +466,97 @@ class ProductFile:
             moved_values=sum(moved for moved, _ in notes),
             kept="" if self.tiles is None else self.tiles.told(log),
         )
+
+
+_MARK = "<!-- written by photoplan -->"
+#: Pixels that lie over each other do so to this part of their side.
+_ALIGNED = 1e-3
+_TYPES = {"uint8": "Byte", "int8": "Int8", "uint16": "UInt16", "int16": "Int16", "uint32": "UInt32", "int32": "Int32",
+          "float32": "Float32", "float64": "Float64"}  # fmt: skip
+
+
+def refuse_foreign_virtual(path: Path) -> None:
+    """Refuse to replace a file that `write_virtual` has not written."""
+    if path.is_file() and _MARK not in path.read_bytes()[:4096].decode(errors="replace"):
+        raise UsageError(f"{path}: exists and is not of photoplan; move it away, or give another name")
+
+
+def write_virtual(path: Path, rasters: Sequence[Path]) -> None:
+    """Write a VRT (GDAL's virtual raster) of rasters of one grid, bands and type, which lie in its folder; replaces an
+    older one."""
+    left, top, right, bottom = float("inf"), float("-inf"), float("-inf"), float("inf")
+    facts = []
+    for raster in rasters:
+        with rasterio.open(raster) as file:
+            b, resolution, crs, dtype = file.bounds, file.res[0], file.crs, file.dtypes[0]
+            masked = rasterio.enums.MaskFlags.per_dataset in file.mask_flag_enums[0]
+            facts.append((raster.name, b.left, b.top, file.width, file.height))
+            count, nodata, colours = file.count, file.nodata, [each.name.capitalize() for each in file.colorinterp]
+        left, top, right, bottom = min(left, b.left), max(top, b.top), max(right, b.right), min(bottom, b.bottom)
+    size = round((right - left) / resolution), round((top - bottom) / resolution)
+
+    def sources(band: str) -> str:
+        found, none = [], 0 if band.startswith("mask") else nodata
+        for name, x, y, width, height in facts:
+            to = f'xOff="{round((x - left) / resolution)}" yOff="{round((top - y) / resolution)}"'
+            at = f'xSize="{width}" ySize="{height}"'
+            found.append(
+                f'<ComplexSource><SourceFilename relativeToVRT="1">{xml_text(name)}</SourceFilename><SourceBand>{band}'
+                f'</SourceBand><SrcRect xOff="0" yOff="0" {at}/><DstRect {to} {at}/>'
+                # Where sheets of any outline lie over each other, what one does not show is the other's.
+                + ("" if none is None else f"<NODATA>{none!r}</NODATA>")
+                + ("<UseMaskBand>true</UseMaskBand>" if masked and not band.startswith("mask") else "")
+                + "</ComplexSource>"
+            )
+        return "\n".join(found)
+
+    none = "" if nodata is None else f"<NoDataValue>{nodata!r}</NoDataValue>"
+    bands = [
+        f'<VRTRasterBand dataType="{_TYPES[dtype]}" band="{k + 1}">{none}<ColorInterp>{colours[k]}</ColorInterp>\n'
+        f"{sources(str(k + 1))}\n</VRTRasterBand>"
+        for k in range(count)
+    ]
+    if masked:
+        bands.append(f'<MaskBand><VRTRasterBand dataType="Byte">\n{sources("mask,1")}\n</VRTRasterBand></MaskBand>')
+    head = (
+        f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{_MARK}\n<SRS>{xml_text(crs.to_wkt())}</SRS>\n'
+        f"<GeoTransform>{left!r}, {resolution!r}, 0, {top!r}, 0, {-resolution!r}</GeoTransform>\n"
+    )
+    write_atomically(path, (head + "\n".join(bands) + "\n</VRTDataset>\n").encode())
+
+
+def write_stacked(path: Path, rasters: Mapping[str, Path]) -> None:
+    """Write a VRT that shows rasters of one resolution, which lie in its folder, as bands of one, over all of them.
+
+    Each band has the name of its raster, with the number of the band where that has several.
+    """
+    left, top, right, bottom = float("inf"), float("-inf"), float("-inf"), float("inf")
+    opened = {}
+    for name, raster in rasters.items():
+        with rasterio.open(raster) as file:
+            b, resolution, crs = file.bounds, file.res[0], file.crs
+            opened[name] = raster.name, b, (file.width, file.height), file.dtypes, file.nodata
+        left, top, right, bottom = min(left, b.left), max(top, b.top), max(right, b.right), min(bottom, b.bottom)
+    bands: list[str] = []
+    for name, (file_name, b, (width, height), dtypes, nodata) in opened.items():
+        x, y = (b.left - left) / resolution, (top - b.top) / resolution
+        if max(abs(x - round(x)), abs(y - round(y))) > _ALIGNED:
+            raise UsageError(f"{file_name}: its pixels do not lie over those of the other orthophotos")
+        at = f'xSize="{width}" ySize="{height}"'
+        none = "" if nodata is None else f"<NoDataValue>{nodata!r}</NoDataValue>"
+        for k, dtype in enumerate(dtypes, 1):
+            title = name if len(dtypes) == 1 else f"{name} {k}"
+            bands.append(
+                f'<VRTRasterBand dataType="{_TYPES[dtype]}" band="{len(bands) + 1}"><Description>{xml_text(title)}'
+                f'</Description>{none}<ComplexSource><SourceFilename relativeToVRT="1">{xml_text(file_name)}'
+                f'</SourceFilename><SourceBand>{k}</SourceBand><SrcRect xOff="0" yOff="0" {at}/><DstRect '
+                f'xOff="{round(x)}" yOff="{round(y)}" {at}/>'
+                + ("<UseMaskBand>true</UseMaskBand>" if nodata is None else f"<NODATA>{nodata!r}</NODATA>")
+                + "</ComplexSource></VRTRasterBand>"
+            )
+    size = round((right - left) / resolution), round((top - bottom) / resolution)
+    head = (
+        f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{_MARK}\n<SRS>{xml_text(crs.to_wkt())}</SRS>\n'
+        f"<GeoTransform>{left!r}, {resolution!r}, 0, {top!r}, 0, {-resolution!r}</GeoTransform>\n"
+    )
+    write_atomically(path, (head + "\n".join(bands) + "\n</VRTDataset>\n").encode())

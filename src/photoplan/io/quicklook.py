@@ -14,9 +14,9 @@ import rasterio.enums
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.checks import check_plain_file, raster_driver
+from photoplan.io.files import check_plain_file, raster_driver
 from photoplan.io.gdal import GDAL_ERRORS, first_cause, gdal_settings, not_georeferenced, open_raster
-from photoplan.io.naming import standing, write_atomically
+from photoplan.io.store import standing, write_atomically
 
 _PERCENT = 2.0, 98.0
 _SOFTWARE = "photoplan"

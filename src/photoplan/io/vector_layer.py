@@ -1,14 +1,14 @@
-"""Layers of vector files, for all readers of features: GeoPackage, Shapefile and GeoJSON by GDAL, DXF by `drawing`.
-
-This is the one place that reads layers through pyogrio: whatever a file holds, a layer has geometries and columns of
-the stated types, or the file is refused by name.
-"""
+"""Vector layers: features, polygons, regions, contours, GeoPackages, drawings."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import shutil
 import sqlite3
 import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +16,25 @@ from typing import Any, Literal
 
 import numpy as np
 import pyogrio.raw
+import rasterio
+import rasterio.features
+import rasterio.windows
 import shapely
 from numpy.typing import NDArray
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
 
-from photoplan.errors import InputError
-from photoplan.geometry.crs import split_compound
+from photoplan.cameras.observed import ImagePoints
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.crs import crs_label, same_crs, split_compound
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.units import MetricSystem, metric_system
+from photoplan.io.disk import FileLock, disk_error, library_error, lock_of, make_parents
 from photoplan.io.drawing import drawing_metres, read_drawing
+from photoplan.io.files import check_plain_file
+from photoplan.io.gdal import FIXED_DATE
+from photoplan.io.product import check_output
+from photoplan.io.store import give_name, scratch, together
+from photoplan.io.tables import write_table
 
 VECTOR_ERRORS = (
     DataLayerError,
@@ -202,3 +214,546 @@ def is_drawing(path: Path) -> bool:
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:300]
+
+
+_POINT, _POLYGON = 0, 3
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnFeatures:
+    """Features of one layer, taken apart into points and lines; of polygons the outlines."""
+
+    path: Path
+    XYZ: NDArray[np.float64]
+    """Vertices of all in the units of the file, shape (n, 3); NaN height: none is stated."""
+    part: NDArray[np.int64]
+    """Number of the point or line of each vertex, ascending, shape (n,)."""
+    is_point: NDArray[np.bool_]
+    """Of each part."""
+    row: NDArray[np.int64]
+    """Feature of each part, from 0."""
+    fields: dict[str, NDArray[Any]]
+    """Attributes by name in small letters, one value for each feature."""
+    crs: str | None
+    """Of the map; None: the file does not state it."""
+    height_system: str | None
+    unit: float | None = None
+    """Metres in the unit of a drawing; None: none is stated."""
+
+
+def read_drawn_features(path: Path, layer: str | None) -> DrawnFeatures:
+    """Features of a layer; `layer`: of several layers one, of a drawing a layer of the drawing."""
+    path = check_plain_file(path, "vector file")
+    drawing = is_drawing(path)
+    name, found = read_chosen(path, layer)
+    shapes, fields = found.shapes, {field.casefold(): values for field, values in found.fields.items()}
+    use = ~(shapely.is_missing(shapes) | shapely.is_empty(shapes))
+    if drawing and layer is not None:
+        use &= fields["layer"].astype(str) == layer
+        if not use.any():
+            known = ", ".join(sorted(set(fields["layer"].astype(str))))[:300]
+            raise InputError(f"{path}: nothing on layer {layer!r}; it has {known}")
+    row = np.flatnonzero(use)
+    parts = shapes[row]
+    while (shapely.get_type_id(parts) > _POLYGON).any():
+        parts, whose = shapely.get_parts(parts, return_index=True)
+        row = row[whose]
+    rings, whose = shapely.get_rings(parts, return_index=True)
+    polygons = shapely.get_type_id(parts) == _POLYGON
+    row = np.concatenate([row[~polygons], row[whose]])
+    parts = np.concatenate([parts[~polygons], rings])
+    XYZ, part = shapely.get_coordinates(parts, include_z=True, return_index=True)
+    if not len(XYZ) or not np.isfinite(XYZ[:, :2]).all():
+        raise InputError(f"{path}: layer {name}: holds nothing that can be drawn, or a coordinate that is no number")
+    stated = found.crs if drawing or states_crs(path) else None
+    crs, heights = (None, None) if stated is None else split_compound(stated, f"{path}: CRS")
+    is_point = shapely.get_type_id(parts) == _POINT
+    return DrawnFeatures(
+        path=path,
+        XYZ=XYZ,
+        part=part.astype(np.int64),
+        is_point=is_point,
+        row=row,
+        fields=fields,
+        crs=crs,
+        height_system=heights,
+        unit=found.unit,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class VectorLayer:
+    """A layer of one geometry type."""
+
+    name: str
+    kind: str
+    """Geometry type: `Polygon`, `MultiPolygon`, `LineString Z`, `Point Z` …"""
+    shapes: Sequence[Any]
+    """Shapely geometries, (n,), metres."""
+    columns: Mapping[str, NDArray[Any]]
+    """Values of each field, (n,)."""
+
+
+def write_vector(path: Path, **layer: Any) -> None:
+    """Write a layer as `pyogrio.raw.write`, without the time of writing."""
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": FIXED_DATE})
+    pyogrio.raw.write(os.fspath(path), **layer)
+
+
+def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str | None) -> None:
+    """Write layers as one GeoPackage, which appears complete or not at all and replaces an older one.
+
+    Without a `crs` they lie in a plane of their own, such as that of an image.
+    """
+    try:
+        make_parents(path.parent)
+        with scratch(path.parent) as folder:
+            partial = folder / path.name
+            warnings.filterwarnings("ignore", "'crs' was not provided")
+            for layer in layers:
+                write_vector(
+                    partial,
+                    geometry=shapely.to_wkb(np.array([*layer.shapes], object)),
+                    field_data=list(layer.columns.values()),
+                    fields=list(layer.columns),
+                    layer=layer.name,
+                    driver="GPKG",
+                    geometry_type=layer.kind,
+                    crs=crs,
+                    append=partial.exists(),
+                )
+            give_name(partial, path)
+    except OSError as error:
+        raise disk_error(path, error) from error
+    except RuntimeError as error:
+        raise library_error(path, error) from error
+
+
+@dataclass(frozen=True, eq=False)
+class PointLayer:
+    """A layer of points in space."""
+
+    name: str
+    XYZ: NDArray[np.float64]
+    """(n, 3), metres."""
+    columns: Mapping[str, NDArray[Any]]
+    """Values of each field, (n,)."""
+
+
+def write_point_layers(path: Path, layers: Sequence[PointLayer], crs: str) -> None:
+    """Write layers of points as one GeoPackage, which appears complete or not at all and replaces an older one.
+
+    Layers without points are left out.
+    """
+    vectors = [
+        VectorLayer(item.name, "Point Z", shapely.points(item.XYZ), item.columns) for item in layers if len(item.XYZ)
+    ]
+    write_geopackage(path, vectors, crs)
+
+
+def write_residuals(
+    path: Path,
+    points: ImagePoints,
+    residuals: NDArray[np.float64],
+    normalised: NDArray[np.float64],
+    redundancies: NDArray[np.float64],
+    rejected: NDArray[np.bool_],
+) -> None:
+    """Write measurements with their residuals as a table that `photoplan adjust` reads again as image points."""
+    pairs = ("residual", "normalised", "redundancy")
+    names = [f"{name}_{axis}" for name in pairs for axis in "xy"]
+    rows = []
+    used: NDArray[np.bool_] = np.asarray(np.isfinite(residuals).all(axis=1))
+    for k in range(len(points)):
+        numbers = [*(f"{v:.10g}" for v in points.xy[k]), *(f"{v:.6g}" for v in points.sigma[k])]
+        for values in (residuals[k], normalised[k], redundancies[k]):
+            numbers += ["" if not np.isfinite(v) else f"{v:.4f}" for v in values]
+        state = "rejected" if rejected[k] else "yes" if used[k] else "no"
+        rows.append([points.points[points.point[k]], points.images[points.image[k]], *numbers, state])
+    write_table(path, ["point", "image", "x", "y", "sigma_x", "sigma_y", *names, "used"], rows)
+
+
+_KINDS = {
+    "Polygon": ("Polygon", "MultiPolygon"),
+    "Point": ("Point", "MultiPoint"),
+    "LineString": ("LineString", "MultiLineString"),
+}
+_PLURAL = {"Polygon": "polygons", "Point": "points", "LineString": "lines"}
+
+
+@dataclass(frozen=True, eq=False)
+class Feature:
+    """One object of a vector file."""
+
+    name: str
+    """Its column `image`, `name`, `NAME` or `id`, else its number from 1."""
+    geometry: Any
+    """Shapely geometry; Z is kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class VectorFeatures:
+    """Objects of one layer."""
+
+    path: Path
+    crs: str | None
+    """As the file states it; None: it does not."""
+    items: tuple[Feature, ...]
+    fields: tuple[str, ...] = ()
+    """Names of the columns."""
+
+
+def read_features(path: Path, *kinds: str, crs: str | None = None) -> VectorFeatures:
+    """Objects of the first layer of a GeoPackage, Shapefile, GeoJSON or FlatGeobuf."""
+    path = check_plain_file(path, "vector file")
+    with path.open("rb") as file:
+        head = file.read(16)
+    if not head.startswith(tuple(MAGIC)) and not head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+        raise InputError(f"{path}: not a vector file that is read here; allowed are GeoPackage, Shapefile, GeoJSON")
+    found = read_layer(path)
+    shapes, columns = found.shapes, found.fields
+    names = next((columns[key] for key in ("image", "name", "NAME", "Name", "id", "ID") if key in columns), None)
+    allowed = [name for kind in kinds for name in _KINDS[kind]]
+    items = []
+    for i, shape in enumerate(shapes):
+        if shape is None or shape.is_empty:
+            continue
+        if shape.geom_type not in allowed:
+            raise InputError(
+                f"{path}: feature {i + 1} is a {shape.geom_type}; allowed are {', '.join(allowed)}. Give another file"
+            )
+        name = None if names is None else names[i]
+        items.append(Feature(str(name) if name is not None and str(name).strip() else str(i + 1), shape))
+    if not items:
+        raise InputError(f"{path}: holds no {' or '.join(kinds)}; give a file that does")
+    _refuse_invalid(path, items)
+    own = found.crs if states_crs(path) else None
+    if own is not None and crs is not None:
+        system = metric_system(own, f"{path}: CRS")
+        if not system.is_plain:
+            items = [Feature(item.name, _in_metres(item.geometry, system, str(path))) for item in items]
+        own = system.crs
+    if own is not None and crs is not None and not same_crs(own, crs):
+        raise InputError(
+            f"{path}: {_PLURAL[kinds[0]]} in {crs_label(own)}, the model is in {crs_label(crs)}; reproject them"
+        )
+    return VectorFeatures(path, own, tuple(items), tuple(found.fields))
+
+
+def _in_metres(shape: Any, system: MetricSystem, where: str) -> Any:
+    """A geometry with its coordinates in metres."""
+    if not shapely.has_z(shape):
+        return shapely.transform(shape, lambda XY: XY * system.scale)
+    return shapely.transform(shape, lambda XYZ: system.to_metres(XYZ, f"{where}: heights"), include_z=True)
+
+
+def _refuse_invalid(path: Path, items: Sequence[Feature]) -> None:
+    shapes = np.array([item.geometry for item in items], object)
+    wrong = [
+        f"{item.name!r} ({reason})"
+        for item, valid, reason in zip(items, shapely.is_valid(shapes), shapely.is_valid_reason(shapes))
+        if not valid and item.geometry.geom_type in _KINDS["Polygon"]
+    ]
+    if wrong:
+        raise InputError(f"{path}: {len(wrong)} polygons cross themselves or overlap: {', '.join(wrong)}; repair them")
+
+
+def label_polygons(labels: NDArray[np.int32], grid: MapGrid) -> dict[int, Any]:
+    """Outline of every positive label of a grid, along the edges of its pixels, as a multipolygon."""
+    to_map = rasterio.Affine(grid.resolution, 0.0, grid.left, 0.0, -grid.resolution, grid.top)
+    parts: dict[int, list[Any]] = {}
+    shapes = rasterio.features.shapes(np.ascontiguousarray(labels, np.int32), mask=labels > 0, transform=to_map)
+    for outline, value in shapes:
+        shell, *holes = outline["coordinates"]
+        parts.setdefault(int(value), []).append(shapely.Polygon(shell, holes))
+    return {value: shapely.MultiPolygon(found) for value, found in sorted(parts.items())}
+
+
+def check_vectors(path: Path) -> None:
+    """Refuse a name that `write_features` would not write, before anything is computed for it."""
+    if path.suffix.lower() != ".gpkg":
+        raise UsageError(f"{path}: vectors are written as GeoPackage; give a name that ends with .gpkg")
+
+
+def write_features(
+    path: Path, kind: str, shapes: Sequence[Any], columns: Mapping[str, NDArray[Any]], crs: str | None, layer: str
+) -> None:
+    """Write one layer as a GeoPackage that appears under its name only when it is complete; replaces an older one."""
+    check_vectors(path)
+    write_geopackage(path, [VectorLayer(layer, kind, shapes, columns)], crs)
+
+
+#: Side of the parts in which a raster is read, pixels.
+_PART = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Polygons that somebody has given to images of a mosaic."""
+
+    grid: MapGrid
+    shapes: tuple[tuple[Any, int], ...]
+    """Polygon, and row of its image in the table of sources, plus one; the last of those over each other counts."""
+
+    @property
+    def meet(self) -> bool:
+        """Whether a polygon lies in the grid, at least in part."""
+        return any(polygon.intersects(shapely.box(*self.grid.bounds)) for polygon, _ in self.shapes)
+
+    def digest(self, margin: float) -> str:
+        """Of what lies in the grid, and `margin` metres around it: the same for regions that are the same there."""
+        left, bottom, right, top = self.grid.bounds
+        box = shapely.box(left - margin, bottom - margin, right + margin, top + margin)
+        found = hashlib.sha256()
+        for polygon, row in self.shapes:
+            part = shapely.normalize(shapely.set_precision(polygon.intersection(box), 1e-6))
+            if part.area > 0:
+                found.update(row.to_bytes(4, "little") + shapely.to_wkb(part, output_dimension=2))
+        return found.hexdigest()
+
+    def rows(self, window: Window) -> NDArray[np.uint16]:
+        """Row plus one for each pixel of a window whose centre lies in a polygon; 0 elsewhere."""
+        grid, shape = self.grid, (window.height, window.width)
+        left, top = grid.left + window.col * grid.resolution, grid.top - window.row * grid.resolution
+        box = shapely.box(left, top - shape[0] * grid.resolution, left + shape[1] * grid.resolution, top)
+        near = [(polygon, row) for polygon, row in self.shapes if polygon.intersects(box)]
+        if not near:
+            return np.zeros(shape, np.uint16)
+        to_map = rasterio.Affine(grid.resolution, 0.0, left, 0.0, -grid.resolution, top)
+        return np.asarray(rasterio.features.rasterize(near, shape, transform=to_map, dtype="uint16"))
+
+
+def source_regions(path: Path, grid: MapGrid, images: int) -> dict[int, Any]:
+    """Outline of what each image paints, along the edges of pixels: multipolygons by row plus one."""
+    found: dict[int, list[Any]] = {}
+    with rasterio.open(path) as file:
+        for part in grid.window.tiles(_PART):
+            at = rasterio.windows.Window(part.col, part.row, part.width, part.height)
+            left, top = grid.left + part.col * grid.resolution, grid.top - part.row * grid.resolution
+            labels = file.read(1, window=at).astype(np.int32)
+            labels[labels > images] = 0
+            here = MapGrid(
+                left=left, top=top, resolution=grid.resolution, width=part.width, height=part.height, crs=grid.crs
+            )
+            for row, shape in label_polygons(labels, here).items():
+                found.setdefault(row, []).append(shape)
+    whole = ((row, shapely.union_all(parts)) for row, parts in sorted(found.items()))
+    return {row: shape if shape.geom_type == "MultiPolygon" else shapely.MultiPolygon([shape]) for row, shape in whole}
+
+
+def write_regions(path: Path, images: Sequence[str], shapes: Mapping[int, Any], crs: str | None) -> None:
+    """Write regions as a GeoPackage with the layer `regions`: columns image, source and area_m2."""
+    rows = list(shapes)
+    columns = {
+        "image": np.array([images[row - 1] for row in rows], object),
+        "source": np.array(rows, np.int64),
+        "area_m2": np.array([shapes[row].area for row in rows], float),
+    }
+    write_features(path, "MultiPolygon", [shapes[row] for row in rows], columns, crs, "regions")
+
+
+def read_regions(path: Path, images: Sequence[str], grid: MapGrid, known: Sequence[str] = ()) -> Regions:
+    """Regions of a GeoPackage, as `write_regions` writes them or somebody has drawn them; those of images that are
+    `known`, but none of the table of sources `images`, are left out.
+    """
+    read = read_features(path, "Polygon", crs=grid.crs)
+    features = read.items
+    if "image" not in read.fields:
+        raise InputError(f"{path}: no column `image`, which says whose each region is")
+    names = [each.name for each in features]
+    unknown = [name for name in names if name not in images and name not in known]
+    if unknown:
+        raise InputError(
+            f"{path}: regions of {', '.join(map(repr, dict.fromkeys(unknown)))}, which "
+            f"{'is' if len(set(unknown)) == 1 else 'are'} not in the mosaic; choose these images too, or take the "
+            "regions out"
+        )
+    rows = {name: row for row, name in enumerate(images, 1)}
+    taken = ((each.geometry, rows[name]) for each, name in zip(features, names) if name in rows)
+    return Regions(grid, tuple(taken))
+
+
+#: Ending of the name and the driver that writes it.
+FORMATS = {".gpkg": "GPKG", ".shp": "ESRI Shapefile", ".geojson": "GeoJSON", ".json": "GeoJSON", ".dxf": "DXF"}
+#: Vertices of the lines that are handed over at once.
+BATCH = 500_000
+
+
+@dataclass(frozen=True, eq=False)
+class ContourRow:
+    """One contour."""
+
+    xy: NDArray[np.float64]
+    """Vertices, shape (n, 2), metres; of a closed line the last is the first."""
+    height: float
+    index: bool
+    """It is an index contour."""
+    depression: bool
+    """It runs round lower ground."""
+
+
+@dataclass(frozen=True)
+class LabelRow:
+    """Text on a contour."""
+
+    X: float
+    Y: float
+    height: float
+    angle: float
+    """Degrees counter-clockwise from east."""
+    text: str
+    size: float
+    """Height of the text, metres."""
+
+
+def contour_files(path: Path, labels: bool) -> list[Path]:
+    """What `write_contours` writes: the file, and for formats of one layer another one with the labels."""
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise UsageError(f"{path}: contours are written as {', '.join(FORMATS)}; give a name with such an ending")
+    if labels and suffix not in (".gpkg", ".dxf"):
+        return [path, path.with_name(f"{path.stem}_labels{path.suffix}")]
+    return [path]
+
+
+def write_contours(
+    path: Path,
+    lines: Iterable[ContourRow],
+    labels: Callable[[], Sequence[LabelRow]] | None,
+    crs: str,
+    *,
+    inputs: Sequence[Path] = (),
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write contours as 3-D lines as they come; files appear under their names only when complete.
+
+    A GeoPackage has the layers `contours` and `labels`; Shapefile and GeoJSON have a second file `NAME_labels`; a DXF
+    the CAD layers CONTOUR, CONTOUR_INDEX and CONTOUR_LABEL. Columns are `height`, `is_index`, `depression`; of labels
+    `text`, `height`, `angle` (degrees counter-clockwise from east) and `size` (metres).
+    """
+    files = contour_files(path, labels is not None)
+    for file in files:
+        check_output(file, inputs, overwrite=overwrite)
+    try:
+        with FileLock(lock_of(path)), scratch(path.parent) as made:
+            # Versions before left a folder of this name when they were killed.
+            old = path.with_name(f".{path.name}.partial")
+            if old.is_dir() and not old.is_symlink():
+                shutil.rmtree(old, ignore_errors=True)
+            folder = made / "files"
+            folder.mkdir()
+            if path.suffix.lower() == ".dxf":
+                _write_dxf(folder / path.name, lines, labels)
+            else:
+                _write_layers([folder / file.name for file in files], lines, labels, crs)
+            # The main file comes last: where it is, its companions are.
+            with together():
+                for part in sorted(folder.iterdir(), key=lambda p: (p.name == path.name, p.name)):
+                    give_name(part, path.with_name(part.name))
+    except RuntimeError as error:
+        raise library_error(path, error) from error
+    except OSError as error:
+        raise disk_error(path, error) from error
+    return files
+
+
+def _batches(rows: Iterable[ContourRow], most: float) -> Iterator[list[ContourRow]]:
+    """Lines in batches of about so many vertices."""
+    batch: list[ContourRow] = []
+    vertices = 0
+    for row in rows:
+        batch.append(row)
+        vertices += len(row.xy)
+        if vertices >= most:
+            yield batch
+            batch, vertices = [], 0
+    if batch:
+        yield batch
+
+
+def _write_layers(
+    files: list[Path], lines: Iterable[ContourRow], labels: Callable[[], Sequence[LabelRow]] | None, crs: str
+) -> None:
+    driver = FORMATS[files[0].suffix.lower()]
+    written = False
+    # GDAL cannot add to a GeoJSON without reading it again.
+    for batch in _batches(lines, np.inf if driver == "GeoJSON" else BATCH):
+        _write_lines(files[0], driver, batch, crs, written)
+        written = True
+    if not written:
+        _write_lines(files[0], driver, [], crs, False)
+    if labels is None:
+        return
+    found = labels()
+    points = np.array([(row.X, row.Y, row.height) for row in found]).reshape(-1, 3)
+    columns = {
+        "text": np.array([row.text for row in found], object),
+        "height": points[:, 2],
+        "angle": np.array([row.angle for row in found], float),
+        "size": np.array([row.size for row in found], float),
+    }
+    one_file = len(files) == 1
+    _write_layer(files[-1], driver, "labels", "Point Z", shapely.points(points), columns, crs, one_file)
+
+
+def _write_lines(path: Path, driver: str, rows: list[ContourRow], crs: str, append: bool) -> None:
+    counts = [len(row.xy) for row in rows]
+    heights = np.array([row.height for row in rows], float)
+    xyz = np.column_stack([np.concatenate([row.xy for row in rows]), np.repeat(heights, counts)]) if rows else None
+    shapes = shapely.linestrings(xyz, indices=np.repeat(np.arange(len(rows)), counts)) if rows else np.array([], object)
+    columns = {
+        "height": heights,
+        "is_index": np.array([row.index for row in rows], np.int16),
+        "depression": np.array([row.depression for row in rows], np.int16),
+    }
+    _write_layer(path, driver, "contours", "LineString Z", shapes, columns, crs, append)
+
+
+def _write_layer(
+    path: Path,
+    driver: str,
+    layer: str,
+    kind: str,
+    shapes: Any,
+    columns: dict[str, NDArray[Any]],
+    crs: str,
+    append: bool,
+) -> None:
+    write_vector(
+        path,
+        geometry=shapely.to_wkb(np.asarray(shapes, object), output_dimension=3),
+        field_data=list(columns.values()),
+        fields=list(columns),
+        layer=layer if driver == "GPKG" else path.stem,
+        driver=driver,
+        geometry_type=kind,
+        crs=crs,
+        append=append,
+    )
+
+
+def _write_dxf(path: Path, lines: Iterable[ContourRow], labels: Callable[[], Sequence[LabelRow]] | None) -> None:
+    """A DXF of release 12, which every CAD program reads: 3-D polylines, and texts turned along them."""
+    with path.open("w", encoding="ascii", newline="\r\n") as file:
+        file.write(
+            "0\nSECTION\n2\nHEADER\n9\n$ACADVER\n1\nAC1009\n0\nENDSEC\n0\nSECTION\n2\nTABLES\n0\nTABLE\n2\nLAYER\n"
+        )
+        file.write("70\n3\n")
+        for name, colour in (("CONTOUR", 34), ("CONTOUR_INDEX", 32), ("CONTOUR_LABEL", 7)):
+            file.write(f"0\nLAYER\n2\n{name}\n70\n0\n62\n{colour}\n6\nCONTINUOUS\n")
+        file.write("0\nENDTAB\n0\nENDSEC\n0\nSECTION\n2\nENTITIES\n")
+        for row in lines:
+            closed = len(row.xy) > 3 and bool((row.xy[0] == row.xy[-1]).all())
+            layer = "CONTOUR_INDEX" if row.index else "CONTOUR"
+            # Flag 8: a polyline in space; 1: closed.
+            file.write(f"0\nPOLYLINE\n8\n{layer}\n66\n1\n10\n0.0\n20\n0.0\n30\n0.0\n70\n{8 + closed}\n")
+            tail = f"30\n{row.height:.6f}\n70\n32\n"
+            for x, y in (row.xy[:-1] if closed else row.xy).tolist():
+                file.write(f"0\nVERTEX\n8\n{layer}\n10\n{x:.7f}\n20\n{y:.7f}\n{tail}")
+            file.write(f"0\nSEQEND\n8\n{layer}\n")
+        for label in labels() if labels is not None else ():
+            at = f"{{0}}\n{label.X:.4f}\n{{1}}\n{label.Y:.4f}\n{{2}}\n{label.height:.6f}\n"
+            # Justified to the middle (72, 73) of its second alignment point.
+            file.write(f"0\nTEXT\n8\nCONTOUR_LABEL\n{at.format(10, 20, 30)}40\n{label.size:.4f}\n1\n{label.text}\n")
+            file.write(f"50\n{label.angle:.4f}\n72\n1\n{at.format(11, 21, 31)}73\n2\n")
+        file.write("0\nENDSEC\n0\nEOF\n")

@@ -1,31 +1,65 @@
-"""Two images registered against each other: displacements of patches by least-squares matching, with their accuracy.
-
-Patches lie on a regular grid of the first image. Each is found in the other image to a whole pixel by its correlation,
-and then by least-squares matching (affine and radiometric parameters) to a small part of one; both images stay as they
-are, the place where a patch is expected is computed strictly.
-
-Between pixels a spline has less noise than on them, and residuals become smaller towards half pixels: matching would be
-drawn there, by 0.05 px at a signal-to-noise ratio of 10. So both images are smoothed a little first, after which noise
-is nearly the same everywhere. How much larger the errors then are than the fit says, `photoplan.matching.patch_noise`
-finds out.
-"""
+"""Registration of two images: patches, their noise, and smooth displacements."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.adjustment.least_squares import huber, solve, spread
 from photoplan.codec import storable
 from photoplan.geometry.grid import Placement, Window
 from photoplan.kernels.correlation import correlate
 from photoplan.kernels.patch_match import sample_spline, spline_coefficients
-from photoplan.matching.grey import Grey, patches_at
-from photoplan.matching.patch_noise import noise_factors
+from photoplan.matching.features import Grey, patches_at
 from photoplan.matching.refine import RefineSettings, disc, match_between
+from photoplan.plain import pick
 
 _Floats = NDArray[np.float64]
+
+#: Distances at which noise may be alike, pixels.
+REACH = 4
+#: The noise that is expected counts as so many patches.
+_EXPECTED = 10.0
+
+
+def noise_factors(columns: _Floats, observed: _Floats, mask: NDArray[np.bool_], expected: _Floats) -> _Floats:
+    """Factors f of the standard deviations of the first two unknowns of every patch, (n, 2)."""
+    n, side, _, unknowns = columns.shape
+    flat = (columns * mask[..., None]).reshape(n, -1, unknowns)
+    q = np.linalg.qr(flat)[0]
+    e = (observed * mask).reshape(n, -1)
+    e = e - np.einsum("npk,nk->np", q, np.einsum("npk,np->nk", q, e))
+    free = mask.sum() - unknowns
+    e /= np.maximum(np.sqrt((e**2).sum(axis=1, keepdims=True) / free), 1e-12)
+    pixels = _products(mask[None].astype(float))[0]
+    along = np.correlate(expected, expected, "full") / (expected**2).sum()
+    one = np.zeros(2 * REACH + 1)
+    half = len(along) // 2
+    one[REACH - half : REACH + half + 1] = along
+    prior = _EXPECTED * pixels * np.outer(one, one).reshape(-1)
+    C = (_products(e.reshape(n, side, side)).sum(axis=0) + prior) / ((n + _EXPECTED) * pixels)
+    B = sum(_products(q[..., k].reshape(n, side, side)).sum(axis=0) for k in range(unknowns))
+    B = B / ((n + _EXPECTED) * pixels)
+    out = np.empty((n, 2))
+    for axis in range(2):
+        others = np.linalg.qr(np.delete(flat, axis, axis=2))[0]
+        g = flat[..., axis] - np.einsum("npk,nk->np", others, np.einsum("npk,np->nk", others, flat[..., axis]))
+        R = _products(g.reshape(n, side, side))
+        R = R / np.maximum(R[:, [R.shape[1] // 2]], 1e-300)
+        out[:, axis] = np.sqrt(np.maximum(R @ C, 0.0) / np.maximum(1.0 - R @ B, 0.2))
+    return np.maximum(out, 1.0)
+
+
+def _products(values: _Floats) -> _Floats:
+    """Sums of products of pixels at distances up to `REACH`, row by row of distances, (n, (2 REACH + 1)²)."""
+    size = values.shape[1] + REACH
+    power = np.abs(np.fft.rfft2(values, (size, size))) ** 2
+    near = np.arange(-REACH, REACH + 1)
+    return np.asarray(np.fft.irfft2(power, (size, size))[:, near[:, None], near].reshape(len(values), -1))
+
 
 #: What became of a patch: found; pixels missing in one of the images; no texture, or along one direction only; not
 #: found again, or unlike; found with too large a standard deviation; contradicts its neighbours.
@@ -314,3 +348,85 @@ def _apart(found: PatchDisplacements, shape: tuple[int, int]) -> NDArray[np.bool
         limit = np.maximum(_APART * (usual + _ALLOWED), _SIGMAS * sigma)
         apart |= enough & good & (np.abs(field[1:-1, 1:-1] - middle) > limit)
     return apart.reshape(-1)
+
+
+MODELS = ("none", "shift", "affine")
+#: Residuals count less beyond so many robust standard deviations.
+_LIMIT = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothModel:
+    """A smooth displacement: d = d0 + A (xy − middle), for dx and dy."""
+
+    kind: str
+    middle: tuple[float, float]
+    """Pixels of the first image."""
+    unknowns: _Floats
+    """d0 and, of an affine mapping, the derivatives along columns and rows; a row for dx, one for dy, (2, u)."""
+    covariances: _Floats
+    """Of each row, (2, u, u)."""
+    rms: tuple[float, float]
+    """Residuals of dx and of dy, pixels."""
+
+    def __call__(self, at: _Floats) -> _Floats:
+        """Displacements at pixels (n, 2)."""
+        return np.asarray(_columns(at, self.middle, self.unknowns.shape[1]) @ self.unknowns.T)
+
+    def json_fields(self) -> dict[str, Any]:
+        """Unknowns with their covariances."""
+        names = ("d0", "along_columns", "along_rows")[: self.unknowns.shape[1]]
+        sigma = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+        axes = {
+            axis: {
+                **dict(zip(names, self.unknowns[k].tolist())),
+                "sigma": dict(zip(names, sigma[k].tolist())),
+                "covariance": self.covariances[k].tolist(),
+            }
+            for k, axis in enumerate(("dx", "dy"))
+        }
+        return {**pick(self, "kind", "middle", rms_px="rms"), **axes}
+
+
+def _columns(at: _Floats, middle: tuple[float, float], unknowns: int) -> _Floats:
+    off = np.asarray(at, float) - np.array(middle)
+    return np.column_stack([np.ones(len(off)), off])[:, :unknowns]
+
+
+def fit_smooth(found: PatchDisplacements, kind: str, overlap: float) -> SmoothModel | None:
+    """A shift or an affine mapping through the vectors by robust least squares; None for the kind `none`.
+
+    Parameters
+    ----------
+    found : PatchDisplacements
+    kind : str
+        See `MODELS`.
+    overlap : float
+        So many patches share a pixel: vectors are no more independent than as many fewer.
+
+    Notes
+    -----
+    Covariances hold the misfit of the vectors (sigma0): what is not smooth is taken for noise.
+    """
+    good = found.state == FOUND
+    unknowns = {"shift": 1, "affine": 3}.get(kind, 0)
+    if not unknowns or good.sum() < 2 * unknowns:
+        return None
+    at, d, sigma = found.at[good].astype(float), found.moved[good], found.sigma[good]
+    column, row = at.mean(axis=0).tolist()
+    middle = column, row
+    A = _columns(at, middle, unknowns)
+    rows, covariances, rms = [], [], []
+    for axis in range(2):
+        # Vectors are believed by their own accuracy, but none far more than others: the misfit is the field's.
+        weight = 1 / np.maximum(sigma[:, axis], np.median(sigma[:, axis])) ** 2
+        fit = solve(A, d[:, axis], weight)
+        for _ in range(10):
+            size = fit.residuals * np.sqrt(weight)
+            fit = solve(A, d[:, axis], weight * huber(size / max(spread(size), 1e-9), _LIMIT))
+        rows.append(fit.unknowns)
+        covariances.append(fit.covariance * max(overlap, 1.0))
+        rms.append(float(np.sqrt((fit.residuals**2).mean())))
+    return SmoothModel(
+        kind=kind, middle=middle, unknowns=np.array(rows), covariances=np.array(covariances), rms=(rms[0], rms[1])
+    )

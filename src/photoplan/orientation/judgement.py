@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import PhotoplanError
-from photoplan.orientation.resection.model import MeasuredPoints, Resected
+from photoplan.orientation.resection import MeasuredPoints, Resected
 
 _Floats = NDArray[np.float64]
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.adjustment.iterate import Equations, by_differences, levenberg
-from photoplan.adjustment.robust import bisquare, spread
+from photoplan.adjustment.least_squares import Equations, bisquare, by_differences, levenberg, spread
 from photoplan.errors import GeometryError
 
 _Floats = NDArray[np.float64]

@@ -13,13 +13,10 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.footprint import depth_tilt, footprint_levels
 from photoplan.kernels.position import tile_runs
-from photoplan.plan.anchors import Anchors
-from photoplan.plan.choice import Drawn
-from photoplan.plan.compile import FINEST, AnchorRule, compile_anchors
-from photoplan.plan.feather import Feather
+from photoplan.plan.anchors import FINEST, AnchorRule, Anchors, compile_anchors
+from photoplan.plan.footprint import Tile, Tiles
 from photoplan.plan.ground import TileGround
-from photoplan.plan.owner import Ownership, Share
-from photoplan.plan.tiles import Tile, Tiles
+from photoplan.plan.sources import Drawn, Feather, Ownership, Share
 from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
 

@@ -1,9 +1,10 @@
-"""Error budgets: what limits the position of products, cause by cause, before the flight or for a project."""
+"""Error budgets: causes, tables of the sources, and polynomials."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+from math import pi
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +12,229 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import Camera, on_level
+from photoplan.cameras.rpc import fit_rpc
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.grid import MapGrid
+from photoplan.geometry.local import GeodeticGround
+from photoplan.io.camera.rpc.text import rpc_text
+from photoplan.io.disk import make_parents
+from photoplan.io.files import unique_stems
+from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project, parse_project
-from photoplan.io.project.model import Project
-from photoplan.io.project.posed import Image
+from photoplan.io.project.model import Image, Project
+from photoplan.io.store import recording, write_atomically
 from photoplan.kernels.weights import KERNELS
-from photoplan.plan.accuracy import SourceErrors, figures_at, in_image, resampling_sigma
+from photoplan.plain import pick
+from photoplan.plan.accuracy import (
+    FILM_CORNER,
+    SourceErrors,
+    admissible_height_error,
+    admissible_shift,
+    displacement_by_height,
+    displacement_by_kappa,
+    displacement_by_tilt,
+    figures_at,
+    in_image,
+    orientation_effect,
+    resampling_sigma,
+)
+from photoplan.plan.footprint import footprint
 from photoplan.project.cameras import camera_without_pixels
+from photoplan.project.error_model import height_errors, known_height_errors, source_errors
 from photoplan.project.ground import Ground, ground_of
-from photoplan.project.uncertain import height_errors, known_height_errors, source_errors
-from photoplan.surfaces.height_errors import HeightErrors, StatedHeightErrors
+from photoplan.project.scene import input_files
+from photoplan.surfaces.hybrid import HeightErrors, StatedHeightErrors
 from photoplan.targets.map import MapTarget
+
+_GON = pi / 200
+#: Flying heights and height errors of table 4.3, metres.
+_HEIGHTS, _ERRORS = (750.0, 1500.0, 3750.0, 7500.0), (1.0, 5.0, 10.0, 25.0, 100.0)
+#: The worked example: 0.1 mm at 1 : 5000 from images 1 : 10 000 with c = 150 mm, at the tangent 0.733 along each axis.
+_PRODUCT, _MAP, _SCALE, _C, _W = 1e-4, 5000.0, 10_000.0, 0.150, 0.733
+#: Standard deviations of the two images of §8.2.2: X0, Y0, Z0 (metres), ω, φ, κ (gon); c, flying height, scale number.
+_IMAGES = {
+    "5162": ((0.14, 0.16, 0.05), (0.0095, 0.0082, 0.0032)),
+    "5164": ((0.24, 0.32, 0.19), (0.0227, 0.0134, 0.0063)),
+}
+_FLIGHT = (0.15324, 900.0, 6000.0)
+
+
+@dataclass(frozen=True)
+class SourceTables:
+    """What the source prints."""
+
+    heights: tuple[tuple[float, ...], ...]
+    """Table 4.3: radial displacement in the image corner, mm, by flying height and height error."""
+    shift: float
+    """Admissible error of X0, Y0 in the worked example of §4.8.2.1, metres."""
+    height: float
+    """Admissible error of Z0, metres."""
+    tilt: float
+    """Admissible error of ω and φ in the worked example of §4.8.2.2, gon."""
+    kappa: float
+    """Of κ, gon."""
+    images: dict[str, tuple[float, ...]]
+    """§8.2.2: displacement in the image corner by X0, Y0, Z0, ω, φ, κ of two images, µm."""
+
+    def json_fields(self) -> dict[str, Any]:
+        """All figures with their units."""
+        names = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+        return {
+            "table_4_3_mm": {
+                f"{h:g} m": dict(zip(map("{:g} m".format, _ERRORS), row)) for h, row in zip(_HEIGHTS, self.heights)
+            },
+            "admissible": {
+                "X0_Y0_m": self.shift,
+                "Z0_m": self.height,
+                "omega_phi_gon": self.tilt,
+                "kappa_gon": self.kappa,
+            },
+            "orientation_8_2_2_um": {image: dict(zip(names, row)) for image, row in self.images.items()},
+        }
+
+    def __str__(self) -> str:
+        lines = ["Ecker 1991, table 4.3: radial displacement in the corner (r = 140 mm) by a height error, mm"]
+        lines.append("  flying height" + "".join(f"{e:>7g} m" for e in _ERRORS))
+        lines += [f"  {h:>11g} m" + "".join(f"{v:>9.1f}" for v in row) for h, row in zip(_HEIGHTS, self.heights)]
+        lines += [
+            "Ecker 1991, §4.8.2: admissible for 0.1 mm at 1 : 5000 in the corner, image 1 : 10 000, c = 150 mm",
+            f"  X0, Y0   {self.shift:.2f} m",
+            f"  Z0       {self.height:.2f} m",
+            f"  ω, φ     {self.tilt:.3f} gon",
+            f"  κ        {self.kappa:.3f} gon",
+            "Ecker 1991, §8.2.2: displacement in the corner by the orientation's standard deviations, µm",
+            "  image        X0     Y0     Z0      ω      φ      κ",
+        ]
+        return "\n".join(
+            [*lines, *(f"  {name:<7}" + "".join(f"{v:>7.0f}" for v in row) for name, row in self.images.items())]
+        )
+
+
+def source_tables() -> SourceTables:
+    """Tables and examples, from the formulas of `photoplan.plan.accuracy`."""
+    in_image = _PRODUCT * _MAP / _SCALE
+    c, height, scale = _FLIGHT
+    images = {}
+    for name, (center, angles) in _IMAGES.items():
+        omega, phi, kappa = (a * _GON for a in angles)
+        effect = orientation_effect(center, (omega, phi, kappa), c, height, scale_number=scale, w=_W)
+        images[name] = tuple(v * 1e6 for v in astuple(effect))
+    return SourceTables(
+        heights=tuple(
+            tuple((displacement_by_height(FILM_CORNER, h, np.array(_ERRORS)) * 1000).tolist()) for h in _HEIGHTS
+        ),
+        shift=float(admissible_shift(in_image, _SCALE)),
+        height=float(admissible_height_error(FILM_CORNER, _C * _SCALE, in_image)),
+        tilt=float(in_image / displacement_by_tilt(_GON, _C, _W)),
+        kappa=float(in_image / displacement_by_kappa(_GON, _C, _W)),
+        images=images,
+    )
+
+
+#: Heights are taken further than those of the terrain, by this part of their range or of the distance from the camera.
+_ROOM, _OF_DISTANCE = 0.1, 0.02
+
+
+@dataclass(frozen=True)
+class PolynomialsRequest:
+    """What is asked."""
+
+    project: Path
+    output: Path | None = None
+    """Folder of the files; None: that of the project."""
+    overwrite: bool = False
+    dry_run: bool = False
+    """Whether to fit polynomials, and write nothing."""
+
+
+@dataclass(frozen=True)
+class ImagePolynomials:
+    """What the polynomials of an image leave of its camera, between the places of the fit."""
+
+    image: str
+    file: Path
+    rms: tuple[float, float]
+    """Of column and row, pixels."""
+    worst: float
+    """Pixels."""
+    heights: tuple[float, float]
+    """For which they were fitted, in the ground's height system, metres."""
+
+
+@dataclass(frozen=True)
+class PolynomialsReport:
+    """What came out."""
+
+    images: tuple[ImagePolynomials, ...]
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that were written."""
+        return tuple(each.file for each in self.images)
+
+    def json_fields(self) -> dict[str, Any]:
+        """Files, and the figures of each image."""
+        return pick(self, "files", "images")
+
+
+def write_polynomials(request: PolynomialsRequest) -> PolynomialsReport:
+    """Fit polynomials to all images of a project over the heights that they see, and write ``IMAGE_RPC.TXT``.
+
+    Raises
+    ------
+    UsageError
+        A file exists.
+    InputError
+        The project cannot be used, or an image has no geometry yet.
+    GeometryError
+        An image sees no terrain, or does not look down.
+    """
+    project = load_project(request.project)
+    folder = request.output or project.folder
+    stems = unique_stems(image.file for image in project.images)
+    outputs = {image.name: folder / f"{stems[image.file]}_RPC.TXT" for image in project.images}
+    inputs = [request.project, *input_files(project)]
+    for path in outputs.values():
+        check_output(path, inputs, overwrite=request.overwrite)
+    with recording("convert", request, inputs) as record:
+        fitted = [_fit(project, name, path) for name, path in outputs.items()]
+        report = PolynomialsReport(tuple(image for image, _, _ in fitted))
+        if request.dry_run:
+            return report
+        try:
+            make_parents(folder)
+        except OSError as error:
+            raise InputError(f"{folder}: the folder cannot be made ({error.strerror or error})") from None
+        for _, path, text in fitted:
+            write_atomically(path, text.encode())
+        record(report.files, report)
+    return report
+
+
+def _fit(project: Project, name: str, path: Path) -> tuple[ImagePolynomials, Path, str]:
+    ground = ground_of(project)
+    camera = camera_without_pixels(project, name)
+    seen = footprint(camera, ground.bare, ground.bounds)
+    if seen.bounds is None:
+        raise GeometryError(f"image {name!r} sees nothing of the terrain; `photoplan check` says where it looks")
+    heights = _heights(camera, seen.height_range)
+    try:
+        found = fit_rpc(camera, GeodeticGround(project.crs, ground.working_system), heights)
+    except GeometryError as error:
+        raise GeometryError(f"image {name!r}: {error}") from None
+    return (
+        ImagePolynomials(image=name, file=path, rms=found.rms, worst=found.worst, heights=heights),
+        path,
+        rpc_text(found.functions),
+    )
+
+
+def _heights(camera: Camera, seen: tuple[float, float]) -> tuple[float, float]:
+    """Heights of the fit: those that are seen, and some room."""
+    (low, high), top = seen, float(camera.vantage.point[2])
+    room = max(_ROOM * (high - low), _OF_DISTANCE * (top - low))
+    return max(low - room, camera.vantage.floor), min(high + room, (high + top) / 2)
+
 
 Triple = tuple[float, float, float]
 #: Places of an image for which a budget is made.
@@ -35,7 +247,7 @@ _USUAL_HEIGHT, _USUAL_CENTER, _USUAL_ANGLE = 0.1, 0.1, 0.01
 #: A vertical image that is stated by numbers lies here; the system does not matter.
 _CRS, _STATION = "EPSG:32633", (500_000.0, 5_000_000.0)
 #: Sides of the map of an image.
-_MAP = 41
+_MAP_BUDGET = 41
 
 
 @dataclass(frozen=True)
@@ -302,7 +514,7 @@ def _of_image(
     edges = [(0.0, far[1]), (w - 1.0, far[1]), (far[0], 0.0), (far[0], h - 1.0)]
     corners = [(x, y) for x in (0.0, w - 1.0) for y in (0.0, h - 1.0)]
     xy = np.array([tuple(far), *edges, *corners])
-    columns, rows = np.meshgrid(np.linspace(0, w - 1, _MAP), np.linspace(0, h - 1, _MAP))
+    columns, rows = np.meshgrid(np.linspace(0, w - 1, _MAP_BUDGET), np.linspace(0, h - 1, _MAP_BUDGET))
     every = np.concatenate([xy, np.stack([columns.ravel(), rows.ravel()], axis=1)])
     XY = on_level(camera, every, level)[:, :2]
     sigma = heights.sigmas(XY)
@@ -329,7 +541,9 @@ def _of_image(
     at = [0, 1 + int(total[1:5].argmax()), 5 + int(total[5:9].argmax())]
     middle = _level_figures(replace(none, image=np.sqrt(0.5)), XY[:1], level)[1]
     kept = {cause: values[at] for cause, values in parts.items() if values[at].any()}
-    return ImageBudget(image=name, gsd=float(middle[0]), parts=kept, total=total[at], map=total[9:].reshape(_MAP, _MAP))
+    return ImageBudget(
+        image=name, gsd=float(middle[0]), parts=kept, total=total[at], map=total[9:].reshape(_MAP_BUDGET, _MAP_BUDGET)
+    )
 
 
 def _level(camera: Camera, ground: Ground, name: str) -> float:

@@ -13,20 +13,17 @@ from photoplan.cameras.base import project as image_points
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
-from photoplan.io.project.cameras import image_size
-from photoplan.io.project.model import Project
-from photoplan.io.project.posed import Image
-from photoplan.orientation.plausibility import ImagePlausibility, JudgedView
+from photoplan.io.project.model import Image, Project, image_size
+from photoplan.orientation.conventions import ImagePlausibility, JudgedView
 from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint, footprint, mean_gsd
-from photoplan.products.balance.glance import colour_advice
-from photoplan.products.judged import against_files, judged, reading_of_block
-from photoplan.products.orthophoto.look import heights_in_feet, two_figures
-from photoplan.project.cameras import camera_without_pixels, is_there
+from photoplan.products.balance import colour_advice
+from photoplan.products.orthophoto.plan import heights_in_feet, two_figures
+from photoplan.products.plausibility import against_files, judged, reading_of_block
+from photoplan.project.cameras import camera_without_pixels, is_there, posed_camera
 from photoplan.project.ground import Ground, ground_of
-from photoplan.project.posed import posed_camera
 from photoplan.project.scene import map_order, open_scene, unusable_images
-from photoplan.surfaces.intersect import intersect
+from photoplan.surfaces.shifted import intersect
 
 #: Displacements by the choice of earth curvature above this are reported, pixels.
 _CHOICE_MATTERS = 0.1

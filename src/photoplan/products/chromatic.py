@@ -13,12 +13,19 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.chromatic_file import read_chromatic, write_chromatic
+from photoplan.io.quality_files import read_chromatic, write_chromatic
 from photoplan.io.raster import RasterReader
 from photoplan.plain import pick, plain
-from photoplan.quality.colour.discs import disc_displacements, find_discs
-from photoplan.quality.colour.displacements import edge_displacements, patch_displacements
-from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
+from photoplan.quality.colour import (
+    BandModel,
+    ChromaticModel,
+    Displacements,
+    disc_displacements,
+    edge_displacements,
+    find_discs,
+    fit_band,
+    patch_displacements,
+)
 from photoplan.quality.edges.find import EdgePicture, find_edges
 
 #: Side of the parts in which edges are sought, pixels; it bounds memory.
@@ -47,7 +54,7 @@ class ChromaticRequest:
     method: Literal["auto", "discs", "windows", "edges"] = "auto"
     """``auto``: discs where the image shows twelve and more, else windows that are matched, else straight edges."""
     kind: str | None = None
-    """A name of `photoplan.quality.colour.model.KINDS`; None: chosen by cross-validation."""
+    """A name of `photoplan.quality.colour.KINDS`; None: chosen by cross-validation."""
 
 
 def measure_chromatic(request: ChromaticRequest) -> ChromaticModel:

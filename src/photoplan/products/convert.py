@@ -12,16 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
+from photoplan.cameras.lenses import Lens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import area_fault, area_note
 from photoplan.geometry.crs import canonical_crs, require_projected_metres
-from photoplan.geometry.earth_poses import enu_of_geodetic
 from photoplan.geometry.frames import triple
+from photoplan.geometry.local import enu_of_geodetic
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.ground_points import read_ground_points
-from photoplan.io.image_points import named_as, read_image_points
-from photoplan.io.names import ImageNames
+from photoplan.io.files import ImageNames
 from photoplan.io.orientation.block import Loss, OrientationBlock, without_lenses
 from photoplan.io.orientation.exif import SUFFIXES
 from photoplan.io.orientation.file import (
@@ -32,10 +30,10 @@ from photoplan.io.orientation.file import (
     written_formats,
 )
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.points import named_as, read_ground_points, read_image_points
 from photoplan.io.product import check_output
-from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.posed import Image
-from photoplan.orientation.readings import (
+from photoplan.io.project.model import Image, interior_of, lens_of
+from photoplan.orientation.conventions import (
     FittedReading,
     Reading,
     StatedPoses,
@@ -45,9 +43,8 @@ from photoplan.orientation.readings import (
     turn_matrix,
 )
 from photoplan.plain import pick
-from photoplan.products.init.match import camera_name
-from photoplan.products.init.run import placed
-from photoplan.products.judged import differences, on_map, stated_positions
+from photoplan.products.init import camera_name, placed
+from photoplan.products.plausibility import differences, on_map, stated_positions
 from photoplan.project.cameras import is_there
 
 #: Formats whose poses are read as those of a system in true metres.

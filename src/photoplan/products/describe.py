@@ -15,42 +15,43 @@ from photoplan.events import SILENT, Events
 from photoplan.findings import Result
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
-from photoplan.io.appearance import looks_like
-from photoplan.io.balance_file import read_balance_file
 from photoplan.io.camera.csm_frame import is_frame, read_frame
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.line.correction import read_line_correction
 from photoplan.io.camera.line.file import describe_line, is_line
 from photoplan.io.camera.rpc.file import is_rpc, read_rpc, rpc_beside, rpc_in
-from photoplan.io.checks import raster_driver
-from photoplan.io.chromatic_file import read_chromatic
-from photoplan.io.fall_off_file import read_fall_off_entry
-from photoplan.io.filter_file import is_filter
-from photoplan.io.gcp_list import is_gcp_list, read_gcp_list
-from photoplan.io.ground_points import read_ground_points
-from photoplan.io.image_points import read_image_points
-from photoplan.io.mtf_file import read_mtf_table
-from photoplan.io.objects.file import read_objects
-from photoplan.io.observed_positions import read_observed_positions
+from photoplan.io.files import looks_like, raster_driver, read_json, read_toml
+from photoplan.io.objects import read_objects
 from photoplan.io.orientation.file import choose_format, read_orientation_block
 from photoplan.io.orientation.table import TableFormat
-from photoplan.io.plain_files import read_json, read_toml
 from photoplan.io.plan_file import read_plan_tables
+from photoplan.io.points import (
+    is_gcp_list,
+    read_gcp_list,
+    read_ground_points,
+    read_image_points,
+    read_observed_positions,
+)
 from photoplan.io.project.file import load_project
-from photoplan.io.project.image import ImageEntry
+from photoplan.io.project.model import ImageEntry
+from photoplan.io.quality_files import (
+    is_filter,
+    read_balance_file,
+    read_chromatic,
+    read_fall_off_entry,
+    read_mtf_table,
+    read_sensor,
+)
 from photoplan.io.raster import with_alpha_judged
 from photoplan.io.raster_info import RasterInfo, read_info
-from photoplan.io.sensor_file import read_sensor
-from photoplan.io.series.file import read_series
+from photoplan.io.series import read_series
 from photoplan.io.terrain.files import read_measured
-from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
-from photoplan.io.terrain.model_tables import GrossError
+from photoplan.io.terrain.model import GrossError, ModelReader, is_terrain_model
 from photoplan.io.vector_layer import layers_of, read_layer
 from photoplan.plain import pick
-from photoplan.products.simulate.form import stated_model
-from photoplan.project.filter_files import load_filter
-from photoplan.quality.restoration.borders import Convolution
-from photoplan.quality.restoration.filters import FilterKernel
+from photoplan.products.simulate import stated_model
+from photoplan.project.steps import load_filter
+from photoplan.quality.restoration.restorer import Convolution, FilterKernel
 from photoplan.requests.terrain import InfoRequest
 from photoplan.surfaces.units import LineElement, UnitFigures
 

@@ -12,21 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan import __version__
-from photoplan.cameras.sun import SunProjection
+from photoplan.cameras.curvature import SunProjection
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Result
 from photoplan.geometry.frames import triple
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.image_form import form_of, placement_of
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
+from photoplan.io.raster_info import form_of, placement_of
 from photoplan.plain import pick
 from photoplan.plan.ground import TileGround
-from photoplan.plan.visibility import hidden_pixels
-from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
-from photoplan.project.open_terrain import OpenTerrain, open_terrain
-from photoplan.project.restored import kept_nodata
+from photoplan.plan.sources import hidden_pixels
+from photoplan.products.dtm.rasters import GridOptions, GridTile, write_grid
+from photoplan.project.ground import OpenTerrain, open_terrain
+from photoplan.project.steps import kept_nodata
 from photoplan.radiometry.illumination import LightModel, LitGround, estimate_light
 from photoplan.radiometry.tone import fitted
 from photoplan.requests.ortho import IlluminationRequest

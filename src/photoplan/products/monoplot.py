@@ -15,25 +15,21 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Result, noted
-from photoplan.geometry.rotation import axes_of_angles
-from photoplan.io.names import ImageNames
+from photoplan.geometry.pose import axes_of_angles
+from photoplan.io.files import ImageNames
 from photoplan.io.orientation.table import angle_in_radians
-from photoplan.io.polygons import check_vectors, read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
-from photoplan.io.project.image import ImageEntry
-from photoplan.io.project.model import Project
-from photoplan.io.project.posed import Image
-from photoplan.io.run_record import recording
+from photoplan.io.project.model import Image, ImageEntry, Project
+from photoplan.io.store import recording
 from photoplan.io.tables import Columns, read_table, write_table
+from photoplan.io.vector_layer import check_vectors, read_features, write_features
 from photoplan.plain import pick
 from photoplan.plan.footprint import footprint
-from photoplan.project.cameras import camera_without_pixels
-from photoplan.project.ground import Ground, ground_of
-from photoplan.project.open_terrain import open_terrain
-from photoplan.project.posed import pose_of
+from photoplan.project.cameras import camera_without_pixels, pose_of
+from photoplan.project.error_model import known_height_errors
+from photoplan.project.ground import Ground, ground_of, open_terrain
 from photoplan.project.scene import input_files
-from photoplan.project.uncertain import known_height_errors
 from photoplan.requests.measure import MonoplotRequest
 from photoplan.terrain.monoplot import REASONS, MonoplotErrors, MonoplotPoints, monoplot
 

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Projection
-from photoplan.engine.arrays import ArrayReader
-from photoplan.engine.base import Reader, Source
-from photoplan.engine.execute import Painted, joined, render
+from photoplan.engine.execute import ArrayReader, Painted, Reader, Source, joined, render
 from photoplan.engine.executors import Outcome, Workers, executor_factory, run_tiles
 from photoplan.errors import PhotoplanError, PhotoplanWarning, UsageError
 from photoplan.geometry.crs import crs_label, parse_crs, require_projected_metres
@@ -24,14 +22,13 @@ from photoplan.io.product import ProductFile
 from photoplan.io.raster import RasterReader, pixels_of_dataset
 from photoplan.io.storage import Nodata
 from photoplan.kernels.weights import KERNELS
-from photoplan.plan.compile import AnchorRule
-from photoplan.plan.owner import GivenOwners
+from photoplan.plan.anchors import AnchorRule
+from photoplan.plan.footprint import Tiles
 from photoplan.plan.product import ProductPlan
-from photoplan.plan.tiles import Tiles
-from photoplan.project.open_terrain import open_terrain
+from photoplan.plan.sources import GivenOwners
+from photoplan.project.ground import open_terrain
 from photoplan.public import described, file_of
-from photoplan.surfaces.base import Surface
-from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.base import LevelSurface, Surface
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 

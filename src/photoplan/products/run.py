@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from photoplan.engine.cluster import Question
 from photoplan.engine.execute import MOST_SOURCE_BYTES
-from photoplan.engine.executors import Workers, executor_factory, open_workers
+from photoplan.engine.executors import Question, Workers, executor_factory, open_workers
 from photoplan.engine.run import Runner, tiles_in_flight
 from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
-from photoplan.io.run_record import run_times, versions
+from photoplan.io.store import run_times, versions
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 320 * 2**20

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.product import check_output
-from photoplan.io.sensor_file import (
+from photoplan.io.quality_files import (
     ChargeTransfer,
     Chip,
     Noise,

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.grid import Window
-from photoplan.geometry.levels import Pixels
+from photoplan.geometry.grid import Pixels, Window
 from photoplan.kernels.shift_bands import limits_of, no_mask, shift_band
 from photoplan.kernels.weights import KERNELS
-from photoplan.quality.colour.model import ChromaticModel
+from photoplan.quality.colour import ChromaticModel
 
 
 @dataclass(frozen=True, eq=False)

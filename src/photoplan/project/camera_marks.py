@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
+from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io import mark_model as described
 from photoplan.io.camera.model import FiducialSystem
-from photoplan.io.names import resolve_input
+from photoplan.io.files import resolve_input
 from photoplan.io.raster import RasterReader
-from photoplan.io.scan_pitch import read_pitch
-from photoplan.orientation.marks import catalogue as free
-from photoplan.orientation.marks import silhouettes as frame
+from photoplan.io.raster_info import read_pitch
+from photoplan.orientation.marks import template as frame
+from photoplan.orientation.marks import template as free
 
 _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
 """Of red, green and blue (ITU-R BT.601): what JPEG and video keep at full resolution, unlike the colours."""

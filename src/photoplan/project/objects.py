@@ -14,12 +14,10 @@ from photoplan.geometry.bounds import MOST_HEIGHT
 from photoplan.geometry.crs import CrsStep, crs_label, crs_step, require_projected_metres, same_crs
 from photoplan.geometry.heights import OPTIONS, HeightStep, check_height_system, height_label, height_step
 from photoplan.geometry.units import agreed_metres, metric_heights, metric_system
-from photoplan.io.objects.file import read_objects
-from photoplan.io.objects.model import ObjectFile
+from photoplan.io.objects import ObjectFile, read_objects
 from photoplan.io.project.model import Objects
 from photoplan.surfaces.base import Terrain
-from photoplan.surfaces.faces import Faces
-from photoplan.surfaces.objects import ObjectSurface
+from photoplan.surfaces.objects import Faces, ObjectSurface
 from photoplan.surfaces.polygon_faces import cannot_be_used
 
 #: Objects whose highest point is deeper than this below the ground, metres, are refused.

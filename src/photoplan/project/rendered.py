@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.crs import crs_label, same_crs
-from photoplan.geometry.grid import MapGrid, Window
-from photoplan.geometry.levels import level_size
-from photoplan.io.image_form import placement_of
+from photoplan.geometry.grid import MapGrid, Window, level_size
 from photoplan.io.project.model import Project
 from photoplan.io.raster import RasterReader, stated_classes
+from photoplan.io.raster_info import placement_of
 from photoplan.kernels.sample_grid import sample_points
 from photoplan.plan.footprint import FAR
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import Ground, ground_of
 from photoplan.quality.formation.rendered import FromAbove, RenderedScene, SolidTexture, Texture
+from photoplan.surfaces.base import Hits
 from photoplan.surfaces.objects import painted_surface
-from photoplan.surfaces.rays import Hits
 
 #: Points along a side of an image at which ground pixels are measured.
 _POINTS = 7

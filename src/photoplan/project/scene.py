@@ -1,36 +1,42 @@
-"""From a project's description to the things that plan and engine work with: camera, surface, pixels."""
+"""Scenes: camera, ground and pixels of each image of a project; frames of targets."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, overload
 
 import numpy as np
 
 from photoplan.cameras.base import Camera
-from photoplan.engine.base import Source
-from photoplan.errors import ImagesLeftOut, InputError
+from photoplan.engine.execute import Source
+from photoplan.errors import GeometryError, ImagesLeftOut, InputError, UsageError
+from photoplan.geometry.bounds import HIGHEST_FLIGHT, odd_place
+from photoplan.geometry.frames import CylinderFrame, Frame, ImageFrame, WallFrame
 from photoplan.geometry.grid import Window
-from photoplan.io.fingerprint import fingerprint
+from photoplan.geometry.heights import HeightStep
+from photoplan.io.files import fingerprint
 from photoplan.io.project.file import parse_project
-from photoplan.io.project.image import ImageEntry
-from photoplan.io.project.model import Project
-from photoplan.io.project.posed import Image
+from photoplan.io.project.model import Image, ImageEntry, Project
 from photoplan.io.raster import RasterReader
-from photoplan.plan.footprint import Footprint, footprint
-from photoplan.project.balance import BalanceStep, load_balance
+from photoplan.plan.footprint import Bounds, Footprint, footprint, image_border
 from photoplan.project.cameras import camera_of
-from photoplan.project.filter_files import load_filter
 from photoplan.project.ground import Ground, ground_of, stamp_of
-from photoplan.project.linearisation import linearisation_of
-from photoplan.project.restored import RestoreStep, restored
-from photoplan.project.stepped import SteppedReader
+from photoplan.project.steps import (
+    BalanceStep,
+    RestoreStep,
+    SteppedReader,
+    linearisation_of,
+    load_balance,
+    load_filter,
+    restored,
+)
 from photoplan.surfaces.base import Terrain
-from photoplan.surfaces.objects import painted_surface
+from photoplan.surfaces.objects import ObjectSurface, SingleObject, painted_surface
 
 #: Scenes that are kept open, some 20 kB each: more than the images of a row of a mosaic's tiles.
 _KEPT = 2048
@@ -261,3 +267,208 @@ def _reader(project: Project, image: ImageEntry) -> SteppedReader:
         light = linearisation_of(table if table in ("linear", "srgb") else str(project.resolve(table)))
         source = restored(source, load_filter(project.resolve(restoration.filter)), light)
     return source if image.balance is None else source.then(load_balance(project.resolve(image.balance)))
+
+
+@dataclass(frozen=True)
+class ScenesAddress:
+    """All that a worker needs to open the images of a product: small, and pickles."""
+
+    scenes: tuple[SceneAddress, ...]
+    """One for each row of the table of sources; all over the same ground."""
+    part: SingleObject | None = None
+    """What is shown of the ground's objects, where it is a single one."""
+
+    @classmethod
+    def of(cls, project: Project, names: Sequence[str], part: SingleObject | None = None) -> ScenesAddress:
+        """Addresses of images of a project."""
+        return cls(tuple(scene_address(project, name) for name in names), part)
+
+    @property
+    def facts(self) -> list[dict[str, Any]]:
+        """What moves a pixel, see `SceneAddress.facts`."""
+        part = [] if self.part is None else [{"part": [list(self.part.objects), self.part.below]}]
+        return [scene.facts for scene in self.scenes] + part
+
+    @property
+    def digests(self) -> tuple[tuple[str, str], ...]:
+        """Path and content digest of each input file, each once."""
+        return tuple(dict.fromkeys(entry for scene in self.scenes for entry in scene.digests))
+
+    def open(self) -> Scenes:
+        """The images; each is opened when it is asked for, and kept for the next tile."""
+        return Scenes(self)
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """The images of a product and their ground."""
+
+    address: ScenesAddress
+
+    @property
+    def sources(self) -> Sequence[Source]:
+        """The table of sources."""
+        return _Table(self.address)
+
+    @property
+    def surface(self) -> Terrain:
+        """The ground that they have in common, or what is shown of it."""
+        return surface_of(self.address)
+
+    def __getitem__(self, row: int) -> Scene:
+        return self.address.scenes[row].open()
+
+
+@lru_cache(maxsize=16)
+def surface_of(address: ScenesAddress) -> Terrain:
+    """The ground that images have in common, or what is shown of it; kept, since it finds its faces once."""
+    surface = address.scenes[0].open().surface
+    if address.part is None:
+        return surface
+    assert isinstance(surface, ObjectSurface)
+    return replace(surface, part=address.part)
+
+
+@dataclass(frozen=True)
+class _Table(Sequence[Source]):
+    """Sources, opened one by one."""
+
+    address: ScenesAddress
+
+    def __len__(self) -> int:
+        return len(self.address.scenes)
+
+    @overload
+    def __getitem__(self, row: int) -> Source: ...
+    @overload
+    def __getitem__(self, row: slice) -> Sequence[Source]: ...
+    def __getitem__(self, row: int | slice) -> Source | Sequence[Source]:
+        if isinstance(row, slice):
+            return _Table(ScenesAddress(self.address.scenes[row]))
+        (source,) = self.address.scenes[row].open().sources
+        return source
+
+
+#: Metres over which an image's projection is taken apart; from a straight line it differs by less than this part.
+_APART, _STRAIGHT = 1024.0, 1e-6
+#: Nearest of what an image shows, metres.
+_NEAR = 0.001
+_FORMS = (
+    "`map`, `wall:X,Y,Z,AZIMUTH[,TILT]`, `vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`, `column:X,Y,Z,AZIMUTH,RADIUS` or "
+    "`image:NAME[,DISTANCE]`"
+)
+#: Radii of vaults and columns, metres.
+_RADII = (0.01, 10_000.0)
+#: How many numbers each target has; what they are.
+_NUMBERS = {
+    "wall": (
+        (4, 5),
+        "`wall:X,Y,Z,AZIMUTH[,TILT]`: a point of the wall in the project's CRS, the azimuth of its outward normal from "
+        "north by east (-360 to 360), and by how much that is raised (-90 to 90), degrees",
+    ),
+    "vault": (
+        (5, 6),
+        "`vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`: a point of its axis in the project's CRS, the azimuth of the axis from "
+        f"north by east (-360 to 360), the radius ({_RADII[0]:g} to {_RADII[1]:g} m), and by how much the axis rises "
+        "(-90 to 90), degrees",
+    ),
+    "column": (
+        (5, 5),
+        "`column:X,Y,Z,AZIMUTH,RADIUS`: a point of its axis in the project's CRS, the azimuth that its middle faces, "
+        f"from north by east (-360 to 360), and the radius ({_RADII[0]:g} to {_RADII[1]:g} m)",
+    ),
+}
+
+
+def _straight(scene: Scene, name: str) -> Camera:
+    """The camera of a scene, whose rays are straight on the ground and meet in a point, so that a target can
+    follow it.
+    """
+    camera = scene.camera
+    try:
+        camera.rays(np.zeros((1, 2)))
+    except UsageError:
+        way = "it is a line or satellite image; choose another one"
+        if camera.vantage.central:
+            way = 'state earth_curvature = "none" and no refraction in [orientation]; so near neither counts'
+        raise GeometryError(
+            f"image {name!r}: its rays are not straight on the ground, so that no surface lies along it: {way}"
+        ) from None
+    return camera
+
+
+def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | None]:
+    """The frame of a target as a user states it, and the bounds that it has by itself; None: it is the map, has none.
+
+    A user states heights in the system of the orientation; the frame is in that of the cameras.
+    """
+    kind, _, rest = text.partition(":")
+    if text == "map":
+        return None, None
+    if kind in _NUMBERS:
+        numbers = _numbers(rest)
+        counts, form = _NUMBERS[kind]
+        more = numbers[4:] if kind == "wall" else numbers[5:]
+        good = len(numbers) in counts and abs(numbers[3]) <= 360 and abs(sum(more)) <= 90
+        if not good or (kind != "wall" and not _RADII[0] <= numbers[4] <= _RADII[1]):
+            raise UsageError(f"target {text}: give {form}")
+        x, y, z, *others = numbers
+        odd = odd_place((x, y, z), camera=False) or project.area_fault((x, y))
+        if odd is not None:
+            raise UsageError(f"target {text}: {odd}")
+        z = float(ground_of(project).into_working(project.crs)((x, y, z)))
+        if kind == "wall":
+            return WallFrame.facing((x, y, z), *others), None
+        make = CylinderFrame.vault if kind == "vault" else CylinderFrame.column
+        return make((x, y, z), *others), None
+    if kind != "image" or not rest:
+        raise UsageError(f"target {text}; give {_FORMS}")
+    name, _, last = rest.rpartition(",")
+    if not name or any(image.name == rest for image in project.images):
+        return _along(project, rest, None, text)
+    return _along(project, name, next(iter(_numbers(last)), math.nan), text)
+
+
+def at_heights(frame: Frame, step: HeightStep) -> Frame:
+    """A frame with its origin in another height system: the step between them is the same all over a target."""
+    if step.definition is None or not isinstance(frame, WallFrame | CylinderFrame | ImageFrame):
+        return frame
+    x, y, _ = frame.origin
+    return replace(frame, origin=(x, y, float(step(frame.origin))))
+
+
+def _numbers(text: str) -> list[float]:
+    """Finite numbers between commas; none if any of them is none."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        return []
+    return numbers if all(math.isfinite(n) for n in numbers) else []
+
+
+def _along(project: Project, name: str, distance: float | None, text: str) -> tuple[Frame, Bounds]:
+    """The frame of an image, and the bounds of its picture."""
+    scene = open_scene(project, project.any_image(name).name)
+    camera = _straight(scene, name)
+    center = camera.vantage.point
+    # Of a camera in a plane picture (x·w, y·w, w) are linear in XYZ, and w is the depth.
+    L, twice = (camera.project_homogeneous(center + length * np.eye(3)).T / length for length in (_APART, _APART / 2))
+    if not (np.isfinite(L).all() and np.abs(L - twice).max() <= _STRAIGHT * np.abs(L).max()):
+        raise GeometryError(f"target {text}: a fisheye image of more than 126° lies in no plane; choose another one")
+    normal = -L[2] / np.linalg.norm(L[2])
+    right = L[0] - (L[0] @ normal) * normal
+    right /= np.linalg.norm(right)
+    axes = np.array([right, np.cross(normal, right), normal])
+    if distance is None:
+        low, high = scene.footprint.height_range
+        distance = float((center[2] - (low + high) / 2) / normal[2]) if normal[2] > 0 else math.nan
+        if not _NEAR <= distance <= HIGHEST_FLIGHT:
+            raise UsageError(f"target {text}: the axis of the image meets no terrain; say `image:{name},DISTANCE`")
+    if not _NEAR <= distance <= HIGHEST_FLIGHT:
+        raise UsageError(
+            f"target {text}: give a distance from {_NEAR:g} to {HIGHEST_FLIGHT:g} m: `image:NAME,DISTANCE`"
+        )
+    frame = ImageFrame(tuple(center.tolist()), tuple(map(tuple, axes.tolist())), distance)  # type: ignore[arg-type]
+    p = camera.rays(image_border(camera.size))[1] @ axes.T
+    uv = p[:, :2] / np.where(p[:, 2:] < 0, -p[:, 2:], np.nan) * distance
+    return frame, (*np.nanmin(uv, axis=0).tolist(), *np.nanmax(uv, axis=0).tolist())

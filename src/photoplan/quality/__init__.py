@@ -7,14 +7,12 @@ __getattr__, __dir__, __all__ = public(
     {
         "quality.edges.response": "measure_edge",
         "quality.edges.find": "find_edges",
-        "quality.spread": "SpreadFunction",
-        "quality.mtf_curve": "MtfCurve",
+        "quality.mtf_curve": "SpreadFunction MtfCurve",
         "quality.linearise": "Linearisation",
         "quality.patterns.siemens": "measure_star",
         "quality.patterns.bars": "measure_bars",
         "quality.patterns.usaf": "measure_usaf",
-        "quality.restoration.inverse": "exact_inverse",
-        "quality.restoration.design": "design_filter",
+        "quality.restoration.design": "exact_inverse design_filter",
         "quality.camera.photon_transfer": "photon_transfer",
     },
 )

@@ -1,13 +1,35 @@
-"""A modulation transfer function as a curve with standard deviations."""
+"""MTF curves, apertures, spread functions, relative sharpness."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import log, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 from photoplan.errors import InputError
+
+_Array = NDArray[np.float64]
+
+
+def disc_transfer(radius: float, f: _Array) -> _Array:
+    """Transfer function of an even disc: 2 J1(2π r f) / (2π r f)."""
+    z = 2.0 * pi * radius * f
+    small = z < 1e-6
+    return np.where(small, 1.0, 2.0 * special.j1(z) / np.where(small, 1.0, z))
+
+
+def pupil_transfer(part: _Array) -> _Array:
+    """Transfer function of a circular pupil without aberrations, in incoherent light, at a part v of its limit.
+
+    2/π (arccos v − v √(1 − v²)), the autocorrelation of a disc (Goodman, Introduction to Fourier Optics, chapter 6);
+    0 from v = 1 on.
+    """
+    v = np.clip(part, 0.0, 1.0)
+    return np.asarray(2.0 / pi * (np.arccos(v) - v * np.sqrt(1.0 - v * v)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,3 +94,137 @@ class MtfCurve:
     def mtf10(self) -> float:
         """Frequency at modulation 0.1, cycles per pixel; NaN if it is not reached."""
         return self.falls_to(0.1)
+
+
+#: Full width at half maximum of a Gaussian with standard deviation 1.
+GAUSSIAN_WIDTH = 2.0 * sqrt(2.0 * log(2.0))
+
+
+@dataclass(frozen=True, eq=False)
+class SpreadFunction:
+    """Which share of the light of an object pixel falls on the pixels around it, in one direction.
+
+    The image is the object convolved with it (Kölbl 2006, eq. 1 and 2); Kölbl's Z, A, B are the values at 0, 1, 2.
+    """
+
+    values: NDArray[np.float64]
+    """Shares from -half to +half pixels, an odd number of values, sum 1."""
+    sigma: NDArray[np.float64] | None = None
+    """Their standard deviations; None if unknown."""
+
+    def __post_init__(self) -> None:
+        values = np.array(self.values, np.float64)
+        if values.ndim != 1 or values.size % 2 == 0:
+            raise InputError(f"a spread function has an odd number of values in one row; given is shape {values.shape}")
+        if not np.isfinite(values).all():
+            raise InputError("a spread function has finite values only")
+        total = float(values.sum())
+        if abs(total - 1.0) > 1e-6:
+            raise InputError(
+                f"the values of a spread function add up to 1, no light is lost; given: {total:.6g} "
+                "(SpreadFunction.normalised divides by the sum)"
+            )
+        values.setflags(write=False)
+        object.__setattr__(self, "values", values)
+
+    @classmethod
+    def normalised(cls, values: NDArray[np.float64] | list[float]) -> SpreadFunction:
+        """Spread function of values that are divided by their sum."""
+        numbers = np.array(values, np.float64)
+        total = float(numbers.sum())
+        if not total > 0.0:
+            raise InputError(f"values of a spread function have a positive sum; given: {total:.6g}")
+        return cls(numbers / total)
+
+    @classmethod
+    def symmetric(cls, half: NDArray[np.float64] | list[float]) -> SpreadFunction:
+        """Spread function from its centre Z and the values A, B, … on one side; divided by their sum."""
+        side = np.asarray(half, np.float64)
+        return cls.normalised(np.concatenate([side[:0:-1], side]))
+
+    @property
+    def half(self) -> int:
+        """How many pixels it reaches to each side."""
+        return int(self.values.size // 2)
+
+    @property
+    def asymmetry(self) -> float:
+        """Half the sum of the differences between both sides: 0 if symmetric."""
+        return float(np.abs(self.values - self.values[::-1]).sum() / 4.0)
+
+    def side(self) -> NDArray[np.float64]:
+        """Centre Z and the means of both sides A, B, …, shape (half + 1,)."""
+        both = (self.values + self.values[::-1]) / 2.0
+        return both[self.half :]
+
+    def transfer(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Optical transfer function at frequencies in cycles per pixel, same shape, 1 at 0."""
+        offsets = np.arange(-self.half, self.half + 1)
+        return np.exp(-2j * pi * np.multiply.outer(np.asarray(frequency, float), offsets)) @ self.values
+
+    def gaussian_fwhm(self) -> float:
+        """Full width at half maximum of the Gaussian with the same second moment, pixels; NaN if there is none."""
+        offsets = np.arange(-self.half, self.half + 1.0)
+        mean = float(self.values @ offsets)
+        variance = float(self.values @ (offsets - mean) ** 2)
+        return GAUSSIAN_WIDTH * sqrt(variance) if variance >= 0.0 else float("nan")
+
+
+def gaussian_modulation(fwhm: float, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Modulation of a Gaussian spread function of a full width at half maximum in pixels, at cycles per pixel."""
+    sigma = fwhm / GAUSSIAN_WIDTH
+    return np.asarray(np.exp(-2.0 * (pi * sigma * np.asarray(frequency, float)) ** 2))
+
+
+#: Side of the blocks in which the quietest places are sought, pixels.
+BLOCK = 8
+#: The share of blocks that show noise alone.
+_QUIET = 0.1
+#: Images are judged by no fewer patches.
+_LEAST = 3
+_ROUNDS = 30
+
+
+def detail_energies(grey: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean squares of fine and of coarser detail in blocks of a patch, shape (2, rows, cols)."""
+    once = _smooth(grey)
+    twice = _smooth(once)
+    fine, coarse = (grey[2:-2, 2:-2] - once)[2:-2, 2:-2], once[2:-2, 2:-2] - twice
+    rows, cols = (size // BLOCK for size in fine.shape)
+    parts = np.square([fine, coarse])[:, : rows * BLOCK, : cols * BLOCK]
+    return np.asarray(parts.reshape(2, rows, BLOCK, cols, BLOCK).mean(axis=(2, 4)))
+
+
+def _smooth(grey: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Binomial means of five pixels along both axes; two pixels less on every side."""
+    for _ in range(2):
+        grey = (grey[:-4] + grey[4:] + 4 * (grey[1:-3] + grey[3:-1]) + 6 * grey[2:-2]).T / 16
+    return grey
+
+
+def detail_quotients(energies: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Logarithms (n,), base 2, of the quotients of amplitudes of fine and coarser detail in patches of one image.
+
+    Energies are those of `detail_energies`; NaN where a patch shows no more than noise.
+    """
+    if not len(energies):
+        return np.empty(0)
+    noise = np.quantile(np.concatenate([each.reshape(2, -1) for each in energies], axis=1), _QUIET, axis=1)
+    fine, coarse = np.transpose([each.mean(axis=(1, 2)) - noise for each in energies])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((fine > 0) & (coarse > 0), 0.5 * np.log2(fine / coarse), np.nan)
+
+
+def blur_of(quotients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Blur of images (n,) from logarithms of quotients of patches and images (m, n); NaN where a patch is not shown."""
+    seen = np.isfinite(quotients)
+    # A patch that one image shows tells nothing of others.
+    use = np.where(seen & (seen.sum(axis=1) > 1)[:, None], quotients, np.nan)
+    sharp = np.zeros(use.shape[1])
+    use[:, np.isfinite(use).sum(axis=0) < _LEAST] = np.nan
+    known, rows = np.isfinite(use).any(axis=0), np.isfinite(use).any(axis=1)
+    for _ in range(_ROUNDS if rows.any() else 0):
+        ground = np.nanmedian(use[rows] - sharp, axis=1)
+        sharp[known] = np.nanmedian(use[np.ix_(rows, known)] - ground[:, None], axis=0)
+    sharp[~known] = sharp[known].max(initial=0.0)
+    return np.asarray(sharp.max() - sharp)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
-from photoplan.quality.apertures import pupil_transfer
+from photoplan.quality.mtf_curve import pupil_transfer
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from photoplan.public import public
 __getattr__, __dir__, __all__ = public(
     __name__,
     {
-        "radiometry.cells": "Cells cells_of",
+        "radiometry.equations": "Cells cells_of",
         "radiometry.balance": "Balanced balanced even_images",
         "radiometry.tone": "Tone toned",
         "radiometry.shown": "SeamLayer Shown features_of",

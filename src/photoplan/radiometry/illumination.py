@@ -21,8 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.adjustment.linear import solve
-from photoplan.adjustment.robust import huber, spread
+from photoplan.adjustment.least_squares import huber, solve, spread
 from photoplan.errors import GeometryError, UsageError
 
 _Floats = NDArray[np.float64]

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.products.balance.run import BalanceReport
+from photoplan.products.balance import BalanceReport
 from photoplan.radiometry.balance import Balanced, Pairs
-from photoplan.radiometry.cells import SIDE
+from photoplan.radiometry.equations import SIDE
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, figure_of, png, styled
 
 _BANDS = (RED, GREEN, BLUE, ORANGE)

@@ -1,4 +1,4 @@
-"""What all plots share: matplotlib when it is there, colours that are told apart by colour-blind readers, PNG bytes."""
+"""Drawing with matplotlib: style, sizes, letters."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
+from photoplan.products.view.content import Lettering, Letters
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -143,3 +144,20 @@ def draw_normalised(values: NDArray[np.float64], limit: float, what: str) -> byt
     panels[1].yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
     panels[1].set(ylim=(floor, 1.0), title="the same, logarithmic")
     return png(fig)
+
+
+def lettering(size: float) -> Lettering:
+    """What draws texts of a size in pixels, in the font of all plots."""
+    load_matplotlib("a view with labels", "leave the labels out (label= of the lines)")
+    fonts = importlib.import_module("matplotlib.ft2font")
+    path = importlib.import_module("matplotlib.font_manager").findfont("DejaVu Sans")
+
+    def draw(text: str) -> Letters:
+        font = fonts.FT2Font(path)
+        font.set_size(size, 72)
+        font.set_text(text, 0.0)
+        font.draw_glyphs_to_bitmap(antialiased=True)
+        cover = np.asarray(font.get_image(), np.float32) / np.float32(255)
+        return Letters(cover, cover.shape[0] - font.get_descent() / 64)
+
+    return draw

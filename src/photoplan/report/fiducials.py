@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from photoplan.geometry.grid import Window
-from photoplan.orientation.marks.found import FiducialResult, LocatedMark, MissingMark
-from photoplan.orientation.marks.layout import MarkLayout
-from photoplan.orientation.marks.measure import mark_window
-from photoplan.orientation.marks.search import Scan
+from photoplan.orientation.marks.fiducials import Scan, mark_window
+from photoplan.orientation.marks.layout import FiducialResult, LocatedMark, MarkLayout, MissingMark
 from photoplan.orientation.marks.template import Template, draw
-from photoplan.products.fiducials import ImageFiducials, UnfoundFiducials
+from photoplan.products.film import ImageFiducials, UnfoundFiducials
 from photoplan.project.camera_marks import ScanImage
 from photoplan.report.drawing import figure_of, png
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.products.interior import ImageInterior, InteriorResult
+from photoplan.products.film import ImageInterior, InteriorResult
 from photoplan.report.drawing import BLUE, INK, RED, SOFT, figure_of, png, round_down, shortened, styled
 from photoplan.report.page import cells, figure, headline, number, page, section, table
 

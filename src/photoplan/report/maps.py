@@ -11,10 +11,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from photoplan.io.naming import write_atomically
 from photoplan.io.quicklook import read_reduced
-from photoplan.products.seams.run import SeamsReport
-from photoplan.products.surface.job import MISFIT
+from photoplan.io.store import write_atomically
+from photoplan.products.seams import SeamsReport
+from photoplan.products.surface.plan import MISFIT
 from photoplan.report.drawing import (
     BLUE,
     GREEN,

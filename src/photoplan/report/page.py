@@ -13,10 +13,10 @@ from pathlib import Path
 
 from photoplan.errors import UsageError
 from photoplan.io.disk import disk_error, make_parents
-from photoplan.io.names import stated_text
-from photoplan.io.naming import write_atomically
+from photoplan.io.files import stated_text
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
+from photoplan.io.store import write_atomically
 from photoplan.project.scene import input_files
 from photoplan.report.drawing import load_matplotlib
 

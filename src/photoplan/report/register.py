@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
-from photoplan.matching.grey import Grey, GreyImage, to_bytes
+from photoplan.matching.features import Grey, GreyImage, to_bytes
 from photoplan.matching.register import APART, FOUND, STATES, TEXTURELESS, UNCERTAIN, UNLIKE
-from photoplan.products.register.run import RegisterReport
+from photoplan.products.register import RegisterReport
 from photoplan.report.drawing import BLUE, INK, ORANGE, PURPLE, RED, SOFT, figure_of, png, round_down, styled
 
 #: Longest side of the small copy, pixels, and arrows along the longer side at most.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.plain import shown_metres
-from photoplan.products.resect import ResectedImage, ResectResult
+from photoplan.products.film import ResectedImage, ResectResult
 from photoplan.report.drawing import BLUE, INK, RED, SOFT, axes_of, png, round_down, shortened, styled
 from photoplan.report.page import Cell, cells, figure, headline, number, page, section, table, text
 

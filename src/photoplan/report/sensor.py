@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.io.sensor_file import Chip, SensorDescription
+from photoplan.io.quality_files import Chip, SensorDescription
 from photoplan.products.sensor import SensorReport, noise_budget, short_number
 from photoplan.quality import sensor
 from photoplan.quality.sensor import NoiseBudget

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.io.quicklook import read_reduced
-from photoplan.products.surface.job import MISFIT
-from photoplan.products.surface.plan import SurfacePlan
+from photoplan.products.surface.plan import MISFIT, SurfacePlan
 from photoplan.products.surface.run import SurfaceResult, outputs
 from photoplan.report.drawing import BLUE, INK, ORANGE, SOFT, figure_of, mpl, png, styled
 from photoplan.report.page import cells, figure, headline, number, page, section, table, text

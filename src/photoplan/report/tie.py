@@ -11,9 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import shortest_path
 
 from photoplan.geometry.grid import Window
-from photoplan.matching.grey import to_bytes
-from photoplan.matching.tracks import Tracks
-from photoplan.products.tie.inputs import TieImage
+from photoplan.matching.features import Tracks, to_bytes
+from photoplan.products.tie import TieImage
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SKY, SOFT, figure_of, png, styled
 
 #: Colours of points in two, three, four, and five or more images.

@@ -5,12 +5,11 @@ from photoplan.public import public
 __getattr__, __dir__, __all__ = public(
     __name__,
     {
-        "surfaces.base": "Surface",
-        "surfaces.level": "LevelSurface",
+        "surfaces.base": "Surface LevelSurface",
         "surfaces.raster": "RasterSurface",
         "surfaces.hybrid": "HybridSurface",
         "surfaces.shifted": "ShiftedSurface",
         "surfaces.seen": "SeenSurface",
-        "surfaces.measured": "MeasuredLine MeasuredTerrain PointGroup Tin",
+        "surfaces.units": "MeasuredLine MeasuredTerrain PointGroup Tin",
     },
 )

@@ -1,10 +1,10 @@
-"""Hybrid terrain: computing units with bilinear meshes, and triangles where lines pass (Ecker 1991, §2.1, §5.4.4)."""
+"""Hybrid terrain: grids with breaklines in units, and errors of its heights."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +14,16 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.extent import height_ranges
 from photoplan.kernels.hybrid import add_between, add_between_on_lattice, sample_hybrid, scan_faces
 from photoplan.kernels.sample_grid import sample_lattice
-from photoplan.surfaces.carried import box_points, carried_positions
-from photoplan.surfaces.lattice import Lattice
-from photoplan.surfaces.rays import NO_FACES, Hits, TerrainPart, carried_hits
+from photoplan.surfaces.base import (
+    NO_FACES,
+    Hits,
+    Lattice,
+    Terrain,
+    TerrainPart,
+    box_points,
+    carried_hits,
+    carried_positions,
+)
 from photoplan.surfaces.units import MeshFaces, Unit, UnitSource
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
@@ -302,3 +309,65 @@ class HybridParts:
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Heights at points of the model's CRS."""
         return self.surface._at(np.asarray(XY, float), "heights")
+
+
+class HeightErrors(Protocol):
+    """Standard deviations of heights, metres; NaN where there is no surface or nothing is known of it."""
+
+    def sigmas(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """At map points (..., 2), shape (...)."""
+        ...
+
+    def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
+        """At the pixel centres of a window of a map target, shape (height, width)."""
+        ...
+
+
+@dataclass(frozen=True)
+class StatedHeightErrors:
+    """One standard deviation of the heights everywhere, metres."""
+
+    sigma: float
+
+    def sigmas(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """See `HeightErrors`."""
+        return np.full(np.shape(XY)[:-1], self.sigma)
+
+    def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
+        """See `HeightErrors`."""
+        return np.full((window.height, window.width), self.sigma)
+
+
+@dataclass(frozen=True)
+class ModelHeightErrors:
+    """The standard deviations that a terrain model holds for its posts, interpolated as its heights are."""
+
+    surface: HybridSurface
+
+    def sigmas(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """See `HeightErrors`."""
+        return self.surface.sigmas(XY)
+
+    def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
+        """See `HeightErrors`."""
+        return self.surface.relief_with_sigma(target, window)[1]
+
+
+@dataclass(frozen=True)
+class RasterHeightErrors:
+    """A raster of standard deviations beside one of heights, bilinear in between."""
+
+    raster: Terrain
+    """Its values are standard deviations; a value below zero tells nothing."""
+
+    def sigmas(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """See `HeightErrors`."""
+        return _known(self.raster.heights(XY)).astype(float)
+
+    def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
+        """See `HeightErrors`."""
+        return _known(self.raster.relief(target, window))
+
+
+def _known(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    return np.where(values >= 0, values, np.nan)

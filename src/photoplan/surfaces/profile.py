@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.mesh.lines import SNAP, on_grid
+from photoplan.surfaces.mesh import SNAP, on_grid
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.units import LineElement, Unit, UnitLayout
 

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
-from photoplan.surfaces.faces import Faces
+from photoplan.surfaces.objects import Faces
 from photoplan.surfaces.polygon_faces import LEAST_AREA
 
 #: More squares than this are not made of one polygon.

@@ -1,10 +1,11 @@
-"""A finer terrain model inside polygons, joined to the coarse one without a step (Behr 1989, §6.1)."""
+"""Units from rasters and refined units."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,78 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.mesh.faces import build_faces
-from photoplan.surfaces.mesh.lines import on_grid
+from photoplan.surfaces.mesh import build_faces, on_grid
+from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.units import LineElement, Unit, UnitLayout, UnitSource
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
+
+#: Meshes along a unit's side at most.
+MESHES = 64
+#: Posts are square if their distances along X and Y differ by no more than this part.
+_SQUARE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class RasterUnits:
+    """A source of computing units (`UnitSource`) whose posts are the posts of a raster; their sigmas are unknown."""
+
+    surface: RasterSurface
+    """In the raster's own CRS."""
+
+    def __post_init__(self) -> None:
+        dx, dy = self.surface.mesh
+        if abs(dx - dy) > _SQUARE * max(dx, dy):
+            raise InputError(
+                f"raster with posts {dx:.10g} m × {dy:.10g} m apart; make its cells square with gdalwarp -tr"
+            )
+        if min(self.surface.grid.size) < 2:
+            raise InputError(f"raster of {self.surface.grid.size} posts; at least 2 × 2 are needed")
+
+    @property
+    def meshes(self) -> int:
+        """Meshes along a unit's side."""
+        return min(MESHES, max(self.surface.grid.size) - 1)
+
+    @property
+    def layout(self) -> UnitLayout:
+        """Where the units lie: the first post is the corner of the first unit."""
+        columns, rows = (-(-(count - 1) // self.meshes) for count in self.surface.grid.size)
+        return UnitLayout(*self.surface.origin, side=self.meshes * self.finest, columns=columns, rows=rows)
+
+    @property
+    def finest(self) -> float:
+        """Distance of posts, metres."""
+        return self.surface.mesh[0]
+
+    @cached_property
+    def ranges(self) -> NDArray[np.float64]:
+        """Bounds of the heights of every unit, shape (rows, columns, 2); NaN for empty units."""
+        layout = self.layout
+        column, row = np.meshgrid(np.arange(layout.columns), np.arange(layout.rows))
+        left, top = layout.left + column * layout.side, layout.top - row * layout.side
+        return self.surface.height_range(np.stack([left, top - layout.side, left + layout.side, top], axis=-1))
+
+    def unit(self, column: int, row: int) -> Unit | None:
+        """The unit, or None if it is empty."""
+        layout = self.layout
+        left, top = layout.corner(column, row)
+        k = np.arange(self.meshes + 1)
+        x, y = np.meshgrid(left + k * self.finest, top - k * self.finest)
+        Z = self.surface.heights(np.stack([x, y], axis=-1))
+        if not np.isfinite(Z).any():
+            return None
+        datum = float(np.rint(np.nanmean(Z)))
+        heights = (Z - datum).astype(np.float32)
+        return Unit(
+            left=left,
+            top=top,
+            side=layout.side,
+            heights=heights,
+            sigmas=np.full(heights.shape, np.nan, np.float32),
+            datum=datum,
+        )
+
 
 #: Vertices of clipped lines nearer than this, metres, are one.
 SAME = 1e-6

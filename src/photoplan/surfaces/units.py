@@ -1,19 +1,281 @@
-"""Parts of a hybrid terrain model: computing units with a grid of posts each, and triangles where lines pass."""
+"""Units of hybrid terrain: measured points and lines, representation errors."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.codec import storable
 from photoplan.errors import InputError
-from photoplan.surfaces.measured import LineKind
-from photoplan.surfaces.representation import Representation, representation
+
+#: Weights by which squares of second differences are averaged along rows and along columns.
+_WINDOW = (0.25, 0.5, 0.25)
+#: Ratio of the mean squares of second differences at one and at two mesh widths: of smooth ground, of ground whose
+#: slopes are Brownian, of steps or Brownian ground, and of ground without any correlation.
+_SMOOTH, _KINKED, _STEPS, _ROUGH = 1 / 16, 1 / 4, 1 / 2, 1.0
+#: Part of a ratio's logarithm beside smooth ground that is left at half the distance: of waves, and from which part on
+#: the ratio is that of a power law.
+_WAVE, _LAW = 0.25, 0.79
+#: Correlation of the errors along x and along y in the middle of a mesh, on Brownian ground.
+_BROWNIAN = -0.44
+#: A vertex this close to a grid line, in meshes, lies on it.
+_ON_LINE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Representation:
+    """Variance between posts, m², is bx² · x + by² · y + 2 bx by · xy with b = (4 f (1 − f))^(power / 2).
+
+    f is the position between two posts, 0 to 1. At posts the variance is zero. In a triangle the standard deviations of
+    its three sides are added, with the products of two weights for f (1 − f) and the lengths of the side along x and y.
+    """
+
+    terms: NDArray[np.float32]
+    """x, y and xy at each post, shape (3, n + 1, n + 1), m²; between posts they are bilinear."""
+    power: float
+    """2 for smooth ground, whose error is a parabola between posts; 1 for Brownian ground, whose error is a bridge."""
+
+
+def representation(
+    heights: NDArray[np.float32],
+    vertices: NDArray[np.float64] | None = None,
+    triangled: NDArray[np.bool_] | None = None,
+) -> Representation:
+    """Return the representation error of a grid of posts from their second differences.
+
+    The error of linear interpolation in the middle between two posts is half the second difference at half the mesh
+    width. Its mean square is extrapolated from those at one and at two mesh widths: by a power law of the distance if
+    the ground has kinks at all scales, and towards the law of smooth ground if it has none.
+    """
+    Z = heights.astype(float)
+    across, along = _uncut(vertices, Z.shape[0] - 1)
+    if triangled is not None:
+        around = np.pad(triangled, 1, constant_values=True)
+        free = ~(around[1:, 1:] & around[1:, :-1] & around[:-1, 1:] & around[:-1, :-1])
+        across &= free[:, 1:] & free[:, :-1]
+        along &= free[1:] & free[:-1]
+    x, y = _second(Z, across, 1), _second(Z.T, along.T, 1).T
+    wide = np.append(_second(Z, across, 2).ravel(), _second(Z.T, along.T, 2).ravel())
+    narrow = np.append(x.ravel(), y.ravel())
+    ratio = _SMOOTH
+    if np.isfinite(narrow).any() and np.isfinite(wide).any() and np.nanmax(np.abs(wide)) > 0:
+        ratio = float(np.clip(np.nanmean(narrow**2) / np.nanmean(wide**2), _SMOOTH, _ROUGH))
+        # A wave's ratio falls to that of smooth ground by the fourth part of its logarithm with each halving.
+        part = min(1.0, np.log(ratio / _SMOOTH) / np.log(_KINKED / _SMOOTH))
+        ratio = _SMOOTH * (ratio / _SMOOTH) ** (0.25 + 0.75 * part)
+    power = _power(ratio)
+    xx, yy, xy = _around(x**2), _around(y**2), _around(x * y)
+    # Where nothing is known of a direction, lines are so close that they carry the surface.
+    xx, yy, xy = (np.nan_to_num(values) for values in (xx, yy, xy))
+    xy = (power - 1) * xy + (2 - power) * _BROWNIAN * np.sqrt(xx * yy)
+    return Representation((np.stack([xx, yy, xy]) * (ratio / 4)).astype(np.float32), power)
+
+
+def between_data(heights: NDArray[np.float64], step: int) -> tuple[NDArray[np.float64], float]:
+    """Return the standard deviation of ground between data that are `step` posts apart, beside smooth ground, at posts.
+
+    Posts between data are interpolated, smoothly in most models; how smooth the ground is, only second differences at
+    the spacing of the data and its multiples say. Of a power law their ratio stays, of waves it falls to that of smooth
+    ground by the fourth part of its logarithm with each halving of the distance. Also returned is the power, as in
+    `Representation`. Zero where data are not further apart than posts.
+    """
+    Z, none = heights.astype(float), np.zeros(heights.shape)
+    if step < 2:
+        return none, 2.0
+    free = np.ones((Z.shape[0], Z.shape[1] - 1), bool)
+    both = [(_second(Z, free, k * step) ** 2, _second(Z.T, free, k * step).T ** 2) for k in (1, 2, 4)]
+    means = np.array([np.nanmean(each) if np.isfinite(each).any() else np.nan for each in both])
+    if not (means[:2] > 0).all():
+        return none, 2.0
+    seen, wide = np.log(np.clip(means[:2] / np.where(means[1:] > 0, means[1:], means[:2]), _SMOOTH, _ROUGH) / _SMOOTH)
+    wave = _SMOOTH * np.exp(_WAVE * seen)
+    ratio = _SMOOTH * np.exp(seen * np.interp(seen / max(wide, 1e-9), (_WAVE, _LAW), (_WAVE, 1.0)))
+    # The best interpolation leaves nothing of the error of linear interpolation on waves, all on steps.
+    left = np.clip(np.log(ratio / wave) / np.log(max(_STEPS / wave, 1.1)), 0.0, 1.0)
+    around = sum(np.nan_to_num(_around(square)) for square in both[0])
+    return np.sqrt(ratio * left / 4 * around), _power(ratio)
+
+
+def _power(ratio: float) -> float:
+    """The power by which variance grows between posts."""
+    return float(np.clip(-np.log2(ratio), 1.0, 2.0))
+
+
+def _uncut(vertices: NDArray[np.float64] | None, n: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether sides of meshes along x, shape (n + 1, n), and along y, shape (n, n + 1), have no vertex inside."""
+    across, along = np.ones((n + 1, n), bool), np.ones((n, n + 1), bool)
+    if vertices is not None and len(vertices):
+        x, y = vertices.T
+        on_x, on_y = np.abs(x - np.rint(x)) < _ON_LINE, np.abs(y - np.rint(y)) < _ON_LINE
+        lower_x, lower_y = (np.clip(np.floor(v), 0, n - 1).astype(int) for v in (x, y))
+        nearest_x, nearest_y = (np.clip(np.rint(v), 0, n).astype(int) for v in (x, y))
+        some = on_y & ~on_x
+        across[nearest_y[some], lower_x[some]] = False
+        some = on_x & ~on_y
+        along[lower_y[some], nearest_x[some]] = False
+    return across, along
+
+
+def _second(Z: NDArray[np.float64], uncut: NDArray[np.bool_], step: int) -> NDArray[np.float64]:
+    """Second differences along rows at a distance of `step` posts; NaN at the ends and where a line crosses."""
+    found = np.full(Z.shape, np.nan)
+    n = Z.shape[1]
+    if n > 2 * step:
+        found[:, step:-step] = Z[:, 2 * step :] - 2 * Z[:, step:-step] + Z[:, : -2 * step]
+        for shift in range(2 * step):
+            found[:, step:-step][~uncut[:, shift : n - 2 * step + shift]] = np.nan
+    return found
+
+
+def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Means over a window; where none is known there, over the windows around."""
+    mean = _mean(values)
+    return np.where(np.isnan(mean), _mean(mean), mean)
+
+
+def _mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Means over a window; NaN where no value is known there."""
+    known = np.isfinite(values)
+    total, count = _weighted_sum(np.where(known, values, 0.0)), _weighted_sum(known.astype(float))
+    return np.asarray(np.where(count > 0.01, total / np.maximum(count, 0.01), np.nan))
+
+
+def _weighted_sum(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum over a window with `_WINDOW` along rows and columns, zeros around."""
+    before, here, after = _WINDOW
+    padded = np.pad(values, 1)
+    rows = before * padded[:-2] + here * padded[1:-1] + after * padded[2:]
+    return np.asarray(before * rows[:, :-2] + here * rows[:, 1:-1] + after * rows[:, 2:])
+
+
+PointKind = Literal["mass", "spot"]
+LineKind = Literal["breakline", "formline", "border", "hole"]
+POINT_KINDS: tuple[PointKind, ...] = get_args(PointKind)
+LINE_KINDS: tuple[LineKind, ...] = get_args(LineKind)
+
+
+@storable
+@dataclass(frozen=True, eq=False)
+class PointGroup:
+    """Points of one class that were measured in one way."""
+
+    name: str
+    """What users call the group: the file, or file and code."""
+    kind: PointKind
+    """Mass points describe the surface; spot heights are chosen points (tops, hollows) measured with more care."""
+    xyz: NDArray[np.float64]
+    """X, Y, Z, shape (n, 3), metres; finite."""
+    records: NDArray[np.int64]
+    """Number of the record (line of a text file, else feature or point number from 1) of each point, shape (n,)."""
+    sigma: float | None = None
+    """Standard deviation of the heights, metres (the filter value); None: that of its class."""
+    names: NDArray[Any] | None = None
+    """Names of the points as the file gives them, shape (n,), strings; None: they have none."""
+
+    def __post_init__(self) -> None:
+        _check_points(self.xyz, self.name)
+        if self.kind not in POINT_KINDS:
+            raise InputError(f"{self.name}: points of kind {self.kind!r}; kinds are {', '.join(POINT_KINDS)}")
+        if len(self.records) != len(self.xyz) or (self.names is not None and len(self.names) != len(self.xyz)):
+            raise InputError(f"{self.name}: {len(self.xyz)} points, but {len(self.records)} record numbers or names")
+        _check_sigma(self.sigma, self.name)
+
+    def label(self, index: int) -> str:
+        """How a point is named in messages and lists."""
+        own = f" {self.names[index]}" if self.names is not None else ""
+        return f"{self.name}{own} (record {self.records[index]})"
+
+
+@storable
+@dataclass(frozen=True, eq=False)
+class MeasuredLine:
+    """One line: its vertices in order."""
+
+    name: str
+    """What users call the line: file and record, and its own name or code."""
+    kind: LineKind
+    """Breakline (slope jumps, or with `right` the height), form line (bends smoothly), border or hole (closed)."""
+    xyz: NDArray[np.float64]
+    """X, Y, Z, shape (n, 3), metres; at a two-sided breakline the height left of the line in its direction.
+    Z may be NaN in borders and holes, which then only bound the model."""
+    right: NDArray[np.float64] | None = None
+    """Heights right of the line, shape (n,), metres: a wall. None: both sides share the height."""
+    sigma: float | None = None
+    """Standard deviation of the heights, metres (the filter value); None: that of its class."""
+    code: str = ""
+    """Code of the file, such as the survey code of a ditch's edge; empty if there is none."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in LINE_KINDS:
+            raise InputError(f"{self.name}: line of kind {self.kind!r}; kinds are {', '.join(LINE_KINDS)}")
+        _check_points(self.xyz, self.name, heights=self.kind in ("breakline", "formline"))
+        if len(self.xyz) < 2:
+            raise InputError(f"{self.name}: a line of {len(self.xyz)} points; at least two are needed")
+        if self.right is not None and (
+            self.kind != "breakline" or self.right.shape != (len(self.xyz),) or not np.isfinite(self.right).all()
+        ):
+            raise InputError(f"{self.name}: right-hand heights belong to breaklines, one finite height for each vertex")
+        _check_sigma(self.sigma, self.name)
+
+
+@storable
+@dataclass(frozen=True, eq=False)
+class Tin:
+    """Triangles that a file brings along; kept for comparison, never used as measurements."""
+
+    xyz: NDArray[np.float64]
+    """Vertices, shape (n, 3), metres."""
+    faces: NDArray[np.int64]
+    """Vertex numbers of each triangle, shape (m, 3)."""
+
+
+@storable
+@dataclass(frozen=True, eq=False)
+class MeasuredTerrain:
+    """All that was measured of one terrain, in one projected CRS and one height system."""
+
+    points: tuple[PointGroup, ...] = ()
+    lines: tuple[MeasuredLine, ...] = ()
+    crs: str | None = None
+    """CRS as pyproj reads it; None: the files do not say."""
+    height_system: str | None = None
+    """Vertical CRS or its name as the file gives it; None: the files do not say."""
+    tin: Tin | None = None
+    """The file's own triangulation, if it has one."""
+    files: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = field(default=())
+    """What was noticed while reading and repaired or left out, one line each."""
+    codes: frozenset[str] = frozenset()
+    """All codes and names of layers that the files hold."""
+    unit: float | None = None
+    """Metres in the unit of X, Y and, without `height_unit`, Z that the file states apart from its CRS; None: none."""
+    height_unit: float | None = None
+    """Metres in the unit of Z that the file states apart from its height system; None: none."""
+    fields: tuple[str, ...] = ()
+    """What the columns, attributes or layers of the files are called, file by file, for messages."""
+
+    @property
+    def count(self) -> int:
+        """Number of points, vertices of lines not included."""
+        return sum(len(group.xyz) for group in self.points)
+
+
+def _check_points(xyz: NDArray[np.float64], name: str, heights: bool = True) -> None:
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise InputError(f"{name}: points of shape {xyz.shape}; X, Y, Z in three columns are needed")
+    if not np.isfinite(xyz if heights else xyz[:, :2]).all():
+        raise InputError(f"{name}: a coordinate is not finite")
+
+
+def _check_sigma(sigma: float | None, name: str) -> None:
+    if sigma is not None and not (np.isfinite(sigma) and sigma >= 0):
+        raise InputError(f"{name}: filter value {sigma}; a standard deviation in metres, zero or more, is needed")
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ __getattr__, __dir__, __all__ = public(
     {
         "targets.base": "Target",
         "targets.map": "MapTarget",
-        "targets.view": "FrameBundle ViewTarget",
-        "targets.panorama": "Panorama",
+        "targets.view": "FrameBundle ViewTarget Panorama",
         "geometry.grid": "MapGrid Placement Window",
     },
 )

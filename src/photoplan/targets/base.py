@@ -7,8 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.geometry.breaks import Breaks
-from photoplan.geometry.grid import Placement, Window
+from photoplan.geometry.grid import Breaks, Placement, Window
 
 
 class Target(Protocol):

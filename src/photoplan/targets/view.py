@@ -1,11 +1,8 @@
-"""The perspective view as a target: (u, v) is a pixel of a virtual camera, h the depth along its axis.
-
-With a pinhole the ground of a pixel is linear in each of u, v and h, so that everything projective over a tile of it is
-one box of anchors, exactly.
-"""
+"""Targets of perspective views and panoramas."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Protocol
@@ -15,12 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import CentralCamera, project
 from photoplan.cameras.build import taken_apart
-from photoplan.cameras.risen import EarthBend, Exaggeration
-from photoplan.cameras.warped import Warp
+from photoplan.cameras.curvature import EarthBend, Exaggeration, Warp
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Placement, Window
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import dot
+from photoplan.geometry.pose import Pose, dot
 
 #: Rays that are bent are followed in at most so many pieces.
 MOST_PIECES = 64
@@ -325,3 +320,115 @@ class ViewTarget:
         for warp in reversed(self.warps):
             points = warp.inverse(points)
         return points
+
+
+@dataclass(frozen=True, eq=False)
+class Panorama:
+    """The rays of a panorama: columns are directions on the map, clockwise, at equal angles.
+
+    On a cylinder (h = horizontal distance) verticals stay straight and rows are tangents of elevations; on a sphere (an
+    equirectangular panorama, h = distance) rows are elevations at equal angles.
+    """
+
+    center: NDArray[np.float64]
+    """The point of view, shape (3,)."""
+    size: tuple[int, int]
+    """Width and height, pixels."""
+    azimuth: float
+    """Direction of the middle, radians clockwise from north."""
+    scale: float
+    """Pixels per radian."""
+    horizon: float
+    """Row of the horizon."""
+    spherical: bool = False
+    upright: bool = field(default=True, init=False)
+    """Columns are vertical planes."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.scale) and self.scale > 0 and min(self.size) >= 1):
+            raise UsageError(f"panorama of {self.size} pixels, {self.scale} per radian; positive numbers are needed")
+        if self.size[0] > 2 * math.pi * self.scale * (1 + 1e-9):
+            raise UsageError(f"panorama over {math.degrees(self.size[0] / self.scale):.6g}°; at most 360 are there")
+
+    def directions(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Directions (..., 3): of horizontal length one on a cylinder, of length one on a sphere."""
+        uv = np.asarray(uv, float)
+        azimuth = self.azimuth + (uv[..., 0] - (self.size[0] - 1) / 2) / self.scale
+        rise = (self.horizon - uv[..., 1]) / self.scale
+        level, up = np.ones_like(rise), rise
+        if self.spherical:
+            level, up = np.where(np.abs(rise) <= math.pi / 2, np.cos(rise), np.nan), np.sin(rise)
+        return np.stack([level * np.sin(azimuth), level * np.cos(azimuth), up], axis=-1)
+
+    def pixels(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Pixel and depth (..., 3), columns within half a turn of the middle; NaN at the point of view itself."""
+        away = np.asarray(XYZ, float) - self.center
+        level = np.hypot(away[..., 0], away[..., 1])
+        turn = np.arctan2(away[..., 0], away[..., 1]) - self.azimuth
+        turn = (turn + math.pi) % (2 * math.pi) - math.pi
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rise = np.arctan2(away[..., 2], level) if self.spherical else away[..., 2] / level
+        h = np.linalg.norm(away, axis=-1) if self.spherical else level
+        out = np.stack([(self.size[0] - 1) / 2 + self.scale * turn, self.horizon - self.scale * rise, h], axis=-1)
+        out[~(h > 0)] = np.nan
+        return out
+
+
+#: Rays steeper than this, metres of height per metre on the map, are no part of a fan.
+STEEPEST = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class Fan:
+    """The rays of a window: those of a column lie in a vertical plane, straight but for the target's `bend`."""
+
+    ways: NDArray[np.float64]
+    """Directions of the columns on the map, of length one, shape (width, 2)."""
+    level: tuple[NDArray[np.float64], NDArray[np.float64]]
+    """Metres on the map per metre of depth: what columns (width,) and rows (height,) have of it, to be multiplied."""
+    rise: NDArray[np.float64]
+    """Metres of height on the map per metre there, of the rows in a column whose own part of it is one, shape
+    (height,); it falls from row to row."""
+    rows: tuple[int, int]
+    """The first of the rows that are not too steep, and the one after the last."""
+    up: NDArray[np.bool_]
+    """Whether the rays of a row do not go down where they start, shape (height,)."""
+
+    @property
+    def steeper(self) -> NDArray[np.float64]:
+        """What `rise` is times in each column, shape (width,)."""
+        return np.asarray(1.0 / self.level[0])
+
+
+def fan_of(target: ViewTarget, window: Window, reach: float, tolerance: float) -> Fan | None:
+    """Rays of a window as planes; None: they are none, or bent otherwise than `ViewTarget.bend`."""
+    if not target.upright:
+        return None
+    # Of the whole picture, so that all windows have the same numbers.
+    width, height = target.bundle.size
+    u, v = np.arange(width, dtype=float), np.arange(height, dtype=float)
+    down = target.bundle.directions(np.stack([np.zeros(height), v], axis=-1))
+    rows = np.hypot(down[:, 0], down[:, 1])
+    middle = v[np.argmax(np.nan_to_num(rows))]
+    across = target.bundle.directions(np.stack([u, np.full(width, middle)], axis=-1))
+    columns = np.hypot(across[:, 0], across[:, 1])
+    with np.errstate(invalid="ignore"):
+        flat = np.flatnonzero(np.abs(down[:, 2]) < STEEPEST * rows)
+    if not len(flat):
+        return None
+    top, end = int(flat[0]), int(flat[-1]) + 1
+    rise = np.full(height, np.nan)
+    paths = target.rays(down[top:end], reach, tolerance)
+    if paths.shape[1] != 2:
+        return None
+    gone = paths[:, 1] - paths[:, 0]
+    rise[top:end] = gone[:, 2] / np.hypot(gone[:, 0], gone[:, 1])
+    here, there = slice(window.row, window.stop[1]), slice(window.col, window.stop[0])
+    first, last = (min(max(row - window.row, 0), window.height) for row in (top, end))
+    return Fan(
+        ways=across[there, :2] / columns[there, None],
+        level=(columns[there] / columns[0], rows[here]),
+        rise=rise[here],
+        rows=(first, last),
+        up=~(down[here, 2] < 0),
+    )

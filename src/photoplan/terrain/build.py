@@ -14,16 +14,12 @@ from scipy.ndimage import distance_transform_edt
 
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events, Map
-from photoplan.surfaces.measured import MeasuredTerrain
-from photoplan.surfaces.mesh.faces import build_faces
-from photoplan.surfaces.mesh.lines import on_grid
-from photoplan.surfaces.mesh.thin import thin
-from photoplan.surfaces.units import LineElement, MeshFaces, Unit, UnitFigures, UnitLayout
-from photoplan.terrain.clean.borders import domain_of
+from photoplan.surfaces.mesh import build_faces, on_grid, thin
+from photoplan.surfaces.units import LineElement, MeasuredTerrain, MeshFaces, Unit, UnitFigures, UnitLayout
+from photoplan.terrain.clean import domain_of
 from photoplan.terrain.fit import TerrainFit, fit
-from photoplan.terrain.held_out import calibrated
 from photoplan.terrain.observations import Observations, observe
-from photoplan.terrain.predict import Domain, predict_lines, predict_unit, with_chords
+from photoplan.terrain.predict import Domain, calibrated, predict_lines, predict_unit, with_chords
 from photoplan.terrain.settings import BuildSettings
 
 #: Gaps are bridged up to twice this many spacings.

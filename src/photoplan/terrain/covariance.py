@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from photoplan.adjustment.linear import solve
-from photoplan.adjustment.robust import spread
+from photoplan.adjustment.least_squares import solve, spread
 from photoplan.codec import storable
 from photoplan.kernels.fit_covariance import block_score, minimise
 from photoplan.kernels.sides import sides_of

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.cameras.base import Camera
 from photoplan.errors import UsageError
 from photoplan.surfaces.base import Terrain
-from photoplan.surfaces.intersect import intersect
 from photoplan.surfaces.objects import without_objects
+from photoplan.surfaces.shifted import intersect
 
 REASONS = {
     "": "met",

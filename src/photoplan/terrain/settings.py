@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from photoplan.errors import UsageError
-from photoplan.surfaces.measured import LINE_KINDS, POINT_KINDS
+from photoplan.surfaces.units import LINE_KINDS, POINT_KINDS
 
 Family = Literal["gaussian", "matern", "exponential"]
 FAMILIES: tuple[Family, ...] = get_args(Family)

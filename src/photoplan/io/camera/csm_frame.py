@@ -14,18 +14,17 @@ from typing import Any
 import numpy as np
 
 from photoplan.cameras.body_frame import BodyFrameCamera
+from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.line_sight import to_sphere
-from photoplan.cameras.plane import Affine2D
+from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.pushbroom_rays import to_sphere
 from photoplan.errors import InputError
-from photoplan.geometry.body import BodyGround
-from photoplan.geometry.motion import conjugate, cubic, rotations, times
-from photoplan.geometry.pose import Pose
+from photoplan.geometry.local import BodyGround
+from photoplan.geometry.pose import Pose, conjugate, cubic, rotations, times
 from photoplan.io.camera.isd import FORM, FRAME_MODEL, Isd
 from photoplan.io.camera.isd_lens import LENSES, lens_of, not_known
-from photoplan.io.plain_files import read_json
+from photoplan.io.files import read_json
 
 #: Support data of a frame are small.
 _MAX_BYTES = 20_000_000

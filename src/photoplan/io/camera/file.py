@@ -9,7 +9,6 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from photoplan.errors import InputError
-from photoplan.io.appearance import looks_like
 from photoplan.io.camera import opencv as camera_opencv
 from photoplan.io.camera import opensfm as camera_opensfm
 from photoplan.io.camera import pix4d as camera_pix4d
@@ -17,12 +16,11 @@ from photoplan.io.camera import yaml as camera_yaml
 from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.camera.usgs import check_report
+from photoplan.io.files import explain, looks_like, read_head, read_toml
 from photoplan.io.orientation import colmap as orientation_colmap
 from photoplan.io.orientation import metashape as orientation_metashape
 from photoplan.io.orientation import pix4d as orientation_pix4d
 from photoplan.io.orientation.table import TableFormat
-from photoplan.io.plain_files import read_head, read_toml
-from photoplan.io.project.errors import explain
 
 _CAMERAS = TypeAdapter(dict[str, Camera])
 

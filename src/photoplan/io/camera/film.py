@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Strict, field_validator, model_validator
 
-from photoplan.cameras.fiducials_fit import MODELS
+from photoplan.cameras.fiducials import MODELS
 from photoplan.cameras.interior import Interior
 from photoplan.io.camera.model import CameraEntry, Fiducials, FiducialSystem, Pair, Pixels, Positive
 from photoplan.io.mark_model import EachMark, Marks

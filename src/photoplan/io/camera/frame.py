@@ -9,7 +9,7 @@ from pydantic import model_validator
 
 from photoplan.cameras.interior import Interior
 from photoplan.io.camera.model import CameraEntry, Fiducials, InPixels, Pair, Pixels, Positive
-from photoplan.io.plain_files import build
+from photoplan.io.files import build
 
 
 class FrameEntry(CameraEntry):

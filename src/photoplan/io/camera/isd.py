@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.motion import between, odd_step, quaternions, times
+from photoplan.geometry.pose import between, odd_step, quaternions, times
 
 _Floats = NDArray[np.float64]
 FORM = "CSM support data (ISD)"

@@ -13,12 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.cubic import Cubic
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.opencv import OpenCV
-from photoplan.cameras.lenses.reversed import Reversed
+from photoplan.cameras.lenses import Brown, Cubic, Lens, NoLens, OpenCV, Reversed
 from photoplan.errors import InputError
 from photoplan.io.camera.isd import Isd
 

@@ -13,18 +13,12 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, field_validator, model_validator
 
-from photoplan.cameras.fiducials_fit import FiducialFit, fit_marks
+from photoplan.cameras.fiducials import FiducialFit, fit_marks
 from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.fisheye import Fisheye
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.opencv import OpenCV
-from photoplan.cameras.lenses.radial_table import RadialTable
-from photoplan.cameras.lenses.reversed import Reversed
+from photoplan.cameras.lenses import Brown, Fisheye, Lens, NoLens, OpenCV, RadialTable, Reversed
 from photoplan.errors import InputError
+from photoplan.io.files import check_input_name
 from photoplan.io.mark_model import LARGEST, Marks, Number
-from photoplan.io.names import check_input_name
 
 Positive = Annotated[float, Strict(), Field(gt=0, le=LARGEST, allow_inf_nan=False)]
 NotNegative = Annotated[float, Strict(), Field(ge=0, le=LARGEST, allow_inf_nan=False)]
@@ -241,7 +235,7 @@ class FiducialSystem:
     places_mm: Fiducials
     """Calibrated marks by name, x right and y upwards."""
     model: str
-    """Transformation from them to a scan: one of `photoplan.cameras.fiducials_fit.MODELS`."""
+    """Transformation from them to a scan: one of `photoplan.cameras.fiducials.MODELS`."""
     mirrored: bool
     """Whether the film was scanned through its back."""
     looks: Marks | None

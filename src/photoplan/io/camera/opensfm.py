@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from photoplan.errors import InputError
-from photoplan.io.appearance import looks_like
 from photoplan.io.camera.frame import frame_in_pixels
 from photoplan.io.camera.model import CameraEntry, InPixels, UnusableCamera
-from photoplan.io.plain_files import finite, read_json
+from photoplan.io.files import finite, looks_like, read_json
 
 _COEFFICIENTS = {
     "perspective": ("k1", "k2"),

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry
+from photoplan.io.files import finite, read_text
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form
-from photoplan.io.plain_files import finite, read_text
 
 MAX_BYTES = 1 << 20
 _KEYS = ("F", "Px", "Py", "K1", "K2", "K3", "T1", "T2")

@@ -13,7 +13,7 @@ from typing import Any
 
 from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry
-from photoplan.io.plain_files import finite
+from photoplan.io.files import finite
 
 #: Coordinates and distances are printed to a micrometre each; rounding makes 2 µm, and the least-squares solution that
 #: the coordinates come from one more.

@@ -21,8 +21,7 @@ from typing import Any
 from photoplan.errors import InputError
 from photoplan.io.camera.frame import frame_in_pixels
 from photoplan.io.camera.model import CameraEntry, InPixels
-from photoplan.io.markup_files import read_yaml
-from photoplan.io.plain_files import finite
+from photoplan.io.files import finite, read_yaml
 
 _COEFFICIENTS = {
     "pinhole": (),

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation
+from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.camera.model import CameraEntry, IdealLens, UnusableCamera
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
 

@@ -25,11 +25,11 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry, UnusableCamera
+from photoplan.io.files import finite, read_text, whole_number
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras, without_unusable
 from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
 from photoplan.io.orientation.text import numbers
-from photoplan.io.plain_files import finite, read_text, whole_number
 
 MAX_BYTES = 2 << 30
 #: Parameters of every camera model, in the order of COLMAP's model numbers (0, 1, 2, …).

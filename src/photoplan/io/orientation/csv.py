@@ -9,11 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from photoplan.errors import InputError
+from photoplan.io.files import crs_beside
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation.table import ANGLE_NAMES, OrientationTable, OrientedImage, TableFormat
-from photoplan.io.plain_files import crs_beside
-from photoplan.io.table_lines import NUMBER, csv_line
-from photoplan.io.tables import Columns, Dialect, Table, read_table
+from photoplan.io.tables import NUMBER, Columns, Dialect, Table, csv_line, read_table
 
 #: Header names (in small letters) of every role.
 HEADERS = {

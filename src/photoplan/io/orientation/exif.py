@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_step
-from photoplan.geometry.earth_poses import enu_poses
-from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.geometry.local import enu_poses
+from photoplan.geometry.pose import rotation_from_angles
 from photoplan.io.image_metadata import ImageMetadata, read_image_metadata
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import OrientationTable, TableFormat, posed

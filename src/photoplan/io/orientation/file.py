@@ -8,11 +8,11 @@ from pathlib import Path
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import disk_error, make_parents
-from photoplan.io.naming import together, write_atomically
+from photoplan.io.files import read_head
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import OrientationTable, TableFormat
-from photoplan.io.plain_files import read_head
 from photoplan.io.product import check_output
+from photoplan.io.store import together, write_atomically
 
 #: Module of every format, by name; each defines `FORMAT` (see `photoplan.io.orientation.block`).
 FORMATS: dict[str, str] = {

@@ -32,15 +32,15 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.pose import rotation_opk
 from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.camera.model import CameraEntry
+from photoplan.io.files import build, read_text
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.inpho_write import losses, render
 from photoplan.io.orientation.table import Direction, OrientationTable, TableFormat, posed
 from photoplan.io.orientation.text import DIRECTIONS, checked_rotation, numbers
-from photoplan.io.plain_files import build, read_text
-from photoplan.io.table_lines import number
+from photoplan.io.tables import number
 
 MAX_BYTES = 200_000_000
 #: Largest median difference of matrices and angles that settles what the matrices do: boresight angles and errors of

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError, named_by
 from photoplan.geometry.crs import crs_step, parse_crs
-from photoplan.geometry.earth_poses import (
+from photoplan.geometry.local import (
     enu_axes,
     geocentric_of_geodetic,
     geocentric_poses,
@@ -38,12 +38,11 @@ from photoplan.geometry.earth_poses import (
 )
 from photoplan.geometry.units import metric_system
 from photoplan.io.camera.model import CameraEntry, UnusableCamera
+from photoplan.io.files import finite, numbers, read_xml
 from photoplan.io.lens_forms import AgisoftForm, agisoft_form, frame_camera
-from photoplan.io.markup_files import numbers, read_xml
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
 from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
 from photoplan.io.orientation.text import checked_rotation
-from photoplan.io.plain_files import finite
 from photoplan.plain import xml_quoted, xml_text
 
 MAX_BYTES = 256 << 20

@@ -24,10 +24,10 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, utm_codes
 from photoplan.io.camera import opensfm as camera_opensfm
 from photoplan.io.camera.model import CameraEntry
+from photoplan.io.files import finite, read_json
 from photoplan.io.lens_forms import opencv_form
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
-from photoplan.io.plain_files import finite, read_json
 
 #: Longest distance of the two positions of an image, metres; the same numbers differ by rounding only.
 _AGREE = 0.05

@@ -27,13 +27,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
-from photoplan.geometry.agreement import agreement, misfit
 from photoplan.geometry.bounds import is_no_fix
-from photoplan.geometry.crs import crs_label, crs_step, topocentric_poses, utm_codes
-from photoplan.geometry.earth_poses import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
-from photoplan.io.appearance import looks_like
+from photoplan.geometry.crs import agreement, crs_label, crs_step, misfit, topocentric_poses, utm_codes
+from photoplan.geometry.local import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
 from photoplan.io.camera.model import CameraEntry, UnusableCamera
 from photoplan.io.camera.opensfm import cameras_of
+from photoplan.io.files import elements, finite, looks_like, members, read_json
 from photoplan.io.lens_forms import opencv_form, opencv_losses
 from photoplan.io.orientation.block import (
     Loss,
@@ -44,7 +43,6 @@ from photoplan.io.orientation.block import (
     without_unusable,
 )
 from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
-from photoplan.io.plain_files import elements, finite, members, read_json
 
 _Floats = NDArray[np.float64]
 

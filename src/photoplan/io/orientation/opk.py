@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
-from photoplan.geometry.earth_poses import enu_poses, is_local_crs, is_wgs84_geographic, legacy_wkt
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.local import enu_poses, is_local_crs, is_wgs84_geographic, legacy_wkt
+from photoplan.geometry.pose import rotation_opk
 from photoplan.geometry.units import metric_system
+from photoplan.io.files import read_text
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
 from photoplan.io.orientation.text import numbers
-from photoplan.io.plain_files import read_text
 
 MAX_BYTES = 256 << 20
 _HEADER = re.compile(r"#\s*PhotoID\W+X\W+Y\W+Z\W+Omega\W+Phi\W+Kappa", re.I)

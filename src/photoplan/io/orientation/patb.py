@@ -24,7 +24,7 @@ from photoplan.io.orientation.block import (
 )
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat, posed
 from photoplan.io.orientation.text import DIRECTIONS, Words, checked_rotation, numbers, one_word, word_lines
-from photoplan.io.table_lines import number
+from photoplan.io.tables import number
 
 #: Characters of an image name that PATB takes at most (Catalyst's guide on export to PATB).
 NAME = 15

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
-from photoplan.geometry.earth_poses import is_local_crs, legacy_wkt
+from photoplan.geometry.local import is_local_crs, legacy_wkt
 from photoplan.io.camera import pix4d as camera_pix4d
 from photoplan.io.camera.model import CameraEntry
+from photoplan.io.files import read_text, whole_number
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
 from photoplan.io.orientation.text import checked_rotation, numbers
-from photoplan.io.plain_files import read_text, whole_number
 
 MAX_BYTES = 1 << 30
 _EXTERNAL = re.compile(r"\s*#?\s*imageName\s+X\s+Y\s+Z\s+Omega\s+Phi\s+Kappa\b", re.I)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import odd_angles, odd_place
-from photoplan.geometry.rotation import ANGLE_UNITS, ROTATION_ORDERS, angles_from_rotation, rotation_from_angles
+from photoplan.geometry.pose import ANGLE_UNITS, ROTATION_ORDERS, angles_from_rotation, rotation_from_angles
 from photoplan.geometry.units import agreed_metres, metric_heights, metric_system, unit_label
 
 Direction = Literal["camera-to-ground", "ground-to-camera"]

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
+from photoplan.io.files import read_text
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
-from photoplan.io.plain_files import read_text
-from photoplan.io.table_lines import number
+from photoplan.io.tables import number
 
 MAX_BYTES = 200_000_000
 #: Rotation matrices of files are rounded; what differs more from a rotation is none.

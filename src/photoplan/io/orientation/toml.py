@@ -16,12 +16,11 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import Fiducials, Name, Pixels, Triple
+from photoplan.io.files import explain, read_toml
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, require_map
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
-from photoplan.io.plain_files import read_toml
-from photoplan.io.project.errors import explain
+from photoplan.io.project.file import camera_lines, toml_value
 from photoplan.io.project.model import Orientation
-from photoplan.io.project.write import camera_lines, toml_value
 
 
 class _TomlLine(BaseModel):

@@ -15,11 +15,11 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Table
 
 from photoplan.errors import InputError
-from photoplan.io.naming import write_atomically
-from photoplan.io.plain_files import MAX_BYTES, read_text
+from photoplan.io.files import MAX_BYTES_PLAIN_FILES as MAX_BYTES
+from photoplan.io.files import read_text
 from photoplan.io.project.file import parse_project
-from photoplan.io.project.model import Project
-from photoplan.io.project.posed import turned_angles, turned_correlation
+from photoplan.io.project.model import Project, turned_angles, turned_correlation
+from photoplan.io.store import write_atomically
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,497 @@
-"""What a project file says, as checked and frozen values. Files are read and written in `photoplan.io.project.file`."""
+"""The project file: cameras, images, orientation, terrain, and their limits."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from numpy.typing import ArrayLike
-from pydantic import Field, PrivateAttr, Strict, field_validator, model_validator
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Discriminator, Field, PrivateAttr, Strict, Tag, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
+from photoplan.cameras.fiducials import Affine2D, FiducialFit
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses import Lens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import area_fault, bounds_fault, odd_angles, odd_place
+from photoplan.geometry.pose import ANGLE_UNITS
 from photoplan.io.camera.kinds import Camera
-from photoplan.io.camera.model import Entry, Name, NotNegative, Number, Positive, Restoration, Triple
-from photoplan.io.names import resolve_input, unique_stems
-from photoplan.io.project.image import ImageEntry, InputName, plain_file
-from photoplan.io.project.kinds import AnyImage
-from photoplan.io.project.posed import Image
+from photoplan.io.camera.line.file import line_files
+from photoplan.io.camera.model import (
+    CameraEntry,
+    Entry,
+    Fiducials,
+    Name,
+    NotNegative,
+    Number,
+    Pair,
+    Pixels,
+    Positive,
+    Restoration,
+    Restore,
+    Triple,
+)
+from photoplan.io.files import check_input_name, resolve_input, unique_stems
+
+Deviation = tuple[str, NDArray[np.float64]]
+"""An error's name, and what it changes of the numbers that state a geometry."""
+
+InputName = Annotated[str, Field(max_length=4000)]
+
+
+class ImageEntry(Entry, ABC):
+    """An image, of whatever geometry.
+
+    A kind of geometry is a file of its own with a subclass, a line in `photoplan.io.project.model` and one in
+    `photoplan.project.cameras`.
+    """
+
+    name: Name
+    """Products are called after it."""
+    file: InputName
+    size: tuple[Pixels, Pixels] | None = None
+    """Width and height of this image, where nothing else states them."""
+    alpha: Annotated[bool, Strict()] | None = None
+    """Whether bands that are tagged as alpha are masks (true) or colours (false); None: their values decide."""
+    restore: Restore | None = None
+    """Filter that it is restored with before anything is made of it; None: that of its camera, if there is one."""
+    balance: InputName | None = None
+    """Balance file by which its grey values agree with those of other images, after all else; None: they stay."""
+
+    @field_validator("file", "balance")
+    @classmethod
+    def _file(cls, text: str | None) -> str | None:
+        return None if text is None else plain_file(text)
+
+    @property
+    @abstractmethod
+    def geometry_file(self) -> str | None:
+        """File that its geometry is read from, beside that of its pixels; None: there is none."""
+
+    def geometry_files(self, resolve: Callable[[str], Path]) -> list[Path]:
+        """All files that its geometry is read from, beside that of its pixels; `resolve` finds what entries name."""
+        return [] if self.geometry_file is None else [resolve(self.geometry_file)]
+
+    @property
+    def unoriented(self) -> str | None:
+        """Why products leave the image out; None if it is oriented."""
+        return None
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know of its geometry, a clause each."""
+        return ()
+
+    def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
+        """Independent errors of its geometry, each one standard deviation large."""
+        raise InputError(f"image {self.name!r}: its kind of geometry states no accuracy that a raster could be made of")
+
+    def moved(
+        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
+    ) -> tuple[ImageEntry, Mapping[str, CameraEntry]]:
+        """It and the cameras with its geometry changed by a part of one of its `deviations`."""
+        raise NotImplementedError
+
+    @property
+    @abstractmethod
+    def described_by(self) -> str | None:
+        """Name of the [cameras.NAME] table that it needs; None: it needs none."""
+
+
+def plain_file(text: str) -> str:
+    """A name of a file as an entry states it; raises ValueError where no file can have it."""
+    try:
+        return check_input_name(text)
+    except InputError as error:
+        raise ValueError(str(error)) from None
+
+
+class FrameImage(ImageEntry):
+    """One image of a frame camera, whose interior and exterior orientation a file states."""
+
+    frame: InputName
+    """File of camera and orientation."""
+
+    @field_validator("frame")
+    @classmethod
+    def _frame(cls, text: str) -> str:
+        return plain_file(text)
+
+    @property
+    def geometry_file(self) -> str:
+        """That file."""
+        return self.frame
+
+    @property
+    def described_by(self) -> None:
+        """It needs no table of cameras."""
+        return None
+
+
+class LineImage(ImageEntry):
+    """One image of a line camera, whose trajectory and directions a file states."""
+
+    line: InputName
+    """File of the line camera."""
+    detectors: Name | None = None
+    """Which line of detectors, where the file has several."""
+    correction: InputName | None = None
+    """File of corrections of its trajectory, as `photoplan adjust` writes them."""
+    mount: Name | None = None
+    """Images of one mount share boresight, lever arm and clock in an adjustment; None: those of one file do."""
+
+    _change: tuple[float, ...] = PrivateAttr(default=())
+
+    @field_validator("line", "correction")
+    @classmethod
+    def _line(cls, text: str | None) -> str | None:
+        return None if text is None else plain_file(text)
+
+    @property
+    def geometry_file(self) -> str:
+        """The file of the line camera."""
+        return self.line
+
+    def geometry_files(self, resolve: Callable[[str], Path]) -> list[Path]:
+        """That file, the record of the flight beside it, and the corrections."""
+        correction = [] if self.correction is None else [resolve(self.correction)]
+        return [*line_files(resolve(self.line)), *correction]
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Its correction."""
+        return () if self.correction is None else (f"trajectory is corrected by {self.correction}",)
+
+    def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
+        """See `ImageEntry.deviations`: six parts of what its correction says of the trajectory's poses."""
+        if self.correction is None:
+            raise InputError(
+                f"image {self.name!r}: nothing is known of the accuracy of its trajectory; `photoplan adjust` writes "
+                "it into the file of its `correction`, as [accuracy]"
+            )
+        return tuple(("trajectory", row) for row in np.eye(6))
+
+    def moved(
+        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
+    ) -> tuple[LineImage, Mapping[str, CameraEntry]]:
+        """See `ImageEntry.moved`; on a flight without tremor, which makes no difference to errors."""
+        image = self.model_copy()
+        image._change = tuple(change.tolist())
+        return image, cameras
+
+    @property
+    def change(self) -> tuple[float, ...]:
+        """Parts of the errors of its trajectory by which it is moved; empty: it is as it is."""
+        return self._change
+
+    @property
+    def described_by(self) -> None:
+        """It needs no table of cameras."""
+        return None
+
+
+#: What `rpc` says if the image file holds them itself.
+TAGS = "tags"
+
+#: Standard deviations of shift (pixels) and drift (pixels per pixel) beyond which nothing is known of an image.
+_MOST_DEVIATION = (1e6, 1e6, 1.0, 1.0, 1.0, 1.0)
+
+
+class RpcImage(ImageEntry):
+    """One image whose geometry a file of rational polynomials states, or the image file itself."""
+
+    rpc: InputName
+    """``tags``: the image file holds them; else the file that does."""
+    shift: Pair | None = None
+    """What is added to the polynomials' column and row, pixels."""
+    scale: Positive | None = None
+    """Pixels of the image file for one of the polynomials, before the shift; None: one, and sizes are compared."""
+    drift: tuple[Number, Number, Number, Number] | None = None
+    """What is added beside: to the column by column and row, to the row by column and row, per pixel."""
+    covariance: Annotated[tuple[Number, ...], Field(max_length=21)] | None = None
+    """Of shift and drift: the lower triangle by rows, of two or six numbers; pixels and pixels per pixel."""
+
+    @field_validator("rpc")
+    @classmethod
+    def _rpc(cls, text: str) -> str:
+        return plain_file(text)
+
+    @field_validator("covariance")
+    @classmethod
+    def _covariance(cls, values: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if values is not None and len(values) not in (3, 21):
+            raise ValueError(f"covariance of {len(values)} numbers; 3 of shift, or 21 of shift and drift are needed")
+        if values is not None and min(values[0], values[2]) < 0:
+            raise ValueError("covariance with a variance below 0; it is the lower triangle by rows")
+        return values
+
+    @property
+    def geometry_file(self) -> str | None:
+        """The file of polynomials; None: the image file holds them."""
+        return None if self.rpc == TAGS else self.rpc
+
+    @property
+    def described_by(self) -> None:
+        """It needs no camera."""
+        return None
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Its correction."""
+        scaled = () if self.scale in (None, 1.0) else (f"polynomials are scaled by {self.scale:g}",)
+        if self.shift is None:
+            return scaled
+        known = "accuracy not stated"
+        if self.covariance is not None:
+            known = f"± {self.covariance[0] ** 0.5:.2g}, {self.covariance[2] ** 0.5:.2g} px"
+        x, y = self.shift
+        return (
+            *scaled,
+            f"polynomials are corrected by {x:+.2f}, {y:+.2f} px ({known})",
+        )
+
+    def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
+        """See `ImageEntry.deviations`: of shift and drift."""
+        if self.covariance is None:
+            raise InputError(
+                f"image {self.name!r}: nothing is known of the accuracy of its polynomials; `photoplan adjust` writes "
+                "their covariance, or state it in [[images]]: covariance = [VARIANCE OF COLUMN, 0, VARIANCE OF ROW]"
+            )
+        size = 2 if len(self.covariance) == 3 else 6
+        C = np.zeros((size, size))
+        C[np.tril_indices(size)] = self.covariance
+        scale = np.sqrt(np.maximum(np.diag(C), 1e-300))
+        odd = scale > np.array(_MOST_DEVIATION)[:size]
+        if odd.any():
+            raise InputError(
+                f"image {self.name!r}: covariance says ± {scale[odd][0]:.3g} {'px' if odd[:2].any() else 'px per px'}: "
+                "that is no accuracy; is it that of its polynomials?"
+            )
+        values, axes = np.linalg.eigh((np.tril(C) + np.tril(C, -1).T) / np.outer(scale, scale))
+        if values[0] < -1e-3:
+            raise InputError(f"image {self.name!r}: covariance is none; `photoplan adjust` writes it")
+        return tuple(("polynomials", a * scale * np.sqrt(max(v, 0.0))) for v, a in zip(values, axes.T))
+
+    def moved(
+        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
+    ) -> tuple[RpcImage, Mapping[str, CameraEntry]]:
+        """See `ImageEntry.moved`."""
+        x, y, *rest = (
+            change + np.array([*(self.shift or (0.0, 0.0)), *(self.drift or (0.0,) * 4)])[: len(change)]
+        ).tolist()
+        return self.model_copy(update={"shift": (x, y)} | ({"drift": tuple(rest)} if rest else {})), cameras
+
+    @property
+    def correction(self) -> Affine2D | None:
+        """From the polynomials' positions to those in the image; None: they are equal."""
+        if self.shift is None and self.drift is None:
+            return None
+        (x, y), (xx, xy, yx, yy) = self.shift or (0.0, 0.0), self.drift or (0.0, 0.0, 0.0, 0.0)
+        return Affine2D(a1=1.0 + xx, a2=xy, a3=x, a4=yx, a5=1.0 + yy, a6=y)
+
+
+#: Metres (or units of an angle or a camera's parameter) beyond which a standard deviation says nothing.
+_MOST_DEVIATION_POSED = 1e6
+_ANGLES = {"o": "omega", "p": "phi", "k": "kappa"}
+
+Correlation = tuple[Annotated[float, Strict(), Field(ge=-1, le=1)], ...]
+
+
+def turned_angles(angles: Sequence[float], unit: str, order: str) -> Triple:
+    """Return angles of a camera system that is turned by half a circle about its x axis, within half a circle.
+
+    Half a turn about x adds to ω, and reverses the sense of the rotations between ω and the camera.
+    """
+    half = ANGLE_UNITS[unit] / 2
+    turned = [round(sign * angle, 12) + 0.0 for sign, angle in zip(_senses(order), angles)]
+    at = order.index("o")
+    turned[at] = round(angles[at] - half if angles[at] > 0 else angles[at] + half, 12) + 0.0
+    return (turned[0], turned[1], turned[2])
+
+
+def _senses(order: str) -> list[float]:
+    """Return −1 for each angle whose sense half a turn of the camera about x reverses, else 1."""
+    return [-1.0 if k > order.index("o") else 1.0 for k in range(3)]
+
+
+def turned_correlation(correlation: Sequence[float], order: str, camera: CameraEntry) -> tuple[float, ...]:
+    """Return the correlations after `turned_angles`: those of reversed angles and of what is odd in x change sign."""
+    signs = [1.0, 1.0, 1.0, *_senses(order)]
+    signs += [-1.0 if name in camera.odd_in_x else 1.0 for name in camera.sigma or {}]
+    size = int((1 + np.sqrt(1 + 8 * len(correlation))) / 2)
+    if size > len(signs):
+        raise InputError(f"correlation has {len(correlation)} numbers, more than orientation and camera have")
+    pairs = zip(*np.tril_indices(size, -1))
+    return tuple(float(r * signs[i] * signs[j]) for r, (i, j) in zip(correlation, pairs))
+
+
+class Image(ImageEntry):
+    """One image with a pose: oriented, or to be oriented."""
+
+    camera: Name
+    center: Triple | None = None
+    """Projection centre X0, Y0, Z0 in the project's CRS and the orientation's height system, metres; None: the image
+    is not oriented yet."""
+    angles: Triple | None = None
+    """Three angles in the sequence and unit that [orientation] states."""
+    sigma_center: tuple[NotNegative, NotNegative, NotNegative] | None = None
+    """Standard deviations of the projection centre, metres, as `photoplan adjust` and `resect` found them."""
+    sigma_angles: tuple[NotNegative, NotNegative, NotNegative] | None = None
+    """Standard deviations of the angles, in their unit."""
+    correlation: Correlation | None = None
+    """The correlation matrix of centre, angles and, after a calibration, what `sigma` of the camera lists, below its
+    diagonal, row by row; None: they are not correlated."""
+    approximate: Annotated[bool, Strict()] | None = None
+    """Whether center and angles are initial values that `photoplan adjust` could not improve: products leave the image
+    out."""
+    fiducials: Fiducials | None = None
+    """Measured fiducial marks of a film scan: name = [column, row], pixels."""
+
+    @model_validator(mode="after")
+    def _both(self) -> Self:
+        if (self.center is None) != (self.angles is None):
+            raise ValueError("center and angles go together: give both, or none for an image that is not oriented")
+        if self.correlation is not None and (self.sigma_center is None or self.sigma_angles is None):
+            raise ValueError("correlation goes with sigma_center and sigma_angles")
+        return self
+
+    @property
+    def geometry_file(self) -> None:
+        """Its geometry stands in the project."""
+        return None
+
+    @property
+    def described_by(self) -> str:
+        """Its camera."""
+        return self.camera
+
+    def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
+        """See `ImageEntry.deviations`: of centre, angles and camera."""
+        if self.sigma_center is None or self.sigma_angles is None:
+            raise InputError(
+                f"image {self.name!r}: nothing is known of the accuracy of its orientation; `photoplan adjust` and "
+                "`resect` write sigma_center and sigma_angles, or state them in [[images]]"
+            )
+        of_camera = cameras[self.camera].sigma or {}
+        sigma = np.array([*self.sigma_center, *self.sigma_angles, *of_camera.values()])
+        if sigma.max() > _MOST_DEVIATION_POSED:
+            raise InputError(
+                f"image {self.name!r}: a standard deviation of {sigma.max():.3g} in orientation or camera is no "
+                "accuracy"
+            )
+        names = ["X0", "Y0", "Z0", *(_ANGLES[letter] for letter in rotation), *(f"camera {name}" for name in of_camera)]
+        R, joined = self._correlations(len(of_camera))
+        values, axes = np.linalg.eigh(R)
+        if joined and values[0] < -1e-3:
+            raise InputError(f"image {self.name!r}: correlation is that of no covariance; `photoplan adjust` writes it")
+        together = "orientation" if joined <= 6 else "orientation and camera"
+        largest = np.abs(axes).argmax(axis=0)
+        return tuple(
+            (together if k < joined else names[k], axis * np.sqrt(max(value, 0.0)) * sigma)
+            for k, value, axis in zip(largest.tolist(), values, axes.T)
+        )
+
+    def _correlations(self, of_camera: int) -> tuple[NDArray[np.float64], int]:
+        """Correlation matrix of centre, angles and so many parameters of the camera; how many first ones it states."""
+        size, given = 6 + of_camera, np.array(self.correlation or (), float)
+        joined = {0: 0, 15: 6, size * (size - 1) // 2: size}.get(len(given))
+        if joined is None:
+            raise InputError(
+                f"image {self.name!r}: correlation has {len(given)} numbers; 15 for centre and angles, or "
+                f"{size * (size - 1) // 2} for them and the {of_camera} parameters of its camera"
+            )
+        R = np.eye(size)
+        R[:joined, :joined][np.tril_indices(joined, -1)] = given
+        return np.tril(R) + np.tril(R, -1).T, joined
+
+    def moved(
+        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
+    ) -> tuple[Image, Mapping[str, CameraEntry]]:
+        """See `ImageEntry.moved`."""
+        camera = cameras[self.camera]
+        center, angles = (np.array(part) for part in self.pose_numbers)
+        update = {"center": tuple(center + change[:3]), "angles": tuple(angles + change[3:6])}
+        by_name = dict(zip(camera.sigma or {}, change[6:].tolist()))
+        return self.model_copy(update=update), {**cameras, self.camera: camera.moved(by_name, self.camera)}
+
+    def scene_turned(self, unit: str, order: str, camera: CameraEntry) -> Image:
+        """Return the image with its angles for a scene on the other side of the image, see `turned_angles`."""
+        update: dict[str, object] = {}
+        if self.angles is not None:
+            update["angles"] = turned_angles(self.angles, unit, order)
+        if self.correlation:
+            update["correlation"] = turned_correlation(self.correlation, order, camera)
+        return self.model_copy(update=update) if update else self
+
+    @property
+    def unoriented(self) -> str | None:
+        """See `ImageEntry`."""
+        if self.center is None:
+            return "has no orientation; `photoplan resect` or `photoplan adjust` determines it"
+        return "its orientation is approximate: `photoplan adjust` could not determine it" if self.approximate else None
+
+    @property
+    def pose_numbers(self) -> tuple[Triple, Triple]:
+        """Projection centre and angles as stated."""
+        if self.center is None or self.angles is None:
+            raise InputError(f"image {self.name!r} {self.unoriented}")
+        return self.center, self.angles
+
+
+#: The entry that only images of a kind have; an image without any of them has a pose.
+_BY_ENTRY: dict[str, type[ImageEntry]] = {"rpc": RpcImage, "line": LineImage, "frame": FrameImage}
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, dict):
+        return next((kind.__name__ for entry, kind in _BY_ENTRY.items() if entry in value), Image.__name__)
+    return type(value).__name__
+
+
+AnyImage = Annotated[
+    Annotated[Image, Tag("Image")]
+    | Annotated[RpcImage, Tag("RpcImage")]
+    | Annotated[LineImage, Tag("LineImage")]
+    | Annotated[FrameImage, Tag("FrameImage")],
+    Discriminator(_kind),
+]
+
+
+def image_size(camera: CameraEntry, image: Image) -> tuple[int, int]:
+    """Width and height of an image as the project states it."""
+    size = image.size or camera.size
+    if size is None:
+        raise InputError(f"image {image.name!r}: its size is stated neither with the image nor with its camera")
+    return size
+
+
+def fiducial_fit(camera: CameraEntry, image: Image, model: str | None = None) -> FiducialFit:
+    """Adjustment of an image's fiducial marks; see `photoplan.io.camera.model.FiducialSystem.fit`."""
+    system = camera.fiducial_system
+    if system is None:
+        raise InputError(f"image {image.name!r}: its camera has no fiducial marks")
+    try:
+        return system.fit(image.fiducials, model)
+    except InputError as error:
+        raise type(error)(f"image {image.name!r}: {error}") from None
+
+
+def interior_of(camera: CameraEntry, image: Image, size: tuple[int, int] | None = None) -> Interior:
+    """Interior orientation of an image."""
+    size = size or image_size(camera, image)
+    try:
+        return camera.interior_orientation(size, image.fiducials)
+    except InputError as error:
+        raise type(error)(f"image {image.name!r}: {error}") from None
+
+
+def lens_of(camera: CameraEntry) -> Lens:
+    """Lens of a camera; raises InputError where the coefficients cannot be a lens's."""
+    return camera.lens.made(camera)
 
 
 class StatedTerrain(Entry):
@@ -340,7 +813,7 @@ class Project(Entry):
         return image.restore or (None if camera is None else self.cameras[camera].restore)
 
     def ortho_settings(self) -> dict[str, Any]:
-        """What the `[ortho]` table states, by the names of `photoplan.products.orthophoto.settings.OrthoSettings`."""
+        """What the `[ortho]` table states, by the names of `photoplan.products.orthophoto.plan.OrthoSettings`."""
         stated = self.ortho.model_dump(exclude_none=True)
         if "nodata" in stated:
             stated["nodata"] = str(stated["nodata"])

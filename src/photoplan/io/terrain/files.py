@@ -17,16 +17,16 @@ from photoplan.geometry.bounds import area_fault, area_note, beyond_area
 from photoplan.geometry.crs import crs_label, require_projected_metres, same_crs, split_compound
 from photoplan.geometry.heights import check_height_system
 from photoplan.geometry.units import MetricSystem, agreed_metres, metric_system, unit_label
-from photoplan.io.checks import check_plain_file
+from photoplan.io.files import check_plain_file
+from photoplan.io.raster import USUAL_NODATA
 from photoplan.io.terrain import landxml as terrain_landxml
 from photoplan.io.terrain import las as terrain_las
 from photoplan.io.terrain import text as terrain_text
 from photoplan.io.terrain import vector as terrain_vector
-from photoplan.io.terrain.groups import check_matched
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.io.terrain.reader import HIGHEST, LOWEST
-from photoplan.io.validity import USUAL_NODATA
-from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup, Tin
+from photoplan.io.terrain.vector import check_matched
+from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, PointGroup, Tin
 
 #: Kilometres beyond the area of the CRS from which on the unit of a drawing is doubted, if its numbers lie inside.
 _MISSTATED = 20.0

@@ -14,16 +14,16 @@ from typing import Any
 from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
-from defusedxml import DefusedXmlException  # type: ignore[import-untyped]
-from defusedxml.ElementTree import iterparse  # type: ignore[import-untyped]
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import iterparse
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
 from photoplan.geometry.units import FOOT, metres_in
-from photoplan.io.plain_files import whole_number
+from photoplan.io.files import whole_number
 from photoplan.io.terrain.options import OTHER, CodeClass, ReadOptions
-from photoplan.surfaces.measured import LINE_KINDS, LineKind, MeasuredLine, MeasuredTerrain, PointGroup, Tin
+from photoplan.surfaces.units import LINE_KINDS, LineKind, MeasuredLine, MeasuredTerrain, PointGroup, Tin
 
 MAX_BYTES = 4 << 30
 MAX_DEPTH = 64

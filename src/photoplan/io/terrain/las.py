@@ -23,7 +23,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
 from photoplan.geometry.units import agreed_metres, metres_in, metric_heights
 from photoplan.io.terrain.options import ReadOptions
-from photoplan.surfaces.measured import MeasuredTerrain, PointGroup
+from photoplan.surfaces.units import MeasuredTerrain, PointGroup
 
 try:
     import resource

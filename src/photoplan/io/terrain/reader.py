@@ -19,11 +19,9 @@ from photoplan.geometry.units import (
     metric_system,
     unit_label,
 )
-from photoplan.io.block_cache import BlockCache
-from photoplan.io.checks import TERRAIN_LIMITS, RasterLimits
+from photoplan.io.files import TERRAIN_LIMITS, RasterLimits
+from photoplan.io.raster import USUAL_NODATA, BlockCache, MissingBlocks, missing_blocks, read_pixels
 from photoplan.io.raster_info import RasterInfo, read_info
-from photoplan.io.raster_pixels import missing_blocks, read_pixels
-from photoplan.io.validity import USUAL_NODATA, MissingBlocks
 
 LOWEST, HIGHEST = -12_000.0, 9_000.0
 """Heights of the Earth, metres: below the deepest sea, above the highest mountain."""
@@ -46,7 +44,7 @@ class TerrainReader:
     to `cache_bytes`, least recently used ones are forgotten first. Safe to call from several threads and to pickle (the
     cache stays behind).
 
-    Nodata, alpha, mask and blocks that were never written follow the rule of `photoplan.io.validity`; NaN and values
+    Nodata, alpha, mask and blocks that were never written follow the rule of `photoplan.io.raster`; NaN and values
     of ±1e30 and more are void as well. Other values that are no height on Earth (below -12 000 m or above 9 000 m), and
     the usual nodata values where none is declared, are refused with their count.
     """

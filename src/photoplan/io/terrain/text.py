@@ -1,17 +1,12 @@
-"""Measured terrain from text files: points, and lines as consecutive records.
-
-Columns are separated by spaces, commas, semicolons or tabs; see `ReadOptions.columns` for what they hold. Lines that
-are empty or begin with ``#`` are passed over. Records whose code is one of a line class make up lines: consecutive
-records of one line id (and code), or, where there is no column of line ids, of one code without an empty line between
-them. A breakline whose records have a second height (column ``z_right``) is two-sided: ``z`` is the height left of the
-line in its direction, ``z_right`` the height to its right; records without it have one height. Heights may be empty
-for border lines and holes. A file of the same name with the suffix ``.prj`` states the CRS.
-"""
+"""Terrain measurements in text files: columns and tables of points."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +14,213 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.plain_files import crs_beside
-from photoplan.io.table_lines import line_blocks, split_line
-from photoplan.io.tables import TableLayout
-from photoplan.io.terrain.columns import PointBlock, parse_block, points_layout
-from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_line, make_groups
+from photoplan.io.files import crs_beside, whole_number
+from photoplan.io.tables import (
+    DELIMITERS,
+    NOTHING,
+    Columns,
+    Dialect,
+    Line,
+    TableLayout,
+    decimal,
+    find_layout,
+    has_decimal_comma,
+    line_blocks,
+    number,
+    split_line,
+    wrong_width,
+)
 from photoplan.io.terrain.options import OTHER, CodeClass, ReadOptions
-from photoplan.surfaces.measured import LineKind, MeasuredLine, MeasuredTerrain
+from photoplan.io.terrain.vector import CodeIndex, PointColumns, class_of, is_line, make_groups
+from photoplan.surfaces.units import LineKind, MeasuredLine, MeasuredTerrain
+
+LookUp = Callable[[str, int], CodeClass]
+"""Class of a code; the line is for messages."""
+
+#: Header names (in small letters) of every role.
+HEADERS = {
+    "x": ("x", "east", "easting", "e", "rechtswert"),
+    "y": ("y", "north", "northing", "n", "hochwert"),
+    "z": ("z", "height", "h", "elevation", "elev", "altitude", "z_left"),
+    "code": ("code", "kind", "class", "type"),
+    "sigma": ("sigma", "stddev", "sd", "accuracy"),
+    "name": ("name", "id", "point", "nr", "number", "label"),
+    "line": ("line", "line_id", "lineid", "string"),
+    "z_right": ("z_right", "right", "zright"),
+}
+NEEDED = ("x", "y", "z")
+NUMBERS = ("x", "y", "z", "sigma", "z_right")
+TEXT = 32
+"""Characters of a text that the fast way keeps; blocks with longer ones are read the slow way."""
+_NONE = (*NOTHING, "-")
+
+
+def _explain(first: tuple[str, ...], why: str) -> str | None:
+    """What a first line is that holds no record: no header either."""
+    if all(decimal(f) is not None for f in first[:3]):
+        return None
+    hint = ""
+    if any(has_decimal_comma(f) or re.fullmatch(r"\d+ [-+]?\d+", f) for f in first):
+        hint = "; decimal commas have to be declared (`decimal_comma`)"
+    return (
+        f"{', '.join(first)[:120]!r} is neither a record nor a header with X, Y and Z: {why}; declare the columns, for "
+        f"example x,y,z,code or x=East,y=North,z=Height{hint}"
+    )
+
+
+COLUMNS = Columns(
+    roles=HEADERS,
+    needed=NEEDED,
+    numbers=frozenset(NUMBERS),
+    orders=tuple(tuple(HEADERS)[:n] for n in range(3, len(HEADERS) + 1)),
+    one_each=True,
+    explain=_explain,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PointBlock:
+    """Columns of a block of lines."""
+
+    xyz: NDArray[np.float64]
+    records: NDArray[np.int64]
+    code: list[str] | None
+    line: list[str] | None
+    name: list[str] | None
+    sigma: NDArray[np.float64] | None
+    right: NDArray[np.float64] | None
+
+
+def points_layout(path: Path, lines: Sequence[str], dialect: Dialect) -> TableLayout | None:
+    """What the columns hold, from the first lines of a file; None: they hold no data."""
+    head = [item for item in enumerate(lines[:1000], 1) if item[1].strip()]
+    data = [item for item in head if not item[1].lstrip().startswith("#")]
+    if not data:
+        return None
+    found = find_layout(path, head, COLUMNS, dialect)
+    if not found.by_order or found.width == 3:
+        return found
+    where = f"{path}:{data[0][0]}"
+    rows = [split_line(path, item, found.delimiter) for item in data[:20]]
+    if _are_numbers_of_points(rows):
+        raise InputError(
+            f"{where}: the first column counts 1 by 1 like numbers of points, and there is no header; "
+            "declare the columns, for example name,x,y,z (or x,y,z,code if it is X)"
+        )
+    for role in ("sigma", "z_right"):
+        text = found.names[found.roles[role]] if role in found.roles else "0"
+        if text.casefold() not in _NONE and decimal(text, dialect.decimal_comma) is None:
+            raise InputError(
+                f"{where}: {found.width} columns without a header that are not {', '.join(HEADERS)}; declare them, for "
+                "example name,x,y,z,-,code (`-` for a column that is not used)"
+            )
+    return found
+
+
+def _are_numbers_of_points(rows: Sequence[Sequence[str]]) -> bool:
+    first = [row[0] for row in rows]
+    if len(first) < 3 or not all(re.fullmatch(r"\d{1,9}", text) for text in first):
+        return False
+    return all(int(b) - int(a) == 1 for a, b in pairwise(first))
+
+
+def parse_block(
+    path: Path, layout: TableLayout, first: int, lines: list[str], look_up: LookUp, decimal_comma: bool
+) -> PointBlock | None:
+    """Columns of the lines of a block that hold data; None if there are none."""
+    keep = [at for at, text in enumerate(lines) if text and not text.isspace() and text.lstrip()[0] != "#"]
+    if keep and first + keep[0] == layout.header:
+        keep = keep[1:]
+    if not keep:
+        return None
+    if len(keep) < len(lines):
+        lines = [lines[at] for at in keep]
+    records = np.array(keep, np.int64) + first
+    block = _fast(layout, lines, records, decimal_comma)
+    return block if block is not None else _slow(path, layout, lines, records, look_up, decimal_comma)
+
+
+def _fast(layout: TableLayout, lines: list[str], records: NDArray[np.int64], decimal_comma: bool) -> PointBlock | None:
+    """Columns by NumPy's reader; None where anything is unusual."""
+    texts = [r for r in layout.roles if r not in NUMBERS]
+    if decimal_comma:
+        lines = [text.replace(",", ".") for text in lines]
+    of_column = {at: role for role, at in layout.roles.items()}
+    plain = len(of_column) == layout.width and not texts
+    kinds = [(f"c{at}", "f8" if of_column.get(at) in NUMBERS else f"U{TEXT}") for at in range(layout.width)]
+    try:
+        table: Any = np.loadtxt(
+            lines,
+            dtype=np.float64 if plain else np.dtype(kinds),
+            delimiter=None if layout.delimiter == " " else layout.delimiter,
+            comments=None,
+            quotechar='"',
+            ndmin=2 if plain else 1,
+        )
+    except (ValueError, OverflowError):
+        return None
+    if len(table) != len(lines) or (plain and table.shape[1] != layout.width):
+        return None
+
+    def column(role: str) -> Any:
+        at = layout.roles.get(role)
+        return None if at is None else table[:, at] if plain else table[f"c{at}"]
+
+    xyz = np.stack([column(r) for r in NEEDED], axis=1)
+    sigma, right = column("sigma"), column("z_right")
+    if not np.isfinite(xyz).all() or any(c is not None and not (c >= 0).all() for c in (sigma,)):
+        return None
+    if right is not None and not np.isfinite(right).all():
+        return None
+    found: dict[str, list[str] | None] = dict.fromkeys(("code", "line", "name"))
+    for role in texts:
+        values = column(role).tolist()
+        if max(map(len, values)) >= TEXT or any("'" in v or (decimal_comma and "." in v) for v in values):
+            return None  # the text may be cut off or in quotes, or its point may have been a comma
+        found[role] = [v.strip() for v in values]
+    return PointBlock(
+        xyz=xyz,
+        records=records,
+        code=found["code"],
+        line=found["line"],
+        name=found["name"],
+        sigma=None if sigma is None else np.array(sigma),
+        right=None if right is None else np.array(right),
+    )
+
+
+def _slow(
+    path: Path, layout: TableLayout, lines: list[str], records: NDArray[np.int64], look_up: LookUp, decimal_comma: bool
+) -> PointBlock:
+    """The same line by line: it names the line and the column that cannot be read."""
+    rows: dict[str, list[Any]] = {role: [] for role in layout.roles}
+    for record, text in zip(records.tolist(), lines):
+        where = f"{path}:{record}"
+        fields = split_line(path, (record, text), layout.delimiter)
+        if len(fields) != layout.width:
+            raise InputError(f"{where}: {wrong_width(len(fields), layout)}")
+        code = fields[layout.roles["code"]] if "code" in layout.roles else ""
+        for role, at in layout.roles.items():
+            if role not in NUMBERS:
+                rows[role].append(fields[at])
+                continue
+            value = decimal(fields[at], decimal_comma)
+            if value is None:
+                may_miss = role in ("sigma", "z_right") or (role == "z" and _without_height(look_up(code, record)))
+                if not (may_miss and fields[at].casefold().lstrip("+-") in _NONE):
+                    number(fields[at], f"{where}: {role}", decimal_comma)
+                value = math.nan
+            if role == "sigma" and value < 0:
+                raise InputError(f"{where}: sigma = {fields[at]!r}; a standard deviation is zero or more")
+            rows[role].append(value)
+    found = {r: np.array(rows[r], np.float64) for r in NUMBERS if r in rows}
+    xyz = np.stack([found[r] for r in NEEDED], axis=1)
+    texts = (rows.get("code"), rows.get("line"), rows.get("name"))
+    return PointBlock(xyz, records, *texts, found.get("sigma"), found.get("z_right"))
+
+
+def _without_height(cls: CodeClass) -> bool:
+    return cls.kind in ("border", "hole", "ignore")
 
 
 @dataclass
@@ -226,3 +421,102 @@ def _line_sigma(sigma: NDArray[np.float64] | None, part: NDArray[np.int64], defa
     if sigma is None or np.isnan(sigma[part]).all():
         return default
     return float(np.sqrt(np.nanmean(sigma[part] ** 2)))
+
+
+_NAMES = {
+    "x": ("x", "east", "easting", "e", "x_m", "rechtswert", "point_x", "longitude", "lon"),
+    "y": ("y", "north", "northing", "n", "y_m", "hochwert", "point_y", "latitude", "lat"),
+}
+
+
+@dataclass(frozen=True)
+class PointTableFormat:
+    """What a table does not say of itself."""
+
+    x: str | None = None
+    """Name of the column of X, or its number from 1; None: `x`, `east`, `easting` …"""
+    y: str | None = None
+    dialect: Dialect = field(default_factory=Dialect)
+    """Delimiter and decimal sign."""
+    header: bool = True
+    """Whether the first line names the columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointPart:
+    """Some lines of the table."""
+
+    rows: list[tuple[str, ...]]
+    """Their fields, as the file has them."""
+    xy: NDArray[np.float64]
+    """X, Y, shape (n, 2)."""
+
+
+class PointTable:
+    """A text file of points with a header; opened by `parts`, as often as wanted."""
+
+    def __init__(self, path: Path, form: PointTableFormat = PointTableFormat()) -> None:
+        self.path, self.form = Path(path), form
+        head = list(islice(self._lines(), 2))
+        if not head:
+            raise InputError(f"{self.path}: holds no line with data")
+        self.delimiter = form.dialect.delimiter or self._sniffed(head[0][1])
+        fields = split_line(self.path, head[0], self.delimiter)
+        self.names = fields if form.header else tuple(str(i + 1) for i in range(len(fields)))
+        if form.header and all(decimal(f, form.dialect.decimal_comma) is not None for f in fields):
+            raise InputError(
+                f"{self.path}:{head[0][0]}: the first line holds numbers, no names of columns; say `header=False`, "
+                "and which columns are X and Y if not the first two"
+            )
+        self._x, self._y = self._column("x", head[0][0]), self._column("y", head[0][0])
+        if form.header and len(head) < 2:
+            raise InputError(f"{self.path}: holds a header and no point")
+
+    def parts(self, size: int) -> Iterator[PointPart]:
+        """The points, in parts of at most `size` lines."""
+        lines = islice(self._lines(), int(self.form.header), None)
+        layout = TableLayout(delimiter=self.delimiter, roles={}, names=self.names, header=0)
+        comma = self.form.dialect.decimal_comma
+        while part := list(islice(lines, size)):
+            rows = [split_line(self.path, item, self.delimiter) for item in part]
+            xy = np.empty((len(rows), 2))
+            for k, ((line, _), row) in enumerate(zip(part, rows)):
+                where = f"{self.path}:{line}"
+                if len(row) != len(self.names):
+                    raise InputError(f"{where}: {wrong_width(len(row), layout)}")
+                xy[k] = [number(row[at], f"{where}: {self.names[at]}", comma) for at in (self._x, self._y)]
+            yield PointPart(rows, xy)
+
+    def _lines(self) -> Iterator[Line]:
+        """The lines that are not empty."""
+        for first, lines in line_blocks(self.path):
+            yield from (item for item in enumerate(lines, first) if item[1].strip())
+
+    def _sniffed(self, text: str) -> str:
+        """The delimiter that the first line holds, a comma before all others where it is no decimal sign."""
+        tried = [d for d in (",", *DELIMITERS) if d != "," or not self.form.dialect.decimal_comma]
+        return next((d for d in tried if d in text.strip()), tried[0])
+
+    def _column(self, axis: str, line: int) -> int:
+        """Where the column of an axis is."""
+        wanted = getattr(self.form, axis)
+        lower = [name.casefold() for name in self.names]
+        if wanted is None:
+            if not self.form.header:
+                wanted = "1" if axis == "x" else "2"
+            else:
+                wanted = next((name for name in _NAMES[axis] if name in lower), None)
+                if wanted is None:
+                    raise InputError(
+                        f"{self.path}:{line}: no column for {axis.upper()} in {', '.join(self.names)[:200]}; name it "
+                        f"with `{axis}` NAME"
+                    )
+        found = [i for i, name in enumerate(lower) if name == wanted.casefold()]
+        if len(found) == 1:
+            return found[0]
+        if 1 <= (whole_number(wanted) or 0) <= len(self.names):
+            return int(wanted) - 1
+        raise InputError(
+            f"{self.path}:{line}: {len(found) or 'no'} columns {wanted!r} for {axis.upper()}; "
+            f"the columns are {', '.join(self.names)[:200]}"
+        )

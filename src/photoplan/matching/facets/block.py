@@ -21,11 +21,19 @@ from photoplan.kernels.facets_height import MOMENTS, GreyFacets, Pixels, add_hei
 from photoplan.kernels.facets_signs import signs_at
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
 from photoplan.kernels.facets_sums import OFFSETS, PAD, add_grey, count_pixels, sort_pixels
-from photoplan.matching.facets.curvature import Roughness, Smoother
 from photoplan.matching.facets.fine import shares
 from photoplan.matching.facets.means import away_from_border, corners, smoothed
-from photoplan.matching.facets.observe import Facets, Relief, Sight, View
-from photoplan.matching.facets.radiometry import Transfer, first_guess, levelled
+from photoplan.matching.facets.observe import (
+    Facets,
+    Relief,
+    Roughness,
+    Sight,
+    Smoother,
+    Transfer,
+    View,
+    first_guess,
+    levelled,
+)
 from photoplan.matching.facets.texture import GreyTexture
 
 _Floats = NDArray[np.float32]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
-from photoplan.matching.grey import Grey
+from photoplan.matching.features import Grey
 
 _Floats = NDArray[np.float32]
 

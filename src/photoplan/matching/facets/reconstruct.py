@@ -14,7 +14,6 @@ from scipy import ndimage
 from photoplan.events import stretch
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.matching.facets.block import FacetBlock
-from photoplan.matching.facets.curvature import Roughness
 from photoplan.matching.facets.evidence import evidence
 from photoplan.matching.facets.judged import (
     edge_variances,
@@ -25,8 +24,19 @@ from photoplan.matching.facets.judged import (
     pixel_noise,
     residual_pictures,
 )
-from photoplan.matching.facets.observe import MARGIN, Facets, Relief, Sight, View, facets_of, levels_done, look
-from photoplan.matching.facets.radiometry import Transfer, first_guess
+from photoplan.matching.facets.observe import (
+    MARGIN,
+    Facets,
+    Relief,
+    Roughness,
+    Sight,
+    Transfer,
+    View,
+    facets_of,
+    first_guess,
+    levels_done,
+    look,
+)
 from photoplan.matching.facets.search import Search, Searched, search
 
 _Floats = NDArray[np.float32]

@@ -1,46 +1,242 @@
-"""Bundle block adjustment: orientations, points and cameras from all observations at once, by least squares.
-
-The unknowns are exterior orientations, ground points and, where they are free, parameters of cameras, lever arm,
-boresight and drift. Points are eliminated (Schur complement), what remains is sparse and solved by SciPy. Gross errors
-are found in two ways: first by weights that fall with the residual, from whatever start; then by data snooping
-(Baarda 1968): each residual against its own standard deviation, the worst of each point first.
-"""
+"""The bundle adjustment: frame, the whole run, and causes of misfits."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from photoplan.errors import GeometryError
-from photoplan.orientation.bundle.block import Active, Adjusted, AdjustSettings, Block, Correlation
-from photoplan.orientation.bundle.correlation import correlation_of, effects_of_rows
-from photoplan.orientation.bundle.loop import Loop, Progress
-from photoplan.orientation.bundle.model import Model, build_model
-from photoplan.orientation.bundle.normal import check_rank, reduce_normals
+from photoplan.adjustment.statistics import chance_gain
+from photoplan.cameras.corrected import CurvatureCorrection
+from photoplan.cameras.curvature import Refraction, local_pose
+from photoplan.cameras.observed import GroundPoints, ObservedAttitudes, ObservedPositions
+from photoplan.errors import GeometryError, PhotoplanError
+from photoplan.geometry.heights import HeightStep
+from photoplan.geometry.local import MEAN_RADIUS, LocalFrame, earth_radius
+from photoplan.geometry.pose import Pose, angles_from_rotation, small_rotations
+from photoplan.orientation.bundle.equations import check_rank, linearise, reduce_normals, residuals_of, whitened
+from photoplan.orientation.bundle.model import (
+    Active,
+    Adjusted,
+    AdjustSettings,
+    Bend,
+    Block,
+    BlockCamera,
+    BlockImage,
+    Correlation,
+    Model,
+    State,
+    build_model,
+    start_state,
+)
 from photoplan.orientation.bundle.result import (
     Solution,
     Weighted,
+    correlation_of,
+    effects_of_rows,
     evened_sigmas,
+    likeness_of,
     refitted_sigmas,
     result_of,
     solution_of,
     with_common_errors,
 )
 from photoplan.orientation.bundle.robust import (
+    Loop,
+    Progress,
+    Selection,
     first_taken_out,
     judged_control,
     kinds_of_measurements,
     scales_of,
+    select,
     snooped,
+    start_points,
     weights_of,
 )
-from photoplan.orientation.bundle.rows import linearise, residuals_of, whitened
-from photoplan.orientation.bundle.select import Selection, select, start_points
-from photoplan.orientation.bundle.unknowns import State, start_state
 
 _Floats = NDArray[np.float64]
+#: Step for the derivatives of angles, radians.
+_STEP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class BlockFrame:
+    """From map X, Y and height (in the orientation's height system) to the block's system and back.
+
+    Without a local system the map is taken for Cartesian, and the two are one.
+    """
+
+    crs: str
+    local: LocalFrame | None
+    """East, north, up near the block's middle, for strict earth curvature."""
+    inward: HeightStep
+    """From the orientation's height system to the one that is computed in."""
+    outward: HeightStep
+
+    def points(self, XYZ: ArrayLike) -> _Floats:
+        """Map points (..., 3) to block points; NaN where a coordinate is NaN and a local system mixes it in."""
+        XYZ = np.array(XYZ, float)
+        if self.local is None:
+            return XYZ
+        XYZ[..., 2] = self.inward(XYZ)
+        return self.local.to_local(XYZ)
+
+    def map_points(self, points: ArrayLike) -> _Floats:
+        """Block points (..., 3) to map points."""
+        if self.local is None:
+            return np.array(points, float)
+        XYZ = self.local.to_map(points)
+        XYZ[..., 2] = self.outward(XYZ)
+        return XYZ
+
+    def jacobian(self, XYZ: ArrayLike) -> _Floats:
+        """∂ block / ∂ map at map points (..., 3), shape (..., 3, 3); the height systems' own slope is left out."""
+        XYZ = np.array(XYZ, float)
+        if self.local is None:
+            return np.broadcast_to(np.eye(3), (*XYZ.shape, 3)).copy()
+        XYZ[..., 2] = self.inward(XYZ)
+        return self.local.jacobian(XYZ)
+
+    def map_covariance(self, covariance: _Floats, XYZ: ArrayLike) -> _Floats:
+        """Covariances (..., 3, 3) of block coordinates as those of map coordinates, at map points."""
+        if self.local is None:
+            return np.array(covariance)
+        back = np.linalg.inv(self.jacobian(XYZ))
+        return back @ covariance @ np.swapaxes(back, -1, -2)
+
+    def map_vectors(self, vectors: _Floats, XYZ: ArrayLike) -> _Floats:
+        """Small vectors (..., 3) of block coordinates as those of map coordinates, at map points."""
+        if self.local is None:
+            return np.array(vectors)
+        return np.asarray((np.linalg.inv(self.jacobian(XYZ)) @ vectors[..., None])[..., 0])
+
+    def pose(self, pose: Pose) -> Pose:
+        """Map pose, whose angles refer to the map's axes at the station, to a block pose."""
+        if self.local is None:
+            return pose
+        center = np.array(pose.center)
+        center[2] = self.inward(center)
+        return local_pose(Pose(center, pose.R_ground_camera), self.local)
+
+    def map_pose(self, pose: Pose) -> Pose:
+        """Inverse of `pose`."""
+        if self.local is None:
+            return pose
+        center = self.local.to_map(pose.center)
+        R = self.local.axes(center).T @ pose.R_ground_camera
+        center[2] = self.outward(center)
+        return Pose(center, R)
+
+    def ground(self, ground: GroundPoints, near: _Floats) -> GroundPoints:
+        """Ground points in the block's system."""
+        if self.local is None:
+            return ground
+        known = np.isfinite(ground.XYZ)
+        place = np.where(known, ground.XYZ, near)
+        XYZ = np.where(known, self.points(place), np.nan)
+        J = self.jacobian(place)
+        variance = np.where(known, ground.sigma, 0.0) ** 2
+        covariance = J @ (variance[..., None] * np.swapaxes(J, -1, -2))
+        if ground.covariance is not None:
+            covariance = J @ ground.covariance @ np.swapaxes(J, -1, -2)
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        covariance[~known.all(axis=1)] = np.nan
+        return GroundPoints(
+            names=ground.names, XYZ=XYZ, sigma=np.where(known, sigma, np.nan), check=ground.check, covariance=covariance
+        )
+
+    def positions(self, positions: ObservedPositions) -> ObservedPositions:
+        """Observed positions in the block's system; covariances between coordinates are left out."""
+        if self.local is None:
+            return positions
+        J = self.jacobian(positions.XYZ)
+        sigma = np.sqrt((J**2 @ positions.sigma[..., None] ** 2)[..., 0])
+        return ObservedPositions(
+            images=positions.images,
+            XYZ=self.points(positions.XYZ),
+            sigma=sigma,
+            strip=positions.strip,
+            time=positions.time,
+        )
+
+    def attitudes(self, attitudes: ObservedAttitudes, centers: _Floats) -> ObservedAttitudes:
+        """Observed attitudes in the block's system; `centers` (n, 3) are the stations in the map."""
+        if self.local is None:
+            return attitudes
+        at = np.array(centers)
+        at[:, 2] = self.inward(at)
+        R = self.local.axes(at) @ attitudes.R_ground_camera
+        return ObservedAttitudes(attitudes.images, R, attitudes.sigma)
+
+
+def angle_derivatives(R: _Floats, order: str) -> _Floats:
+    """∂ angles / ∂ small rotations about the camera's x, y, z (R ← R · exp[δ]×), shape (3, 3), for an order of angles.
+
+    By central differences; large where the angles are not determined (the second one near a right angle).
+    """
+    J = np.empty((3, 3))
+    for axis, turn in enumerate(small_rotations(_STEP * np.eye(3))):
+        difference = angles_from_rotation(R @ turn, order) - angles_from_rotation(R @ turn.T, order)
+        J[:, axis] = (difference + np.pi) % (2 * np.pi) - np.pi
+    return J / (2 * _STEP)
+
+
+def make_bend(
+    frame: BlockFrame,
+    images: Sequence[BlockImage],
+    cameras: Mapping[str, BlockCamera],
+    nadir: _Floats,
+    curved: bool,
+    refracted: bool,
+) -> Bend | None:
+    """What earth curvature (as a correction) and refraction add to the central projection; None if nothing.
+
+    images: all of the block, in its order; nadir: height of the ground below each, metres; curved, refracted: which
+    of them are to be regarded.
+    """
+    if not (curved or refracted):
+        return None
+    radii = [earth_radius(frame.crs, image.pose.center[:2]) if curved else MEAN_RADIUS for image in images]
+
+    def warp_of(k: int, center: _Floats) -> Callable[[_Floats], _Floats]:
+        X, Y, Z = (float(v) for v in center)
+        refract = Refraction((X, Y, Z)) if refracted else None
+        curve = CurvatureCorrection((X, Y, Z), float(nadir[k]), radii[k] + float(nadir[k])) if curved else None
+
+        def warp(points: _Floats) -> _Floats:
+            points = points if refract is None else refract(points)
+            return points if curve is None else curve(points)
+
+        return warp
+
+    def bend(image: NDArray[np.int64], poses: tuple[Pose, ...], points: _Floats) -> _Floats:
+        on_map = points if frame.local is None else frame.local.to_map(points)
+        shift = np.empty((len(points), 2))
+        order = np.argsort(image, kind="stable")
+        for part in np.split(order, np.flatnonzero(np.diff(image[order])) + 1):
+            if not len(part):
+                continue
+            k = int(image[part[0]])
+            center = poses[k].center if frame.local is None else frame.local.to_map(poses[k].center)
+            moved = warp_of(k, center)(on_map[part])
+            moved = moved if frame.local is None else frame.local.to_local(moved)
+            camera = cameras[images[k].camera]
+            shift[part] = _pixels(images[k], camera, poses[k], moved) - _pixels(
+                images[k], camera, poses[k], points[part]
+            )
+        return shift
+
+    return bend
+
+
+def _pixels(image: BlockImage, camera: BlockCamera, pose: Pose, points: _Floats) -> _Floats:
+    p = pose.to_camera(points)
+    t = p[:, :2] / np.where(p[:, 2] < 0, -p[:, 2], np.nan)[:, None]
+    return image.plane_to_pixel(camera.c * camera.lens.distort(t) + np.array(camera.principal_point))
+
 
 #: Points farther from the block than this, in units of its largest extent, begin anew.
 _FAR = 10.0
@@ -233,3 +429,144 @@ def _returned(model: Model, state: State, active: Active, factors: _Floats, crit
 def _started(model: Model, XYZ: _Floats) -> State:
     poses = [model.block.images[k].pose for k in model.image_rows]
     return start_state(model.block, model.camera_names, model.strip_names, poses, XYZ, model.sets)
+
+
+#: Plain least squares of all that is not a gross error of an image point: nothing is thrown out, nothing reweighted.
+_PLAIN = AdjustSettings(robust=False, variance_components=False, correlation=False, covariance=False)
+#: Chance and part of the sum of squares from which a cause is named.
+_CHANCE, _EXPLAINS = 1e-6, 0.3
+#: Part of the sum of squares that a cause with more unknowns must explain beyond one with less.
+_MORE = 0.1
+#: Ratio of found to stated accuracy from which one asks for causes, and redundancy that the ratio needs.
+_RATIO, _SOUND = 1.4, 15.0
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A model in which the observations fit better."""
+
+    name: str
+    """As users call it."""
+    explains: float
+    """Part of what does not fit that it takes away, 0 to 1."""
+    change: float
+    """By how much a camera constant changes, as a part of it; 0 for other causes."""
+    remedy: str
+    """What would regard it."""
+    measure: str = "squared residuals"
+    """What it takes away a part of; accuracies are weighed by the deviance, −2 times the logarithm of likelihood."""
+
+
+def doubtful(result: Adjusted) -> bool:
+    """Whether control or positions were thrown out, or accuracies are far from what was stated."""
+    rejected = result.ground_rejected.any() or result.position_rejected.any()
+    ratios = [g.factor for g in result.groups if g.redundancy > _SOUND and np.isfinite(g.factor)]
+    return bool(rejected or any(ratio > _RATIO for ratio in ratios))
+
+
+def weighed_causes(block: Block, result: Adjusted) -> tuple[Cause, ...]:
+    """Causes that explain a good part of what does not fit, the likeliest first; empty where all is as stated.
+
+    Each is an adjustment of the block with other unknowns, all control and positions included. It is named where
+    unknowns without meaning would hardly lower the sum of squares as much (F-test). What the best of them leaves is
+    weighed as errors of image points that are alike, and as other accuracies than stated, by their likelihood.
+    """
+    if not doubtful(result):
+        return ()
+    poses = dict(zip(result.images, result.poses))
+    used = np.isfinite(result.residuals[:, 0]) & ~result.rejected
+    start = replace(
+        block,
+        images=tuple(replace(image, pose=poses[image.name]) for image in block.images if image.name in poses),
+        observations=block.observations.where(used),
+    )
+    try:
+        base = adjust_block(start, _PLAIN)
+    except PhotoplanError:
+        return ()
+    whole = base.sigma0**2 * base.redundancy
+    found: list[tuple[Cause, int, Block, Adjusted]] = []
+    for name, remedy, other in _models(start):
+        try:
+            tried = adjust_block(other, _PLAIN)
+        except PhotoplanError:
+            continue
+        rest, more = tried.sigma0**2 * tried.redundancy, tried.unknowns - base.unknowns
+        if more <= 0 or tried.redundancy <= 0 or not rest < whole:
+            continue
+        if chance_gain(whole, rest, more, tried.redundancy) < _CHANCE and (whole - rest) / whole > _EXPLAINS:
+            changes = [a.c / block.cameras[a.name].c - 1 for a in tried.cameras if "c" in a.free]
+            change = max(changes, key=abs, default=0.0) if "constant" in name else 0.0
+            found.append((Cause(name, (whole - rest) / whole, change, remedy), more, other, tried))
+    # A simpler cause that explains nearly as much is the likelier one.
+    best = max((cause.explains for cause, *_ in found), default=0.0)
+    found.sort(key=lambda item: (item[0].explains < best - _MORE * (1 - best) - 0.02, item[1], -item[0].explains))
+    other, tried = found[0][2:] if found else (start, base)
+    return (*(cause for cause, *_ in found), *_of_errors(other, tried, result))
+
+
+def _of_errors(block: Block, base: Adjusted, result: Adjusted) -> tuple[Cause, ...]:
+    """Other errors than stated: of image points that are alike, or larger ones of what else was observed.
+
+    Control that does not agree with the rest is wrong by itself, and has no part in this.
+    """
+    XYZ = np.where(result.ground_rejected, np.nan, block.ground.XYZ)
+    likeness = likeness_of(replace(block, ground=replace(block.ground, XYZ=XYZ)), base)
+    if likeness is None:
+        return ()
+    found = []
+    if likeness.alike:
+        name = (
+            f"errors of image points that are alike over about {float(f'{likeness.reach:.2g}'):.0f} px "
+            f"({likeness.share:.0%} of their variance)"
+        )
+        remedy = (
+            "look at the lens, the film and how points were measured; with many more points in each image the "
+            "adjustment regards it"
+        )
+        found.append(Cause(name=name, explains=likeness.by_likeness, change=0.0, remedy=remedy, measure="deviance"))
+    if likeness.worse:
+        groups = ", ".join(f"{name} ({times:.1f} times)" for name, times in likeness.worse)
+        name = f"errors that are larger than stated: {groups}"
+        found.append(
+            Cause(
+                name=name,
+                explains=likeness.by_accuracy,
+                change=0.0,
+                remedy="state their accuracy as it is",
+                measure="deviance",
+            )
+        )
+    return tuple(sorted(found, key=lambda cause: -cause.explains))
+
+
+def _models(block: Block) -> Iterator[tuple[str, str, Block]]:
+    """Other models of a block: name, remedy, block."""
+    for name, camera in block.cameras.items():
+        for what, parameters in (("camera constant", ("c",)), ("principal point", ("x0", "y0"))):
+            if not set(parameters) <= set(camera.free):
+                free = tuple(dict.fromkeys((*camera.free, *parameters)))
+                cameras = {**block.cameras, name: replace(camera, free=free)}
+                remedy = f"calibrate {', '.join(parameters)} of camera {name!r}, or state what is right"
+                yield f"the {what} of camera {name!r}", remedy, replace(block, cameras=cameras)
+    positions = block.positions
+    if positions is None or block.drift == "linear":
+        return
+    if block.drift == "none":
+        together = replace(positions, strip=("all",) * len(positions.images))
+        remedy = "check datum, heights and antenna of the observed positions"
+        yield (
+            "a common shift of the observed positions (datum)",
+            remedy,
+            replace(block, positions=together, drift="shift"),
+        )
+        yield (
+            "a shift of the observed positions in each strip",
+            'drift = "shift" in [adjustment]',
+            replace(block, drift="shift"),
+        )
+    yield (
+        "a drift of the observed positions in each strip",
+        'drift = "linear" in [adjustment]',
+        replace(block, drift="linear"),
+    )

@@ -1,29 +1,545 @@
-"""A block as arrays: what stays the same in all iterations of the bundle adjustment."""
+"""The block of a bundle adjustment: observations, unknowns and the model."""
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, field, replace
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.adjustment.blocks import Layout
-from photoplan.cameras.correctable import Corrections
-from photoplan.cameras.lenses.brown import Brown
-from photoplan.cameras.lenses.none import NoLens
-from photoplan.cameras.lenses.opencv import OpenCV
-from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.adjustment.blocks import Kind, Layout, Unknowns
+from photoplan.cameras.correctable import Correctable, Corrections
+from photoplan.cameras.fiducials import Affine2D, Bilinear2D
+from photoplan.cameras.lenses import Brown, Lens, NoLens, OpenCV
+from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
 from photoplan.errors import InputError, UsageError
-from photoplan.orientation.bundle.block import PARAMETERS, Block, BlockCamera, BlockProjection
-from photoplan.orientation.bundle.unknowns import BORESIGHT, COMMON, LEVER, CameraState, layout_of
+from photoplan.geometry.pose import UNKNOWNS, Pose, rotation_vector, small_rotations
+
+#: Parameters of a camera that can be unknowns, in the order of results: camera constant and principal point in the
+#: unit of the image plane, coefficients of the lens without unit (as in `photoplan.cameras.lenses.Brown`).
+PARAMETERS = ("c", "x0", "y0", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
+
+#: Shift of image points, (image indices (n,), poses of all images, ground points (n, 3)) → (n, 2) pixels, that is added
+#: to the central projection: earth curvature, refraction. It must be smooth and small; its derivatives are neglected.
+Bend = Callable[[NDArray[np.int64], "tuple[Pose, ...]", NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class BlockCamera:
+    """A camera of the block."""
+
+    c: float
+    """Camera constant, in the unit of the image plane (millimetres, or pixels)."""
+    principal_point: tuple[float, float]
+    """x0, y0 in the image plane, same unit."""
+    lens: Lens
+    """`Brown`, `OpenCV` or `NoLens` where one of its coefficients is free; any where none is."""
+    free: tuple[str, ...] = ()
+    """Parameters that are unknowns, of `PARAMETERS`."""
+    prior_sigma: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations with which free parameters are known beforehand; without an entry: not at all."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockImage:
+    """An image of the block."""
+
+    name: str
+    camera: str
+    plane_to_pixel: Affine2D | Bilinear2D
+    """From the image plane (x right, y up) to pixels."""
+    pose: Pose
+    """Start value of the exterior orientation."""
+
+
+#: From block points (n, 3) to map points (n, 3), and their derivatives ∂ map / ∂ block (n, 3, 3).
+OnMap = Callable[[NDArray[np.float64]], "tuple[NDArray[np.float64], NDArray[np.float64]]"]
+
+
+@dataclass(frozen=True, eq=False)
+class BlockProjection:
+    """An image of the block without a pose: its geometry is known but for corrections."""
+
+    name: str
+    group: str
+    """Images that are measured alike, as messages call them: "rational polynomials"."""
+    geometry: Correctable
+    """Over map points."""
+    sight: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+    """From image points (n, 2) to about where they are seen from, and unit directions, in the block's system."""
+    metres: float
+    """About the size of a pixel on the ground."""
+    away: float
+    """About the distance from where it is seen to the ground, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Everything that is observed and that is known beforehand."""
+
+    cameras: Mapping[str, BlockCamera]
+    images: tuple[BlockImage, ...]
+    observations: ImagePoints
+    """With a standard deviation for every measurement; those in images that are not of the block are not used."""
+    ground: GroundPoints
+    """Control and check points; control with a standard deviation for every known coordinate."""
+    positions: ObservedPositions | None = None
+    attitudes: ObservedAttitudes | None = None
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Antenna minus projection centre, in camera axes, metres."""
+    lever_arm_sigma: float = 0.0
+    """Its standard deviation; 0: held fixed."""
+    drift: str = "none"
+    """none, shift or linear: of observed positions in each strip."""
+    common: tuple[float, float, float] | None = None
+    """Standard deviations of an error that all observed positions share, metres; None: there is none."""
+    boresight: bool = False
+    """Whether three rotations between observed attitudes and camera are unknowns."""
+    boresight_sigma: float = 0.0
+    """Their standard deviation a priori, radians; 0: not known."""
+    start_points: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Start values of points, where they are known; others are intersected."""
+    bend: Bend | None = None
+    projections: tuple[BlockProjection, ...] = ()
+    on_map: OnMap | None = None
+    """Where projections see points of the block; None: map and block are one."""
+    datum: bool = False
+    """Whether positions and attitudes are approximate orientations that only place the block: their accuracy counts as
+    stated, whatever the residuals are."""
+
+
+@dataclass(frozen=True, eq=False)
+class Active:
+    """Observations that are not taken out."""
+
+    image: NDArray[np.bool_]
+    """Of `block.observations`."""
+    ground: NDArray[np.bool_]
+    """Of the coordinates of `block.ground`, (g, 3)."""
+    position: NDArray[np.bool_]
+    """Of `block.positions`."""
+
+    @classmethod
+    def all_of(cls, block: Block) -> Active:
+        """Nothing taken out."""
+        positions = 0 if block.positions is None else len(block.positions.images)
+        ground = np.ones((len(block.ground), 3), bool)
+        return cls(np.ones(len(block.observations), bool), ground, np.ones(positions, bool))
+
+    def equals(self, other: Active) -> bool:
+        """Whether the same observations are active."""
+        pairs = ((self.image, other.image), (self.ground, other.ground), (self.position, other.position))
+        return all(np.array_equal(a, b) for a, b in pairs)
+
+
+@dataclass(frozen=True)
+class AdjustSettings:
+    """How the adjustment is done."""
+
+    robust: bool = True
+    """Whether observations that do not fit lose weight while iterating (Huber, then a redescending function)."""
+    critical: float = 4.0
+    """Normalised residual from which an observation is taken out as a gross error."""
+    variance_components: bool = True
+    """Whether the groups' standard deviations are estimated and used."""
+    correlation: bool = True
+    """Whether it is regarded that errors of neighbouring image points are alike, where their residuals show it."""
+    iterations: int = 40
+    """Most iterations."""
+    covariance: bool = True
+    """Whether covariances, redundancy numbers and normalised residuals are computed."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Observations of one kind with one variance factor."""
+
+    name: str
+    """As users call it: "image points, camera RC30", "control, height" …"""
+    count: int
+    """Observed numbers (not points)."""
+    redundancy: float
+    """Sum of the redundancy numbers; NaN where they were not computed."""
+    rms: float
+    """Root mean square of the residuals in the unit of the observations."""
+    unit: str
+    factor: float
+    """Standard deviation found divided by the one that was stated (root of vᵀPv / redundancy); NaN where too little
+    checks the group to estimate it, and it counts as stated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Errors of image points that are alike over some distance, of the images of one camera or group."""
+
+    group: str
+    """Of the images: "camera RC30"."""
+    effect: float
+    """Measurements that count as one for an orientation."""
+    reach: float
+    """Distance over which errors are alike, pixels."""
+    distance: NDArray[np.float64]
+    """Outer limits of classes of distance, (m,), pixels."""
+    rho: NDArray[np.float64]
+    """Correlation of residuals in each class, (m,); NaN: too few pairs."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedCamera:
+    """Interior orientation after the adjustment."""
+
+    name: str
+    c: float
+    principal_point: tuple[float, float]
+    lens: Lens
+    free: tuple[str, ...]
+    """The parameters that were unknowns."""
+    covariance: NDArray[np.float64]
+    """Of those, shape (k, k), sigma0 included; NaN without covariance."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedCorrections:
+    """A set of corrections after the adjustment."""
+
+    key: str
+    values: NDArray[np.float64]
+    """(owners, parameters)."""
+    covariance: NDArray[np.float64]
+    """Of each owner, (owners, parameters, parameters); NaN without covariance."""
+    known: NDArray[np.float64]
+    """What each value was known to beforehand: standard deviations; infinite: not at all. As `values`."""
+    joint: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Of knots: the covariances of four that follow each other, from each on, with the first owner of another set of
+    the same images before them, by the key of that set; empty: there is none. (owners − 3, n, n)."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedStrip:
+    """Drift of the observed positions of a strip: position = antenna + shift + rate · (time − epoch)."""
+
+    name: str
+    shift: NDArray[np.float64]
+    """(3,), metres."""
+    rate: NDArray[np.float64]
+    """(3,), metres per second; zero with shift only."""
+    epoch: float
+    sigma: NDArray[np.float64]
+    """Of shift and rate, (6,); NaN where it was no unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """Result of a bundle adjustment. Covariances and standard deviations hold sigma0 already."""
+
+    images: tuple[str, ...]
+    poses: tuple[Pose, ...]
+    pose_covariance: NDArray[np.float64]
+    """(n, 6, 6): projection centre in metres, then small rotations about the camera's x, y, z axes in radians
+    (R ← R · exp[δ]×); NaN without covariance."""
+    pose_camera_covariance: tuple[NDArray[np.float64], ...]
+    """For each image that of its pose with the free parameters of its camera, (6, k)."""
+    cameras: tuple[AdjustedCamera, ...]
+    points: tuple[str, ...]
+    """All points that were adjusted: tie, control and check points."""
+    XYZ: NDArray[np.float64]
+    """(m, 3)."""
+    point_covariance: NDArray[np.float64]
+    """(m, 3, 3); NaN without covariance."""
+    rays: NDArray[np.int64]
+    """Measurements of each point that take part, (m,)."""
+    left_out: tuple[tuple[str, str], ...]
+    """Points and images that could not take part: name and reason."""
+    residuals: NDArray[np.float64]
+    """Computed minus measured position of every image measurement, (k, 2), pixels (column, row); NaN: not used."""
+    redundancies: NDArray[np.float64]
+    """Redundancy numbers of the measurements, (k, 2), 0 to 1; NaN: not used or not computed."""
+    normalised: NDArray[np.float64]
+    """Residuals divided by their standard deviations, (k, 2)."""
+    rejected: NDArray[np.bool_]
+    """Measurements that were taken out as gross errors, (k,); `residuals` and `normalised` then are those against the
+    result without them, NaN where their point or image had not enough left."""
+    ground_residuals: NDArray[np.float64]
+    """Adjusted minus given coordinates of every ground point, (g, 3), metres; NaN: not known or not seen."""
+    ground_normalised: NDArray[np.float64]
+    """Normalised residuals of control, (g, 3); NaN for check points."""
+    ground_rejected: NDArray[np.bool_]
+    """Control taken out as a gross error, coordinate by coordinate, (g, 3)."""
+    position_residuals: NDArray[np.float64]
+    """Computed minus observed positions, (n_positions, 3), metres."""
+    position_rejected: NDArray[np.bool_]
+    """(n_positions,)."""
+    attitude_residuals: NDArray[np.float64]
+    """Small rotations computed minus observed, (n_attitudes, 3), radians."""
+    lever_arm: NDArray[np.float64]
+    """(3,), metres."""
+    lever_arm_sigma: NDArray[np.float64]
+    """(3,); zero where held fixed."""
+    boresight: NDArray[np.float64]
+    """(3,), radians; zero where it was no unknown."""
+    boresight_sigma: NDArray[np.float64]
+    strips: tuple[AdjustedStrip, ...]
+    common: tuple[float, float, float] | None
+    """See `Block.common`; found from positions that agree among each other far better than stated."""
+    groups: tuple[Group, ...]
+    sigma0: float
+    """Standard deviation of unit weight: 1 where the stated standard deviations are right."""
+    redundancy: int
+    unknowns: int
+    iterations: int
+    correlations: tuple[Correlation, ...] = ()
+    """Of cameras whose image points have clearly correlated errors; orientations and their covariances regard it."""
+    projections: tuple[str, ...] = ()
+    """Images without poses that took part."""
+    corrections: tuple[AdjustedCorrections, ...] = ()
+    """Of these, in the order of their first image."""
+    by_prior: tuple[str, ...] = ()
+    """Motions of the block that nothing but what corrections are known to beforehand determines."""
+    other_control: tuple[str, ...] = ()
+    """Control points of the largest other set that agrees within itself; empty where all of it agrees."""
+
+
+_Floats = NDArray[np.float64]
+
+#: Keys of the kinds of unknowns; those of a camera are "camera NAME".
+IMAGES, LEVER, BORESIGHT, DRIFT = "images", "lever arm", "boresight", "drift"
+COMMON = "common error of positions"
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Exterior orientations."""
+
+    centers: _Floats
+    """(n, 3)."""
+    rotations: _Floats
+    """R_ground_camera, (n, 3, 3)."""
+
+    def moved(self, step: _Floats) -> Poses:
+        """See `Unknowns`."""
+        return Poses(self.centers + step[:, :3], self.rotations @ small_rotations(step[:, 3:]))
+
+    def motions(self) -> tuple[float, dict[str, _Floats]]:
+        """What moves all images together: the size of the block, and steps (n, 6) by their names."""
+        n = len(self.centers)
+        if not n:
+            return 1.0, {}
+        away = self.centers - self.centers.mean(axis=0)
+        size = float(np.abs(away).max()) or 1.0
+        motions: dict[str, _Floats] = {}
+        for k, axis in enumerate("XYZ"):
+            motions[f"position of the block in {axis}"] = np.tile(size * np.eye(6)[k], (n, 1))
+            about = np.eye(3)[k]
+            motions[f"rotation of the block about {axis}"] = np.hstack([np.cross(about, away), about @ self.rotations])
+        motions["scale of the block"] = np.hstack([away, np.zeros((n, 3))])
+        return size, motions
+
+
+@dataclass(frozen=True)
+class CameraState:
+    """Interior orientation as it is now."""
+
+    c: float
+    x0: float
+    y0: float
+    lens: Lens
+    free: tuple[str, ...] = ()
+    """Parameters that are unknowns."""
+
+    def parameter(self, name: str) -> float:
+        """Value of a parameter by its name in `photoplan.orientation.bundle.model.PARAMETERS`."""
+        if name in ("c", "x0", "y0"):
+            return float(getattr(self, name))
+        lens = self.lens
+        if isinstance(lens, OpenCV):
+            # OpenCV's y points down: its p2 is Brown's p1, and minus its p1 is Brown's p2.
+            return {"p1": lens.p2, "p2": -lens.p1}.get(name, float(getattr(lens, name, 0.0)))
+        return float(getattr(lens, name, 0.0))
+
+    def value(self, parameter: int) -> float:
+        """A free parameter by its number."""
+        return self.parameter(self.free[parameter])
+
+    def moved(self, step: _Floats) -> CameraState:
+        """See `Unknowns`."""
+        values = {name: self.parameter(name) + float(d) for name, d in zip(self.free, step[0])}
+        c, x0, y0 = (values.pop(name, getattr(self, name)) for name in ("c", "x0", "y0"))
+        lens = self.lens
+        if values and isinstance(lens, OpenCV):
+            turned = {"p1": ("p2", 1.0), "p2": ("p1", -1.0)}
+            values = {turned[n][0] if n in turned else n: v * turned.get(n, ("", 1.0))[1] for n, v in values.items()}
+            lens = OpenCV(**{**asdict(lens), **values})
+        elif values and isinstance(lens, Brown):
+            lens = Brown(**{**asdict(lens), **values})
+        return replace(self, c=c, x0=x0, y0=y0, lens=lens)
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """Numbers that steps are added to, a row for each block: a lever arm, shifts and rates of strips."""
+
+    values: _Floats
+    """(n, w); a step may be of the first columns only."""
+
+    def value(self, parameter: int) -> float:
+        """A value of the first block."""
+        return float(self.values[0, parameter])
+
+    def moved(self, step: _Floats) -> Vectors:
+        """See `Unknowns`."""
+        values = self.values.copy()
+        values[:, : step.shape[1]] += step
+        return Vectors(values)
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """A rotation, from observed to true camera axes."""
+
+    R: _Floats
+    """(3, 3)."""
+
+    def value(self, parameter: int) -> float:
+        """Rotation about an axis, radians."""
+        return float(rotation_vector(self.R)[parameter])
+
+    def moved(self, step: _Floats) -> Turn:
+        """See `Unknowns`."""
+        return Turn(self.R @ small_rotations(step)[0])
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Values of all that may be unknown."""
+
+    blocks: Mapping[str, Unknowns]
+    """By their keys."""
+    strips: tuple[str, ...]
+    """What the rows of the drift belong to."""
+    XYZ: _Floats
+    """Points (m, 3): blocks too, but so many that they are eliminated."""
+
+    @property
+    def images(self) -> Poses:
+        """Exterior orientations."""
+        return cast(Poses, self.blocks[IMAGES])
+
+    @property
+    def lever(self) -> _Floats:
+        """Antenna minus projection centre, in camera axes, (3,)."""
+        return cast(Vectors, self.blocks[LEVER]).values[0]
+
+    @property
+    def boresight(self) -> _Floats:
+        """Rotation from observed to true camera axes, (3, 3)."""
+        return cast(Turn, self.blocks[BORESIGHT]).R
+
+    @property
+    def drift(self) -> _Floats:
+        """Shift and rate of each strip, (s, 6)."""
+        return cast(Vectors, self.blocks[DRIFT]).values
+
+    def camera(self, name: str) -> CameraState:
+        """Interior orientation of a camera."""
+        return cast(CameraState, self.blocks[f"camera {name}"])
+
+    @property
+    def common(self) -> _Floats:
+        """Error that all observed positions share, (3,)."""
+        return cast(Vectors, self.blocks[COMMON]).values[0]
+
+    def known(self, key: str) -> CameraState | Vectors | Turn:
+        """Blocks of which something may be known beforehand."""
+        return cast("CameraState | Vectors | Turn", self.blocks[key])
+
+    def corrections(self, key: str) -> _Floats:
+        """Values of a set of corrections, (owners, parameters)."""
+        return cast(Vectors, self.blocks[key]).values
+
+    def poses(self) -> tuple[Pose, ...]:
+        """Exterior orientations as values."""
+        return tuple(Pose(c, R) for c, R in zip(self.images.centers, self.images.rotations))
+
+    def moved(self, layout: Layout, step: _Floats, points: _Floats) -> State:
+        """The state after a step: `step` in the order of the layout, `points` (m, 3)."""
+        return replace(self, blocks=layout.moved(self.blocks, step), XYZ=self.XYZ + points)
+
+    def carried(self, start: State) -> State:
+        """The start of another selection of the block, with the values that this state has found for all but images."""
+        found = {key: block for key, block in self.blocks.items() if key in start.blocks and key not in (IMAGES, DRIFT)}
+        before = dict(zip(self.strips, self.drift))
+        drift = [before.get(name, row) for name, row in zip(start.strips, start.drift)]
+        return replace(start, blocks={**start.blocks, **found, DRIFT: Vectors(np.array(drift).reshape(-1, 6))})
+
+
+def layout_of(
+    block: Block,
+    images: tuple[str, ...],
+    cameras: tuple[str, ...],
+    strips: tuple[str, ...],
+    sets: Sequence[Corrections] = (),
+) -> Layout:
+    """The unknowns of a block: orientations, what is free of cameras, lever arm, boresight and drift, corrections."""
+    width = {"none": 0, "shift": 3, "linear": 6}.get(block.drift)
+    if width is None:
+        raise UsageError(f"drift {block.drift!r}; allowed are none, shift, linear")
+    lever = block.positions is not None and block.lever_arm_sigma > 0
+    boresight = block.boresight and block.attitudes is not None and not set(block.attitudes.images).isdisjoint(images)
+    common = block.positions is not None and block.common is not None
+    drift = tuple(f"drift of {{}} in {axis}" for axis in "XYZXYZ"[:width])
+    return Layout.of(
+        [
+            Kind(IMAGES, images, tuple(f"{name} of {{}}" for name in UNKNOWNS), "image"),
+            *(
+                Kind(f"camera {name}", (name,), tuple(f"{p} of {{}}" for p in block.cameras[name].free), "camera")
+                for name in cameras
+            ),
+            Kind(LEVER, ("",), tuple(f"lever arm {axis}" for axis in "xyz") if lever else ()),
+            Kind(BORESIGHT, ("",), tuple(f"boresight about {axis}" for axis in "xyz") if boresight else ()),
+            Kind(DRIFT, strips, drift, "strip"),
+            Kind(COMMON, ("",), tuple(f"{COMMON} in {axis}" for axis in "XYZ") if common else ()),
+            *(Kind(each.key, each.owners, each.parameters, each.owner) for each in sets),
+        ]
+    )
+
+
+def start_state(
+    block: Block,
+    cameras: tuple[str, ...],
+    strips: tuple[str, ...],
+    poses: list[Pose],
+    XYZ: _Floats,
+    sets: Sequence[Corrections] = (),
+) -> State:
+    """Start values of the images that take part, their cameras, strips and corrections, and the points (m, 3)."""
+    blocks: dict[str, Unknowns] = {
+        IMAGES: Poses(
+            np.array([p.center for p in poses]).reshape(-1, 3),
+            np.array([p.R_ground_camera for p in poses]).reshape(-1, 3, 3),
+        ),
+        LEVER: Vectors(np.array([block.lever_arm], float)),
+        BORESIGHT: Turn(np.eye(3)),
+        DRIFT: Vectors(np.zeros((len(strips), 6))),
+        COMMON: Vectors(np.zeros((1, 3))),
+        **{each.key: Vectors(np.array(each.values, float)) for each in sets},
+    }
+    for name in cameras:
+        given = block.cameras[name]
+        lens = given.lens
+        if isinstance(lens, NoLens) and any(p not in ("c", "x0", "y0") for p in given.free):
+            lens = Brown()
+        blocks[f"camera {name}"] = CameraState(given.c, *given.principal_point, lens, given.free)
+    return State(blocks, strips, XYZ)
+
 
 #: Standard deviation of coordinates that are held fixed, in units of an image point's on the ground: small against
 #: anything that is measured, in any unit of length, and large enough for the arithmetic.
 FIXED = 1e-5
 
 _Index = NDArray[np.int64]
-_Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,38 @@
-"""What a converged bundle adjustment knows of its accuracy, and from there to its result."""
+"""Results of a bundle adjustment: accuracies, correlated errors."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import linalg, sparse
 from scipy.optimize import nnls
 
-from photoplan.adjustment.chances import chance_chi_square
-from photoplan.adjustment.robust import ENOUGH, MEDIAN_1D, variance_factors
+from photoplan.adjustment.least_squares import ENOUGH, MEDIAN_1D, variance_factors
+from photoplan.adjustment.statistics import Components, chance_chi_square, variance_components
 from photoplan.cameras.correctable import Corrections
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import GeometryError
-from photoplan.geometry.rotation import rotation_vector
-from photoplan.orientation.bundle.block import (
+from photoplan.geometry.pose import rotation_vector
+from photoplan.orientation.bundle.equations import (
+    Inverse,
+    Reduced,
+    Residuals,
+    by_prior,
+    check_rank,
+    linearise,
+    reduce_normals,
+    residuals_of_all,
+    whitened,
+)
+from photoplan.orientation.bundle.model import (
+    BORESIGHT,
+    DRIFT,
+    IMAGES,
+    LEVER,
     Active,
     Adjusted,
     AdjustedCamera,
@@ -24,16 +41,273 @@ from photoplan.orientation.bundle.block import (
     Block,
     Correlation,
     Group,
+    Model,
+    State,
+    build_model,
+    start_state,
 )
-from photoplan.orientation.bundle.datum import by_prior
-from photoplan.orientation.bundle.model import Model
-from photoplan.orientation.bundle.normal import Inverse, Reduced, check_rank, reduce_normals
-from photoplan.orientation.bundle.robust import DATUM, Judged, kinds_of, kinds_of_measurements, robust_scale
-from photoplan.orientation.bundle.rows import Residuals, linearise, residuals_of_all, whitened
-from photoplan.orientation.bundle.select import Selection
-from photoplan.orientation.bundle.unknowns import BORESIGHT, DRIFT, IMAGES, LEVER, State
+from photoplan.orientation.bundle.robust import (
+    DATUM,
+    Judged,
+    Selection,
+    kinds_of,
+    kinds_of_measurements,
+    robust_scale,
+    select,
+)
 
 _Floats = NDArray[np.float64]
+
+#: Classes of distance: their number, and the largest distance as a part of the extent of an image's points.
+_CLASSES, _REACH = 14, 0.5
+#: The first class ends where the last does, divided by this.
+_RANGE = 64.0
+#: Measurements of an image that are compared with each other at most.
+_SAMPLE = 500
+#: Pairs that a class needs to say anything, and how many of its standard deviations a correlation must exceed zero by.
+_PAIRS, _CLEAR = 50, 3.0
+#: Fewer measurements that count as one than this are none: formal accuracies stay as they are.
+_LEAST = 1.2
+
+
+def correlation_of(model: Model, normalised: _Floats, used: NDArray[np.bool_]) -> tuple[Correlation, ...]:
+    """Correlation of the residuals within the images of each camera, as a function of their distance.
+
+    Orientations are smooth functions of the image's points, so errors that are alike over some distance d do not
+    average out: of n measurements, n / effect count, with effect = 1 + Σ ρ(d) over the neighbours of each.
+    """
+    v = np.nan_to_num(normalised)
+    found = []
+    for index, name in enumerate(model.groups):
+        mine = np.flatnonzero(used & (model.camera_of[model.image] == index))
+        made = _of_camera(name, model.image[mine], model.xy[mine], v[mine]) if len(mine) > _PAIRS else None
+        if made is not None:
+            found.append(made)
+    return tuple(found)
+
+
+def effects_of_rows(model: Model, correlations: tuple[Correlation, ...], rows: int) -> _Floats:
+    """How many measurements count as one, of each row; 1 for everything but correlated tie points, (rows,).
+
+    Control and check points are few and far from each other, so what they say is hardly alike. And if the image points
+    of control lost weight, it would lie where its ground coordinates are, and nothing would check these.
+    """
+    of_camera = np.ones(len(model.groups))
+    for correlation in correlations:
+        of_camera[model.groups.index(correlation.group)] = correlation.effect
+    out = np.ones(rows)
+    ground = set(model.block.ground.names)
+    surveyed = np.array([name in ground for name in model.point_names], bool)
+    effects = np.where(surveyed[model.point], 1.0, of_camera[model.camera_of[model.image]])
+    out[model.parts.image] = np.repeat(effects, 2)
+    return out
+
+
+def _of_camera(name: str, image: NDArray[np.int64], xy: _Floats, v: _Floats) -> Correlation | None:
+    extent = float(np.hypot(*np.ptp(xy, axis=0)))
+    if extent == 0.0:
+        return None
+    edges = np.concatenate([[0.0], np.geomspace(extent * _REACH / _RANGE, extent * _REACH, _CLASSES)])
+    sums, pairs, weights = (np.zeros(_CLASSES) for _ in range(3))
+    rng = np.random.default_rng(0)
+    order = np.argsort(image, kind="stable")
+    images = [0, *(np.flatnonzero(np.diff(image[order])) + 1).tolist(), len(order)]
+    for begin, end in pairwise(images):
+        members = order[begin:end]
+        chosen = members if len(members) <= _SAMPLE else members[rng.permutation(len(members))[:_SAMPLE]]
+        i, j = np.triu_indices(len(chosen), 1)
+        distance = np.linalg.norm(xy[chosen[i]] - xy[chosen[j]], axis=1)
+        product = (v[chosen[i]] * v[chosen[j]]).mean(axis=1)
+        # The last class takes what is too far away.
+        of = np.searchsorted(edges, distance, side="right") - 1
+        sums += np.bincount(of, product, _CLASSES + 1)[:_CLASSES]
+        count = np.bincount(of, minlength=_CLASSES + 1)[:_CLASSES]
+        pairs += count
+        # Of a sample of the points, each pair stands for many.
+        weights += count * (len(members) / len(chosen)) ** 2
+    variance = float((v**2).mean())
+    enough = pairs >= _PAIRS
+    rho = np.where(enough, sums / np.maximum(pairs, 1.0) / max(variance, 1e-300), 0.0)
+    clear = rho > _CLEAR / np.sqrt(np.maximum(pairs, 1.0))
+    ends = np.flatnonzero(enough & ~clear)
+    last = int(ends[0]) if len(ends) else _CLASSES
+    effect = 1.0 + 2.0 * float((rho[:last] * weights[:last]).sum()) / len(image)
+    if effect < _LEAST:
+        return None
+    return Correlation(
+        group=name, effect=effect, reach=float(edges[last]), distance=edges[1:], rho=np.where(enough, rho, np.nan)
+    )
+
+
+#: Images and contrasts that are looked at at most: a neighbourhood tells as much as needed.
+_IMAGES, _CONTRASTS = 30, 400
+#: Contrasts below which nothing is said.
+_FEW = 40
+#: Correlation lengths that are tried, as parts of the extent of an image's points, and on either side of the best.
+_LENGTHS = 1.0 / np.array([48.0, 24.0, 12.0, 6.0, 3.0])
+_BESIDE = 2.0 ** np.array([-0.5, 0.5])
+#: Chance from which on a difference in likelihood means something.
+_CHANCE = 1e-4
+#: Times that an accuracy is worse than stated from which on it is named.
+_WORSE = 1.4
+#: Singular values below this part of the largest are none.
+_RANK = 1e-10
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """What makes the misfits of a block likely, image errors of free size at any rate."""
+
+    reach: float
+    """Distance at which the correlation of image errors has fallen to 1/e, pixels."""
+    share: float
+    """Part of their variance that is alike, 0 to 1."""
+    by_likeness: float
+    """Part of what the best model makes more likely (in deviance) that image errors which are alike make, all other
+    accuracies as stated, 0 to 1."""
+    by_accuracy: float
+    """The same of other accuracies than stated, image errors independent."""
+    worse: tuple[tuple[str, float], ...]
+    """Groups of observations that are less accurate than stated even so, and how many times; empty: none with any
+    certainty."""
+    alike: bool
+    """Whether errors are alike, whatever the accuracies of the others are."""
+
+
+def likeness_of(block: Block, base: Adjusted) -> Likeness | None:
+    """Weigh image errors that are alike, with covariance exp(−(d/L)²) over distances d, against other accuracies."""
+    model, K, w = _contrasts(_part(block, base), base)
+    if len(w) < _FEW:
+        return None
+    kinds, of = kinds_of(model)
+    kind = np.full(model.rows, -1)
+    kind[: len(of)] = of
+    there = [k for k in range(len(kinds)) if (of == k).any()]
+    parts = {k: K[kind == k].T @ K[kind == k] for k in there}
+    image = [parts[k] for k in there if kinds[k][1] == "px"]
+    others = [k for k in there if kinds[k][1] != "px"]
+    free = [parts[k] for k in others]
+    rest = K[kind < 0].T @ K[kind < 0]
+    stated = sum(free, rest)
+    size = float(w @ w) / len(w)
+    plain = variance_components(w, stated, image, np.full(len(image), size))
+    accuracy = variance_components(w, rest, [*image, *free], np.full(len(there), max(size, 1.0)))
+    length, near, likeness = _likeliest(model, K, lambda near: (w, stated, image, near), size)
+    start = [*likeness.variances[:-1], *np.ones(len(free)), likeness.variances[-1]]
+    both = variance_components(w, rest, [*image, *free, near], start)
+    whole = plain.deviance - both.deviance
+    alike = _means(accuracy.deviance - both.deviance, 2)
+    variances = dict(zip(others, both.variances[len(image) :]))
+    worse = []
+    for k, variance in variances.items():
+        if variance > _WORSE**2:
+            # As stated, with all others free.
+            rest_free = [parts[j] for j in others if j != k]
+            start = [*both.variances[: len(image)], *(variances[j] for j in others if j != k), both.variances[-1]]
+            without = variance_components(w, rest + parts[k], [*image, *rest_free, near], start)
+            if _means(without.deviance - both.deviance, 1):
+                worse.append((kinds[k][0], float(np.sqrt(variance))))
+    if not (alike or worse):
+        return None
+    own = float(np.average(likeness.variances[:-1], weights=[np.trace(part) for part in image]))
+    return Likeness(
+        reach=length,
+        share=float(likeness.variances[-1]) / (own + float(likeness.variances[-1])),
+        by_likeness=min(1.0, (plain.deviance - likeness.deviance) / whole),
+        by_accuracy=min(1.0, (plain.deviance - accuracy.deviance) / whole),
+        worse=tuple(worse),
+        alike=alike,
+    )
+
+
+def _means(gain: float, more: int) -> bool:
+    return more > 0 and chance_chi_square(max(gain, 0.0), more) < _CHANCE
+
+
+_Data = tuple[_Floats, _Floats, list[_Floats], _Floats]
+
+
+def _likeliest(
+    model: Model, K: _Floats, data: Callable[[_Floats], _Data], size: float
+) -> tuple[float, _Floats, Components]:
+    """Correlation length, its part of the covariance matrix, and variances: the last of errors that are alike."""
+    found: list[tuple[float, _Floats, Components]] = []
+
+    def tried(lengths: _Floats) -> tuple[float, _Floats, Components]:
+        for length in lengths.tolist():
+            w, fixed, image, near = data(_near(model, K, length))
+            start = found[-1][2].variances if found else np.full(len(image) + 1, size / 2.0)
+            start = np.maximum(start, 0.01 * size)
+            found.append((length, near, variance_components(w, fixed, [*image, near], start)))
+        return min(found, key=lambda each: each[2].deviance)
+
+    best = tried(_LENGTHS * np.hypot(*np.ptp(model.xy, axis=0)))
+    return tried(best[0] * _BESIDE)
+
+
+def _near(model: Model, K: _Floats, length: float) -> _Floats:
+    """Covariance of contrasts from errors that are alike within each image, in either coordinate."""
+    out = np.zeros((K.shape[1], K.shape[1]))
+    for image in range(len(model.image_names)):
+        mine = np.flatnonzero(model.image == image)
+        xy = model.xy[mine]
+        distance = np.linalg.norm(xy[:, None] - xy[None], axis=2)
+        covariance = np.exp(-((distance / length) ** 2))
+        for axis in range(2):
+            rows = K[2 * mine + axis]
+            out += rows.T @ covariance @ rows
+    return out
+
+
+def _part(block: Block, base: Adjusted) -> Block:
+    """A neighbourhood of images with so many of their points, at random, that all can be computed at once."""
+    seen = block.observations
+    centers = {name: pose.center for name, pose in zip(base.images, base.poses)}
+    names = [image.name for image in block.images if image.name in centers]
+    if len(names) > _IMAGES:
+        XYZ = np.array([centers[name] for name in names])
+        away = np.linalg.norm(XYZ - np.median(XYZ, axis=0), axis=1)
+        names = [names[k] for k in np.argsort(away)[:_IMAGES]]
+    names += [each.name for each in block.projections]
+    inside = np.array([name in set(names) for name in seen.images], bool)[seen.image]
+    inside &= np.array([name in set(base.points) for name in seen.points], bool)[seen.point]
+    rays = np.bincount(seen.point[inside], minlength=len(seen.points))
+    surveyed = np.array([name in set(block.ground.names) for name in seen.points], bool)
+    usable = (rays >= 2) | surveyed
+    order = np.random.default_rng(0).permutation(len(seen.points))
+    order = order[np.argsort(~surveyed[order], kind="stable")]
+    added = np.where(usable[order], np.maximum(2 * rays[order] - 3, 0), 0)
+    chosen = np.zeros(len(seen.points), bool)
+    chosen[order[usable[order] & (np.cumsum(added) <= _CONTRASTS + 6 * len(names))]] = True
+    return replace(block, observations=seen.where(inside & chosen[seen.point]))
+
+
+def _contrasts(block: Block, base: Adjusted) -> tuple[Model, _Floats, _Floats]:
+    """The model, combinations of its rows that no unknown moves (rows, n), and what they are (n,)."""
+    cameras = {
+        each.name: replace(block.cameras[each.name], c=each.c, principal_point=each.principal_point, lens=each.lens)
+        for each in base.cameras
+    }
+    block = replace(block, cameras={**block.cameras, **cameras})
+    selection = select(block, Active.all_of(block))
+    model = build_model(block, selection.images, selection.measured, selection.points)
+    XYZ = dict(zip(base.points, base.XYZ))
+    poses = dict(zip(base.images, base.poses))
+    state = start_state(
+        block,
+        model.camera_names,
+        model.strip_names,
+        [poses[block.images[k].name] for k in model.image_rows],
+        np.array([XYZ[name] for name in model.point_names]).reshape(-1, 3),
+        model.sets,
+    )
+    rows, _ = linearise(model, state, np.ones(model.rows))
+    A = np.hstack([rows.A_global.toarray(), rows.A_points.toarray()])
+    lengths = np.linalg.norm(A, axis=0)
+    Q, R, _ = linalg.qr(A / np.where(lengths > 0.0, lengths, 1.0), pivoting=True)
+    diagonal = np.abs(np.diag(R))
+    K = Q[:, int((diagonal > _RANK * diagonal.max(initial=0.0)).sum()) :]
+    return model, K, K.T @ rows.e
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +425,7 @@ def solution_of(
 
 #: Redundancy from which standard deviations of image points are fitted, classes of them, and the ratio of large to
 #: small ones (deciles) below which they are all alike.
-_FITTED, _CLASSES, _ALIKE = 200.0, 8, 1.2
+_FITTED, _CLASSES_RESULT, _ALIKE = 200.0, 8, 1.2
 
 
 def evened_sigmas(model: Model) -> ImagePoints:
@@ -189,12 +463,12 @@ def refitted_sigmas(solution: Solution, stated: _Floats) -> ImagePoints:
         s, size, red = stated[mine], v[mine] / np.sqrt(r[mine]), r[mine]
         if red.sum() < _FITTED or np.quantile(s, 0.9) < _ALIKE * np.quantile(s, 0.1):
             continue
-        classes = np.array_split(np.argsort(s, kind="stable"), _CLASSES)
+        classes = np.array_split(np.argsort(s, kind="stable"), _CLASSES_RESULT)
         square = np.array([(s[c] ** 2).mean() for c in classes])
         found = np.array([(np.median(size[c]) / MEDIAN_1D) ** 2 for c in classes])
         if not (found > 0).all():
             continue
-        (a, b), _ = nnls(np.column_stack([square, np.ones(_CLASSES)]) / found[:, None], np.ones(_CLASSES))
+        (a, b), _ = nnls(np.column_stack([square, np.ones(_CLASSES_RESULT)]) / found[:, None], np.ones(_CLASSES_RESULT))
         middle = float(np.median(s))
         sigma[own] = np.sqrt(a * stated[own] ** 2 + b) * (middle / np.sqrt(a * middle**2 + b))
     return seen if np.array_equal(sigma, seen.sigma) else replace(seen, sigma=sigma)
@@ -202,7 +476,7 @@ def refitted_sigmas(solution: Solution, stated: _Floats) -> ImagePoints:
 
 #: Found over stated accuracy below which the rest of what is stated is an error that all share; chance of as little
 #: without one.
-_BETTER, _CHANCE = 0.7, 0.01
+_BETTER, _CHANCE_RESULT = 0.7, 0.01
 
 
 def with_common_errors(solution: Solution, factors: _Floats) -> Block:
@@ -216,7 +490,7 @@ def with_common_errors(solution: Solution, factors: _Floats) -> Block:
     for k, (name, _) in enumerate(kinds):
         r = float(solution.redundancies[: len(of)][of == k].sum())
         f2 = float(factors[k]) ** 2
-        clear = f2 < _BETTER**2 and chance_chi_square(f2 * r, r) > 1.0 - _CHANCE
+        clear = f2 < _BETTER**2 and chance_chi_square(f2 * r, r) > 1.0 - _CHANCE_RESULT
         hidden[name] = float(np.sqrt(1.0 - f2)) if r > ENOUGH and clear else 0.0
     plane, height = (hidden.get(f"observed positions, {what}", 0.0) for what in ("horizontal", "height"))
     if block.positions is not None and block.drift == "none" and max(plane, height) > 0:

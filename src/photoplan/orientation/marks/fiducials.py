@@ -1,21 +1,408 @@
-"""Fiducial marks of a scan: found, measured, and joined to the interior orientation."""
+"""The search for the fiducial marks of a scan, without approximate values, and their measurement."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
 
-from photoplan.adjustment.linear import solve
-from photoplan.cameras.fiducials_fit import FiducialFit, fit_affine
+from photoplan.adjustment.least_squares import solve
+from photoplan.cameras.fiducials import FiducialFit, MarkExample, MarkPattern, fit_affine
 from photoplan.errors import InputError, PhotoplanError
-from photoplan.orientation.marks.found import FiducialResult, LocatedMark, MarksNotFound, MissingMark, SoughtMark
-from photoplan.orientation.marks.layout import TURNS, MarkLayout, MarkPlacement, ScanTurn
-from photoplan.orientation.marks.locate import LEAST_CORRELATION, Location
-from photoplan.orientation.marks.measure import Measured, measure_marks
-from photoplan.orientation.marks.search import MarkSearch, Scan, pixel_sizes, search_placements
+from photoplan.geometry.grid import Window
+from photoplan.orientation.marks.layout import (
+    FILM,
+    FLOOR,
+    TURNS,
+    FiducialResult,
+    LocatedMark,
+    MarkLayout,
+    MarkPlacement,
+    MarksNotFound,
+    MissingMark,
+    ScanTurn,
+    SoughtMark,
+    combine,
+    fit_placement,
+)
+from photoplan.orientation.marks.locate import (
+    BLURS,
+    LEAST_CORRELATION,
+    Location,
+    best_blur,
+    correlation_surface,
+    locate_mark,
+)
+from photoplan.orientation.marks.single import fit_edges
+from photoplan.orientation.marks.template import Template, draw
+
+SIDE = 20
+"""Pixels that the smaller side of the smallest mark has in the coarse search, about."""
+CANDIDATES = 12
+"""Candidates of a mark and tone."""
+SLACK_MM = 2.0
+"""How far a mark may lie beyond where the scan's outline lets it."""
+STEP = 0.04
+"""Relative step of the scales that are tried."""
+WIDEST = 1.36
+"""How much larger than the marks' extent a scan's shorter side may be when its scale is not known."""
+USUAL = 1.13
+"""How much larger it mostly is."""
+SURE = 0.45
+"""Correlation per mark beyond chance, with all marks found, at which no other scale is tried."""
+
+
+class Scan(Protocol):
+    """Grey values of a scan, by windows."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        ...
+
+    def grey(self, window: Window, factor: int = 1) -> NDArray[np.float32]:
+        """Means of blocks of `factor` × `factor` pixels of a window whose sides it divides; NaN: no valid pixel."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class MarkSearch:
+    """What is sought in which scan."""
+
+    scan: Scan
+    layout: MarkLayout
+    turns: tuple[ScanTurn, ...]
+    """Turns of the film that come into question."""
+    negatives: tuple[bool, ...]
+    """Tones that come into question."""
+    scale_tolerance: float = STEP
+    """Part of the scale by which the true one may differ from those that are tried."""
+    _surfaces: dict[tuple[int, int, Window], NDArray[np.float64]] = field(default_factory=dict, repr=False)
+    _templates: list[tuple[int, float, Template]] = field(default_factory=list, repr=False)
+
+
+def pixel_sizes(layout: MarkLayout, size: tuple[int, int]) -> tuple[float, ...]:
+    """Sides of a pixel in millimetres that are worth trying for a scan of unknown resolution, the likely ones first.
+
+    All marks lie in the scan, and its shorter side is not much longer than their extent.
+    """
+    short = min(np.ptp(layout.mm, axis=0))
+    short = float(short) if short > 0.5 * layout.extent else layout.extent
+    count = math.ceil(math.log(WIDEST) / STEP)
+    wider = [1.01 * WIDEST ** (k / count) for k in range(count + 1)]
+    return tuple(short * w / min(size) for w in sorted(wider, key=lambda w: abs(math.log(w / USUAL))))
+
+
+def search_placements(search: MarkSearch, pixels_mm: Sequence[float]) -> list[MarkPlacement]:
+    """The best placement for every turn and tone, best first."""
+    best: dict[tuple[ScanTurn, bool], MarkPlacement] = {}
+    for pixel_mm in pixels_mm:
+        search._surfaces.clear()
+        search._templates.clear()
+        factor = _factor(search.layout, pixel_mm)
+        for turn in search.turns:
+            surfaces = [_surface(search, k, turn, pixel_mm, factor) for k in range(len(search.layout.names))]
+            for negative in search.negatives:
+                peaks = [_peaks(s, negative, factor) for s in surfaces]
+                found = combine(
+                    search.layout, peaks, turn, negative, 1 / pixel_mm, search.scale_tolerance, 2.0 * factor
+                )
+                key = turn, negative
+                if found is not None and (key not in best or found.score > best[key].score):
+                    best[key] = found
+        if any(p.score >= SURE * len(p.found) and len(p.found) == len(search.layout.names) for p in best.values()):
+            break
+    return sorted(best.values(), key=lambda p: -p.score)
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    values: NDArray[np.float64]
+    origin: tuple[float, float]
+    """Column and row in the scan of values[0, 0]."""
+    apart: int
+    """Two candidates are not nearer than this, coarse pixels."""
+
+
+def _factor(layout: MarkLayout, pixel_mm: float) -> int:
+    """Pixels of the scan in a coarse one."""
+    side = min(_side(pattern) for pattern in layout.patterns)
+    return max(1, round(side / SIDE / pixel_mm))
+
+
+def _side(pattern: MarkPattern | MarkExample) -> float:
+    """Shorter side of what is compared, millimetres."""
+    if isinstance(pattern, MarkExample):
+        return min(pattern.values.shape) * pattern.pixel_mm
+    x0, y0, x1, y1 = pattern.window
+    return min(x1 - x0, y1 - y0)
+
+
+def _surface(search: MarkSearch, k: int, turn: ScanTurn, pixel_mm: float, factor: int) -> _Surface | None:
+    """Correlation of mark k with all places where it may lie; None: nowhere."""
+    index, template = _template(search, search.layout.patterns[k], turn, pixel_mm * factor)
+    region = _region(search, k, turn, pixel_mm, factor)
+    if region is None:
+        return None
+    a, b = template.values.shape
+    rx, ry = (math.ceil(v) for v in template.reference)
+    # The template may reach beyond the scan, where nothing is compared.
+    x0, y0 = region.col - rx, region.row - ry
+    key = index, factor, Window(x0 + 10**6, y0 + 10**6, region.width + b, region.height + a)
+    if key not in search._surfaces:
+        grey = _padded(search.scan, x0, y0, region.width + b, region.height + a, factor)
+        search._surfaces[key] = correlation_surface(grey, template)[0]
+    ox, oy = x0 + template.reference[0], y0 + template.reference[1]
+    half = (factor - 1) / 2
+    return _Surface(search._surfaces[key], (factor * ox + half, factor * oy + half), max(2, round(0.5 * min(a, b))))
+
+
+def _template(
+    search: MarkSearch, pattern: MarkPattern | MarkExample, turn: ScanTurn, coarse_mm: float
+) -> tuple[int, Template]:
+    """Number and template of a pattern; turns that leave it as it is share one."""
+    made = draw(pattern, turn.matrix / coarse_mm, blur_px=0.7)
+    for number, (owner, size, other) in enumerate(search._templates):
+        same = owner == id(pattern) and size == coarse_mm and other.values.shape == made.values.shape
+        if same and np.allclose(other.values, made.values, atol=0.02) and np.allclose(other.weights, made.weights):
+            return number, other
+    search._templates.append((id(pattern), coarse_mm, made))
+    return len(search._templates) - 1, made
+
+
+def _region(search: MarkSearch, k: int, turn: ScanTurn, pixel_mm: float, factor: int) -> Window | None:
+    """Coarse pixels where mark k may lie if all marks lie in the scan, turned by a few degrees; None: nowhere."""
+    places = search.layout.mm @ turn.matrix.T / pixel_mm
+    low, high = places.min(axis=0), places.max(axis=0)
+    tolerance = (SLACK_MM + 0.035 * search.layout.extent) / pixel_mm
+    size = np.array(search.scan.size, float)
+    slack = size - (high - low)
+    if (slack < -tolerance).any():
+        return None
+    first = np.clip(places[k] - low - tolerance + np.minimum(slack, 0), 0, size - 1)
+    last = np.clip(places[k] - low + np.maximum(slack, 0) + tolerance, 0, size - 1)
+    (c0, r0), (c1, r1) = np.floor(first / factor).astype(int), np.ceil(last / factor).astype(int)
+    return Window(int(c0), int(r0), int(c1 - c0 + 1), int(r1 - r0 + 1))
+
+
+def _padded(scan: Scan, col: int, row: int, width: int, height: int, factor: int) -> NDArray[np.float32]:
+    """Coarse pixels of a window that may leave the scan, where they are NaN."""
+    most = Window(0, 0, scan.size[0] // factor, scan.size[1] // factor)
+    c0, r0 = max(col, 0), max(row, 0)
+    c1, r1 = min(col + width, most.width), min(row + height, most.height)
+    grey = np.full((height, width), np.nan, np.float32)
+    if c1 > c0 and r1 > r0:
+        window = Window(c0 * factor, r0 * factor, (c1 - c0) * factor, (r1 - r0) * factor)
+        grey[r0 - row : r1 - row, c0 - col : c1 - col] = scan.grey(window, factor)
+    return grey
+
+
+def _peaks(surface: _Surface | None, negative: bool, factor: int) -> NDArray[np.float64]:
+    """Highest local maxima (minima of a negative): column, row in the scan, correlation; shape (k, 3)."""
+    if surface is None:
+        return np.empty((0, 3))
+    values = np.nan_to_num(-surface.values if negative else surface.values, nan=-1.0)
+    top = (ndimage.maximum_filter(values, 2 * surface.apart + 1, mode="constant", cval=-1.0) == values) & (
+        values > FLOOR
+    )
+    rows, columns = np.nonzero(top)
+    order = np.argsort(-values[rows, columns], kind="stable")[:CANDIDATES]
+    rows, columns = rows[order], columns[order]
+    x, y = columns * factor + surface.origin[0], rows * factor + surface.origin[1]
+    return np.column_stack([x, y, values[rows, columns]])
+
+
+_BLUR = 0.7
+"""Standard deviation of blur with which measuring begins, pixels."""
+_NEAR_PX = 3.0
+"""Pixels from where the first measurement has a mark in which the second one seeks it."""
+_NEAR_MM = 0.35
+"""Millimetres from a coarse candidate in which its mark is sought."""
+_KNOWN = (0.002, 0.002)
+"""Standard deviations of rotation (radians) and scale at a mark, once an affine transformation joins all marks."""
+_EDGES_USED, _EDGES_RMS, _EDGES_AGREE = 0.4, 1.5, 1.5
+"""Least share of a mark's edges that is seen, their largest distance and difference from the correlation, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Marks by name, as the placement names them."""
+
+    placement: MarkPlacement
+    found: Mapping[str, Location]
+    """Places in the scan."""
+    missed: Mapping[str, tuple[float, str]]
+    """Best correlation and reason of those that were not found."""
+    expected: Mapping[str, tuple[float, float]]
+    """Column and row where the other marks say each one is."""
+    matrix: NDArray[np.float64]
+    """From millimetres to columns and rows, as the last templates were drawn, shape (2, 2)."""
+    blur_px: float
+
+    @property
+    def px_per_mm(self) -> float:
+        """Pixels in a millimetre."""
+        return math.sqrt(abs(float(np.linalg.det(self.matrix))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """How marks look in a round of measuring, and where they are sought."""
+
+    matrix: NDArray[np.float64]
+    blur_px: float
+    negative: bool
+    least: float
+    expected: NDArray[np.float64]
+    radius: Mapping[str, float]
+    sigmas: tuple[float, float] = (0.035, 0.02)
+    """Standard deviations of rotation (radians) and scale of the matrix."""
+
+
+def measure_marks(scan: Scan, layout: MarkLayout, placement: MarkPlacement, least: float) -> Measured:
+    """Measure all marks: as the placement draws them, then as the affine transformation and blur so found do."""
+    scale = 1.0 / placement.pixel_mm
+    wide = FILM * layout.extent * scale + _NEAR_PX
+    start = dict.fromkeys(placement.found, _NEAR_MM * scale + _NEAR_PX)
+    expected = placement(layout.mm)
+    for name, (x, y, _) in placement.found.items():
+        expected[layout.names.index(name)] = x, y
+    look = _Look(
+        matrix=placement.matrix,
+        blur_px=_BLUR,
+        negative=placement.negative,
+        least=least,
+        expected=expected,
+        radius=start,
+    )
+    found, missed = _round(scan, layout, look, wide)
+    blur = _BLUR
+    for _ in range(2):
+        matrix, expected = _refit(layout, placement, found)
+        blur = _blur(scan, layout, look, found)
+        radius = dict.fromkeys(found, _NEAR_PX)
+        for name, at in found.items():
+            expected[layout.names.index(name)] = at.x, at.y
+        look = _Look(
+            matrix=matrix,
+            blur_px=blur,
+            negative=placement.negative,
+            least=least,
+            expected=expected,
+            radius=radius,
+            sigmas=_KNOWN,
+        )
+        found, missed = _round(scan, layout, look, wide)
+    _, expected = _refit(layout, placement, found)
+    where = {name: (float(x), float(y)) for name, (x, y) in zip(layout.names, expected)}
+    return Measured(placement=placement, found=found, missed=missed, expected=where, matrix=look.matrix, blur_px=blur)
+
+
+def mark_window(scan: Scan, xy: tuple[float, float], half: tuple[int, int]) -> tuple[NDArray[np.float32], int, int]:
+    """Grey values around a place, 2 half + 1 pixels wide and high, NaN beyond the scan; column and row of the first."""
+    col, row = (round(v) - h for v, h in zip(xy, half))
+    width, height = (2 * h + 1 for h in half)
+    grey = np.full((height, width), np.nan, np.float32)
+    c0, r0 = max(col, 0), max(row, 0)
+    c1, r1 = min(col + width, scan.size[0]), min(row + height, scan.size[1])
+    if c1 > c0 and r1 > r0:
+        grey[r0 - row : r1 - row, c0 - col : c1 - col] = scan.grey(Window(c0, r0, c1 - c0, r1 - r0))
+    return grey, col, row
+
+
+def _round(
+    scan: Scan, layout: MarkLayout, look: _Look, wide: float
+) -> tuple[dict[str, Location], dict[str, tuple[float, str]]]:
+    """Every mark once: those found, and those missed with correlation and reason."""
+    found, missed = {}, {}
+    for k, name in enumerate(layout.names):
+        radius = look.radius.get(name, wide)
+        at = _locate(scan, layout, k, look, radius)
+        if at is None or not math.isfinite(at.correlation):
+            missed[name] = math.nan, "lies outside the scan or on pixels without variation"
+        elif at.correlation < look.least:
+            missed[name] = at.correlation, f"nothing correlates by {look.least:g}"
+        elif at.method == "pixel":
+            missed[name] = at.correlation, "the best place lies at the border of the scan or of the search"
+        else:
+            found[name] = at
+    return found, missed
+
+
+def _locate(scan: Scan, layout: MarkLayout, k: int, look: _Look, radius: float) -> Location | None:
+    pattern, (x, y) = layout.patterns[k], look.expected[k]
+    template = draw(pattern, look.matrix, negative=look.negative, blur_px=look.blur_px)
+    a, b = template.values.shape
+    # Three pixels more than the search needs, for the neighbourhood of the maximum and for matching.
+    half = tuple(math.ceil(max(r + 1, s - r) + radius) + 4 for r, s in zip(template.reference, (b, a)))
+    grey, col, row = mark_window(scan, (x, y), half)
+    if not np.isfinite(grey).any():
+        return None
+    try:
+        at = locate_mark(
+            grey, pattern, look.matrix, negative=look.negative, blur_px=look.blur_px, near=(x - col, y - row, radius)
+        )
+    except InputError:
+        return None
+    return _by_edges(at, grey, pattern, look).moved(col, row)
+
+
+def _by_edges(at: Location, grey: NDArray[np.float32], pattern: MarkPattern | MarkExample, look: _Look) -> Location:
+    """The place by the mark's edges where image content lies beside it; as it was, if they do not confirm it."""
+    if not isinstance(pattern, MarkPattern) or not math.isnan(pattern.background) or not math.isfinite(at.x):
+        return at
+    fit = fit_edges(grey, pattern, look.matrix, (at.x, at.y), negative=look.negative, sigmas=look.sigmas)
+    if fit is None or fit.used < _EDGES_USED or fit.rms > _EDGES_RMS:
+        return at
+    if math.hypot(fit.x - at.x, fit.y - at.y) > _EDGES_AGREE + 3 * math.hypot(fit.sigma_x, fit.sigma_y):
+        return at
+    return replace(at, x=fit.x, y=fit.y, sigma_x=fit.sigma_x, sigma_y=fit.sigma_y, method="edges")
+
+
+def _blur(scan: Scan, layout: MarkLayout, look: _Look, found: Mapping[str, Location]) -> float:
+    """The blur with which the marks correlate best on the whole."""
+    sums = np.zeros(len(BLURS))
+    for name, at in found.items():
+        k = layout.names.index(name)
+        template = draw(layout.patterns[k], look.matrix, blur_px=0.0)
+        half = tuple(
+            s // 2 + math.ceil(abs(r - s / 2)) + 5 for r, s in zip(template.reference, template.values.shape[::-1])
+        )
+        grey, col, row = mark_window(scan, (at.x, at.y), half)
+        tried = best_blur(grey, layout.patterns[k], look.matrix, (at.x - col, at.y - row), look.negative)
+        if np.isfinite(tried).all():
+            sums += tried
+    if not sums.any():
+        return look.blur_px
+    k = int(sums.argmax())
+    if k in (0, len(BLURS) - 1):
+        return BLURS[k]
+    # Between the values that were tried: the top of the parabola through the best and its neighbours.
+    top = np.polyfit(BLURS[k - 1 : k + 2], sums[k - 1 : k + 2], 2)
+    return float(np.clip(-top[1] / (2 * top[0]), BLURS[k - 1], BLURS[k + 1])) if top[0] < 0 else BLURS[k]
+
+
+def _refit(
+    layout: MarkLayout, placement: MarkPlacement, found: Mapping[str, Location]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Matrix of the affine transformation (similarity, below four marks), and where it puts all marks."""
+    if len(found) < 2:
+        return placement.matrix, placement(layout.mm)
+    index = [layout.names.index(n) for n in found]
+    xy = np.array([(at.x, at.y) for at in found.values()])
+    matrix, shift = fit_placement(layout.mm[index], xy, placement.turn.mirrored)
+    if len(found) > 3:
+        A = np.column_stack([layout.mm[index], np.ones(len(index))])
+        if np.linalg.matrix_rank(A, tol=1e-3 * layout.extent) == 3:
+            solution = solve(A, xy).unknowns
+            matrix, shift = solution[:2].T, solution[2]
+    return matrix, layout.mm @ matrix.T + shift
+
 
 TIE = 0.03
 """Correlation per mark below which two ways of turning the scan fit equally well."""

@@ -7,11 +7,11 @@ from math import isfinite, nan
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.series.pixels import Plane
+from photoplan.io.series import Plane
 from photoplan.products.characterise.common import SettingsRun, black_of, exposure_runs, no_run, tried
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, known
-from photoplan.quality.camera.blooming import Blooming, find_blooming
+from photoplan.quality.camera.drift import Blooming, find_blooming
 
 _LEAST = 4
 #: Pixels of all mean images that are held at once.

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.series.pixels import Plane
+from photoplan.io.series import Plane
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Findings, Subject, Trace, joined
-from photoplan.quality.camera.frame_statistics import Level
-from photoplan.quality.camera.saturation import Saturation, find_saturation
+from photoplan.quality.camera.dark_signal import Level
+from photoplan.quality.camera.photon_transfer import Saturation, find_saturation
 
 #: Share of saturated samples up to which a mean grey value is one.
 MOST_SATURATED = 1e-2

@@ -7,12 +7,11 @@ from math import sqrt
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.series.pixels import Plane
+from photoplan.io.series import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
-from photoplan.quality.camera.dark_signal import DarkCurrent, dark_current, doubling_temperature
-from photoplan.quality.camera.frame_statistics import Level
+from photoplan.quality.camera.dark_signal import DarkCurrent, Level, dark_current, doubling_temperature
 
 _LEAST = 3
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.series.pixels import Plane
+from photoplan.io.series import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, no_pair, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import (
@@ -22,8 +22,15 @@ from photoplan.products.characterise.result import (
     known,
     shrunk,
 )
-from photoplan.quality.camera.defects import DefectList, Kind, find_blinking, find_defects, find_lines, log_histogram
-from photoplan.quality.camera.frame_statistics import FrameStack
+from photoplan.quality.camera.dark_signal import (
+    DefectList,
+    FrameStack,
+    Kind,
+    find_blinking,
+    find_defects,
+    find_lines,
+    log_histogram,
+)
 
 #: Hot pixels whose growth with the exposure is followed, and whose places are drawn.
 _FOLLOWED = 40

@@ -9,7 +9,7 @@ import numpy as np
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, central_window, frame_groups, window_means
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, spaced
-from photoplan.quality.camera.brightness_drift import LEAST_MEASUREMENTS, BrightnessDrift, brightness_drift
+from photoplan.quality.camera.drift import LEAST_MEASUREMENTS, BrightnessDrift, brightness_drift
 
 #: Side of the window in the middle of the image (Behr 1989, §4.2.4).
 WINDOW = 6

@@ -7,15 +7,14 @@ from math import hypot, isfinite, nan
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.series.statistics import ReducedPoint
+from photoplan.io.series import ReducedPoint
 from photoplan.products.characterise import dark, pattern
 from photoplan.products.characterise.common import SettingsRun, exposure_runs, of_one_temperature, tried, used_and_rest
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined, known
 from photoplan.products.characterise.transfer import reduced_level
-from photoplan.quality.camera.dark_signal import dark_current
-from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet
-from photoplan.quality.camera.frame_statistics import Level, cut_off
+from photoplan.quality.camera.dark_signal import Level, cut_off, dark_current
+from photoplan.quality.camera.photon_transfer import EmvaPoints, EmvaSheet, emva_sheet
 
 _LEAST = 5
 #: Figures of other analyses that belong to the sheet: name there, name here, words, unit, and whether K divides them.

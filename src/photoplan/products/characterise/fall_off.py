@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
-from photoplan.io.series.pixels import Plane
+from photoplan.io.quality_files import FallOffEntry, TermEntry, fall_off_text
+from photoplan.io.series import Plane
 from photoplan.products.characterise.common import black_of, dark_like
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.groups import FrameGroup
 from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Plate, Subject, Trace, joined
-from photoplan.quality.camera.fall_off import FallOff, fit_fall_off
-from photoplan.quality.camera.fall_off_adjust import FallOffSettings
+from photoplan.quality.camera.fall_off import FallOff, FallOffSettings, fit_fall_off
 from photoplan.quality.camera.fall_off_model import gain_image
 
 _SATURATED = 1e-3

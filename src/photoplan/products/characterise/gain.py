@@ -10,8 +10,8 @@ from photoplan.errors import InputError
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups, window_means
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, known, spaced
-from photoplan.quality.camera.approach import LEAST_VALUES
-from photoplan.quality.camera.gain_control import GainControl, compare_transitions, gain_control
+from photoplan.quality.camera.drift import LEAST_VALUES
+from photoplan.quality.camera.video import GainControl, compare_transitions, gain_control
 
 
 def missing(data: SeriesData) -> str | None:

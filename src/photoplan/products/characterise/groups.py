@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.series.file import SeriesFrame, SeriesGroup
-from photoplan.io.series.pixels import frame_pixels, plane_mask, split
+from photoplan.io.series import SeriesFrame, SeriesGroup, frame_pixels, plane_mask, split
 from photoplan.products.characterise.data import SeriesData
-from photoplan.quality.clipping import piled_ends
+from photoplan.quality.linearise import piled_ends
 
 #: Share of a window that may be saturated, and samples of it that are looked at for the value where frames are cut off.
 _MOST, _SAMPLE = 0.01, 4096

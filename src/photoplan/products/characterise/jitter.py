@@ -10,15 +10,12 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.series.file import SeriesFrame
-from photoplan.io.series.model import EdgeEntry
-from photoplan.io.series.pixels import frame_pixels
+from photoplan.io.series import EdgeEntry, SeriesFrame, frame_pixels
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
 from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined
-from photoplan.quality.camera.line_jitter import LineJitter, line_jitter
-from photoplan.quality.camera.parallel_edges import above_control, compare_edges, mean_correlation
-from photoplan.quality.camera.plumb_edge import EdgeLines, correlate_edge, fit_edge
+from photoplan.quality.camera.straight_lines import EdgeLines, correlate_edge, fit_edge
+from photoplan.quality.camera.video import LineJitter, above_control, compare_edges, line_jitter, mean_correlation
 from photoplan.quality.sensor import jitter_grey
 
 #: Frames that are drawn.

@@ -7,7 +7,7 @@ from math import hypot
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.series.pixels import Plane
+from photoplan.io.series import Plane
 from photoplan.products.characterise.common import (
     MOST_SATURATED,
     SettingsRun,
@@ -19,8 +19,8 @@ from photoplan.products.characterise.common import (
 )
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace
-from photoplan.quality.camera.frame_statistics import check_level, cut_off
-from photoplan.quality.camera.linearity import HIGH, Linearity, linearity
+from photoplan.quality.camera.dark_signal import check_level, cut_off
+from photoplan.quality.camera.photon_transfer import HIGH, Linearity, linearity
 
 _KINDS = ("flat", "scene")
 _LEAST = 3

@@ -8,7 +8,7 @@ import numpy as np
 
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
-from photoplan.quality.camera.frame_statistics import Level
+from photoplan.quality.camera.dark_signal import Level
 
 #: What stands still: between frames of other kinds the scene or its brightness changes.
 _KINDS = ("dark", "flat", "scene", "wedge", "drift")

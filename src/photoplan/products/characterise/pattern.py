@@ -8,20 +8,22 @@ from math import isfinite, nan
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.series.pixels import Plane
+from photoplan.io.series import Plane
 from photoplan.plain import plain
 from photoplan.products.characterise.common import black_of, dark_like, no_pair, of_one_temperature, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
-from photoplan.quality.camera.fixed_pattern import (
+from photoplan.quality.camera.dark_signal import (
+    FrameStack,
     PatternVariance,
     Spectrogram,
+    check_level,
+    cut_off,
     pattern_variance,
     prnu_percent,
     signed_root,
     spectrogram,
 )
-from photoplan.quality.camera.frame_statistics import FrameStack, check_level, cut_off
 
 #: Share of saturation that the standard asks of bright frames.
 _HALF = 0.5

@@ -10,18 +10,17 @@ from typing import Any
 
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
-from photoplan.io.series.file import Series, read_series
-from photoplan.io.series.pixels import Plane, grey_step, largest_of_steps
+from photoplan.io.raster import write_whole_image
+from photoplan.io.series import Plane, Series, grey_step, largest_of_steps, read_series
+from photoplan.io.store import write_atomically
 from photoplan.io.tables import write_table
-from photoplan.io.whole_image import write_whole_image
 from photoplan.plain import pick, plain
 from photoplan.products.characterise.common import SettingsRun, exposure_runs
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.registry import ANALYSES, Analysis
 from photoplan.products.characterise.result import Figure, Findings, Listing
-from photoplan.quality.camera.saturation import FullWell, full_well
+from photoplan.quality.camera.photon_transfer import FullWell, full_well
 
 _LEAST = 4
 #: Share of samples at the largest grey value from which on that is what stops them.

@@ -9,9 +9,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.series.file import SeriesFrame
-from photoplan.io.series.model import TargetEntry
-from photoplan.io.series.pixels import frame_pixels
+from photoplan.io.series import SeriesFrame, TargetEntry, frame_pixels
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup
 
@@ -56,7 +54,7 @@ def locate_targets(data: SeriesData, group: FrameGroup) -> dict[str, list[Locate
 
 
 def _locate(data: SeriesData, group: FrameGroup, frame: SeriesFrame, target: TargetEntry) -> Located:
-    from photoplan.orientation.marks.target import locate_target  # noqa: PLC0415 - slow to import, rarely needed
+    from photoplan.orientation.marks.locate import locate_target  # noqa: PLC0415 - slow to import, rarely needed
 
     window = _window(data, group, target)
     # The first band; of a colour pattern the mean of each cell would move the target by less than its sigma.

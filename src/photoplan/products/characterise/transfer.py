@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from photoplan.io.series.pixels import Plane
-from photoplan.io.series.statistics import ReducedPoint
+from photoplan.io.series import Plane, ReducedPoint
 from photoplan.products.characterise.common import dark_levels, tried, used_and_rest
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, known
-from photoplan.quality.camera.frame_statistics import Level
+from photoplan.quality.camera.dark_signal import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
 
 _LEAST = 3

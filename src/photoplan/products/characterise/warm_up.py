@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.series.statistics import MeasuredPositions
+from photoplan.io.series import MeasuredPositions
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
 from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined, known
 from photoplan.products.characterise.targets import locate_targets
-from photoplan.quality.camera.approach import LEAST_VALUES
-from photoplan.quality.camera.warm_up import Course, WarmUp, warm_up
+from photoplan.quality.camera.drift import LEAST_VALUES, Course, WarmUp, warm_up
 
 Array = NDArray[np.float64]
 

@@ -9,13 +9,12 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.series.file import SeriesFrame
-from photoplan.io.series.pixels import Plane, plane_pixels
+from photoplan.io.series import Plane, SeriesFrame, plane_pixels
 from photoplan.products.characterise.common import black_of, saturation_of, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, spaced
-from photoplan.quality.camera.frame_statistics import Level, StackSums
-from photoplan.quality.camera.straight_line import GreyWedge, grey_wedge
+from photoplan.quality.camera.dark_signal import Level, StackSums
+from photoplan.quality.camera.straight_lines import GreyWedge, grey_wedge
 
 _LEAST = 3
 

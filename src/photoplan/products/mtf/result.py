@@ -12,14 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.plain import pick
-from photoplan.quality.edges.enhancement import Enhancement
 from photoplan.quality.edges.find import REASONS
-from photoplan.quality.edges.groups import CombinedValue, GaussianFit
-from photoplan.quality.edges.koelbl import spread_of_edge
-from photoplan.quality.edges.response import EdgeMeasurement
-from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.edges.groups import CombinedValue, Enhancement, GaussianFit
+from photoplan.quality.edges.response import EdgeMeasurement, spread_of_edge
+from photoplan.quality.mtf_curve import MtfCurve, SpreadFunction
 from photoplan.quality.restoration.design import point_spread
-from photoplan.quality.spread import SpreadFunction
 
 #: Of a measured edge, in JSON under their own names.
 _FIGURES = ("angle_deg", "length", "sampling", "dark", "bright", "snr", "mtf50", "mtf50_interval", "mtf10",

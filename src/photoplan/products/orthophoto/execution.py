@@ -18,18 +18,24 @@ from photoplan.engine.run import Kept, Tally, Work
 from photoplan.errors import InputError, PhotoplanError, TilesFailed
 from photoplan.events import Events
 from photoplan.io.disk import make_folder
-from photoplan.io.image_form import ImageForm, bands_of
-from photoplan.io.kept_tiles import KeptTiles
-from photoplan.io.naming import RunMarker, scratch, standing, together, when_named
-from photoplan.io.product import ProductFacts, ProductFile, is_product
+from photoplan.io.product import ProductFacts, ProductFile, is_product, refuse_foreign_virtual
 from photoplan.io.project.model import Project
 from photoplan.io.quicklook import refuse_foreign_overview, write_overview
-from photoplan.io.run_record import input_entry, record_path, write_run_record
-from photoplan.io.virtual import refuse_foreign_virtual
+from photoplan.io.raster_info import ImageForm, bands_of
+from photoplan.io.store import (
+    KeptTiles,
+    RunMarker,
+    input_entry,
+    record_path,
+    scratch,
+    standing,
+    together,
+    when_named,
+    write_run_record,
+)
 from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.accuracy import BANDS, radial_error
-from photoplan.plan.tiles import Tiles
-from photoplan.products.one_colour import one_colour, one_colour_told
+from photoplan.plan.footprint import Tiles
 from photoplan.products.orthophoto.finished import (
     ProductResult,
     all_files,
@@ -39,14 +45,12 @@ from photoplan.products.orthophoto.finished import (
     seams_path,
     stale_files,
 )
-from photoplan.products.orthophoto.keys import known_errors, tile_keys
-from photoplan.products.orthophoto.look import Look
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, painting
+from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, known_errors, painting, tile_keys
 from photoplan.products.orthophoto.stack import stack_index, write_stack
+from photoplan.products.plausibility import one_colour, one_colour_told
 from photoplan.products.run import Run, refuse_inputs, tile_bytes
-from photoplan.project.restored import RestoreStep
-from photoplan.project.scene import Scene, input_files, open_scene
-from photoplan.project.scenes import Scenes, ScenesAddress
+from photoplan.project.scene import Scene, Scenes, ScenesAddress, input_files, open_scene
+from photoplan.project.steps import RestoreStep
 
 #: Names and units of the bands of an accuracy raster.
 _BANDS = ImageForm(descriptions=tuple(name for name, _ in BANDS), units=tuple(unit for _, unit in BANDS))
@@ -235,7 +239,10 @@ def _complete(
         painted: dict[str, float] | None = None
         if "sources" in files and facts is not None:
             # A product without regions does not need the libraries of vector data.
-            from photoplan.io.regions import source_regions, write_regions  # noqa: PLC0415
+            from photoplan.io.vector_layer import (  # noqa: PLC0415
+                source_regions,
+                write_regions,
+            )
 
             shapes = source_regions(standing(files["sources"].path), product.grid, len(product.images))
             painted = {product.images[row - 1]: float(shape.area) for row, shape in shapes.items()}

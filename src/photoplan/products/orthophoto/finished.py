@@ -9,12 +9,10 @@ from typing import Any
 
 from photoplan.engine.execute import OutputName
 from photoplan.errors import UsageError
-from photoplan.io.names import file_in, safe_stem
-from photoplan.io.naming import is_unfinished, tidy
-from photoplan.io.run_record import record_path, recorded_result, refuse_foreign_record
+from photoplan.io.files import file_in, safe_stem
+from photoplan.io.store import is_unfinished, record_path, recorded_result, refuse_foreign_record, tidy
 from photoplan.plain import pick
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
-from photoplan.products.orthophoto.settings import OrthoSettings
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, OrthoSettings
 
 
 @dataclass(frozen=True)

@@ -1,38 +1,461 @@
-"""Orthophotos: read a project, compile a plan, look at it, execute it."""
+"""Plans of orthophotos: settings, coverage of images, bounds, tiles."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+import hashlib
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan import __version__
+from photoplan.cameras.base import Camera, on_level
 from photoplan.engine.direct import Direct
-from photoplan.engine.execute import Painted, joined, with_holes_filled
+from photoplan.engine.execute import MOST_IMAGES, Painted, halo, joined, with_holes_filled
 from photoplan.engine.execute import render as render_tile
-from photoplan.engine.holes import MOST_IMAGES
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.bounds import bounds_fault
-from photoplan.geometry.grid import MapGrid, refuse_absurd
+from photoplan.geometry.grid import MapGrid, Window, check_resolution, refuse_absurd
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
-from photoplan.plan.choice import BestImage, Drawn
-from photoplan.plan.compile import AnchorRule
-from photoplan.plan.feather import feather_of
-from photoplan.plan.footprint import Footprint, covered_tiles
-from photoplan.plan.owner import InSight
+from photoplan.orientation.conventions import ImagePlausibility, JudgedView
+from photoplan.plain import advised
+from photoplan.plan.accuracy import in_image
+from photoplan.plan.anchors import AnchorRule
+from photoplan.plan.footprint import Footprint, Tile, Tiles, covered_tiles, image_border, mean_gsd, some_height
 from photoplan.plan.product import ProductPlan
-from photoplan.plan.tiles import Tile, Tiles
-from photoplan.products.orthophoto.keys import keyed
-from photoplan.products.orthophoto.look import Look, extent_text, look_at, with_resolution
-from photoplan.products.orthophoto.settings import Choice, OrthoSettings
-from photoplan.project.scene import Scene
-from photoplan.project.scenes import ScenesAddress
-from photoplan.surfaces.objects import SingleObject, painted_surface
+from photoplan.plan.sources import BestImage, Drawn, InSight, Weights, feather_of
+from photoplan.products.plausibility import judged, reading_of_block
+from photoplan.project.error_model import ScenesErrors
+from photoplan.project.scene import Scene, ScenesAddress, map_order, open_scene
+from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.objects import SingleObject, as_if_in_feet, painted_surface
 from photoplan.targets.map import MapTarget
+
+Kernel = Literal["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"]
+Hidden = Literal["show", "nodata", "mark"]
+Method = Literal["indirect", "direct"]
+Blending = Literal["mean", "multiband"]
+Compression = Literal["deflate", "zstd", "lzw", "jpeg", "none"]
+
+
+#: Gaps wider than twice this, and hidden holes wider than this, are not filled, pixels.
+MOST_FILLED = 32
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How a mosaic chooses among its images; checked at birth."""
+
+    name: str = "mosaic"
+    """Of the product, and of its file without the extension."""
+    weights: Weights = field(default_factory=Weights)
+    """What each penalty of the score counts."""
+    prefer: tuple[str, ...] = ()
+    """Images that come before all others wherever they see the ground, the first of them before the next."""
+    seams: str | None = None
+    """A GeoPackage of regions, each with its image, that come before the score; relative to the project's folder."""
+
+    feather: float = 0.0
+    """Width in which images pass into each other along seams, metres; 0: they do not."""
+
+    blend: Blending = "mean"
+    """``mean``: all detail passes over that width; ``multiband``: fine detail at the seam, coarse over the width."""
+
+    sheets: float | str | None = None
+    """Side of the squares that a mosaic is cut into, metres, or a file of polygons with names, relative to the
+    project's folder; None: it is one file."""
+
+    def __post_init__(self) -> None:
+        if self.blend not in get_args(Blending):
+            raise UsageError(f"`blend` {self.blend!r}; allowed are {', '.join(get_args(Blending))}")
+        if self.blend == "multiband" and self.feather == 0:
+            raise UsageError("`blend` multiband needs the width over which coarse detail passes; give `feather`")
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Choice:
+        """A choice from plain values."""
+        weights = Weights(**values.get("weights", {}))
+        return cls(**{**values, "weights": weights, "prefer": tuple(values.get("prefer", ()))})
+
+
+@dataclass(frozen=True)
+class OrthoSettings:
+    """Choices that change the pixels or the file of an orthophoto; checked at birth."""
+
+    resolution: float | None = None
+    """Side of a ground pixel, metres; None: the mean ground sampling distance of the images, to two figures."""
+    bounds: tuple[float, float, float, float] | None = None
+    """Outer edges xmin ymin xmax ymax in the project's CRS; None: all that the image sees of the terrain."""
+    kernel: Kernel = "bicubic"
+    """Resampling kernel; bicubic is a = −0.5, bicubic-1 is a = −1."""
+    tolerance: float = 0.02
+    """Largest residual of the anchors, pixels of the source image; 0: every pixel strictly by its camera."""
+    tile: int = 512
+    """Side of a tile, pixels; a multiple of 16 from 128 on."""
+    true: bool = False
+    """Whether orthophotos show the project's objects where they stand; else the ground alone is what is painted."""
+    hidden: Hidden | None = None
+    """What becomes of places that the image cannot see, since ground or objects are in the way: ``show`` paints them
+    with what hides them, without asking; ``nodata`` leaves them empty; ``mark`` paints them and writes where they are.
+    None becomes ``nodata`` in true orthophotos and ``show`` in others."""
+    nodata: str = "auto"
+    """A number, ``mask`` (an internal mask band), or ``auto``: 0 for unsigned integers, −32768 for int16, NaN for
+    floats."""
+    compress: Compression = "deflate"
+    """Compression of the file; jpeg needs ``nodata = "mask"`` and sets it."""
+    overviews: bool = True
+    """Whether the file holds overviews."""
+    choice: Choice | None = None
+    """How images are chosen for one mosaic of them; None: an orthophoto of each."""
+    accuracy: bool = False
+    """Whether a second raster holds the standard deviations of what each pixel shows; all errors must be stated."""
+    method: Method = "indirect"
+    """``indirect``: every pixel of the product is looked up in the image; ``direct``: every pixel of the image is
+    carried to the ground."""
+    fill: int = 0
+    """Gaps that the direct method leaves are filled from pixels no further away than this; 0: they stay empty."""
+    fill_hidden: int = 0
+    """Hidden holes up to this width and height, pixels, are filled: from an image whose line of sight is only just
+    blocked, else from the pixels around them. The raster of `sources` marks them; 0: they stay empty."""
+    sources: bool = False
+    """Whether a second raster says which image painted each pixel, and a GeoPackage where its regions are."""
+    stack: str = ""
+    """Name of a virtual raster that shows all orthophotos as bands of one, on the same ground: lines of one camera, of
+    other colours; empty: there is none."""
+
+    @property
+    def exactness(self) -> str:
+        """How exactly positions are computed, in words."""
+        return f"tolerance {self.tolerance:g} px" if self.tolerance else "every pixel strictly by its camera"
+
+    def __post_init__(self) -> None:
+        if self.resolution is not None:
+            check_resolution(self.resolution)
+        if self.hidden is None:
+            object.__setattr__(self, "hidden", "nodata" if self.true or self.method == "direct" else "show")
+        if self.kernel not in get_args(Kernel):
+            raise UsageError(f"kernel {self.kernel!r}; allowed are {', '.join(get_args(Kernel))}")
+        names = ("compression", self.compress, Compression), ("hidden", self.hidden, Hidden)
+        for what, value, allowed in (*names, ("method", self.method, Method)):
+            if value not in get_args(allowed):
+                raise UsageError(f"{what} {value!r}; allowed are {', '.join(get_args(allowed))}")
+        if not (self.tolerance == 0 or 1e-6 <= self.tolerance <= 10):
+            raise UsageError(
+                f"tolerance {self.tolerance} px; it must be 0 (every pixel strictly by its camera) or 1e-6 to 10 "
+                "(usual is 0.02)"
+            )
+        if self.tile < 128 or self.tile > 4096 or self.tile % 16:
+            raise UsageError(f"tile side {self.tile}; allowed are multiples of 16 from 128 to 4096")
+        if self.bounds is not None:
+            object.__setattr__(self, "bounds", tuple(float(b) for b in self.bounds))
+        if self.nodata not in ("auto", "mask"):
+            try:
+                float(self.nodata)
+            except ValueError:
+                raise UsageError(f"nodata {self.nodata!r}; allowed are auto, mask or a number") from None
+
+        if not 0 <= self.fill <= MOST_FILLED or (self.fill and self.method != "direct"):
+            raise UsageError(f"`fill` {self.fill}; allowed are 0 to {MOST_FILLED} pixels, with `method` direct")
+        if self.method == "direct" and (self.choice is not None or self.accuracy or self.hidden != "nodata"):
+            raise UsageError(
+                "`method` direct makes orthophotos of single images, paints no hidden ground and knows no `accuracy`: "
+                "leave `hidden` and `accuracy` out, or take the indirect method"
+            )
+        if type(self.fill_hidden) is not int or not 0 <= self.fill_hidden <= MOST_FILLED:
+            raise UsageError(
+                f"`fill_hidden` {self.fill_hidden!r}; must be a whole number from 0 to {MOST_FILLED} pixels"
+            )
+        if self.fill_hidden and (self.hidden != "nodata" or self.method == "direct"):
+            raise UsageError(
+                f"`fill_hidden` {self.fill_hidden} fills hidden ground that is left empty; it requires `hidden` nodata "
+                f"(found {self.hidden}) and `method` indirect (found {self.method})"
+            )
+        if self.fill_hidden:
+            # Filled pixels are never without their mark.
+            object.__setattr__(self, "sources", True)
+
+        if self.stack and self.choice is not None:
+            raise UsageError(f"`stack` {self.stack!r} shows orthophotos as bands; a mosaic is one picture already")
+
+    @property
+    def asks_hidden(self) -> bool:
+        """Whether it is looked what images cannot see."""
+        return self.hidden != "show" or self.choice is not None
+
+    @property
+    def filling(self) -> str:
+        """Which hidden holes are filled, in words; empty if none are."""
+        return f", hidden holes up to {self.fill_hidden} px filled" if self.fill_hidden else ""
+
+    @property
+    def nodata_value(self) -> float | Literal["auto", "mask"]:
+        """`nodata` as the product's writer takes it."""
+        return self.nodata if self.nodata in ("auto", "mask") else float(self.nodata)  # type: ignore[return-value]
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> OrthoSettings:
+        """Settings from plain values, by name."""
+        known = {f.name for f in fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise UsageError(f"unknown settings {', '.join(unknown)}; known are {', '.join(sorted(known))}")
+        choice = values.get("choice")
+        return cls(**{**values, "choice": Choice.from_dict(choice) if isinstance(choice, dict) else choice})
+
+
+def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: SingleObject | None = None) -> str:
+    """Key of a product of a project, or of what it shows of a single object."""
+    address = ScenesAddress.of(project, plan.sources, part)
+    facts = address.facts if not settings.accuracy else [address.facts, known_errors(address, plan, settings).facts]
+    drawn = None
+    if settings.choice is not None and isinstance(plan.owners, BestImage) and plan.owners.drawn is not None:
+        assert isinstance(plan.target, MapTarget)
+        around = halo(plan.fill_hidden) * plan.target.grid.resolution if plan.fill_hidden else 0.0
+        drawn = plan.owners.drawn.digest(settings.choice.feather + around)
+    return product_key(facts, plan, settings, drawn)
+
+
+def known_errors(address: ScenesAddress, plan: ProductPlan, settings: OrthoSettings) -> ScenesErrors:
+    """What is known of the errors of a product's images and of its ground."""
+    sigma = in_image(settings.kernel, plan.rule.tolerance)
+    return ScenesErrors(address, (sigma,) * len(address.scenes))
+
+
+def tile_keys(address: ScenesAddress, plan: ProductPlan, settings: OrthoSettings) -> Callable[[int], str | None]:
+    """Key of a tile of a mosaic by its index; None: it is none of the plan's tiles.
+
+    Other than the key of the product it changes only with what the tile itself is made of: the images that can paint
+    it, and the regions and lines in it and as far around it as seams are felt. What moves nothing but pixels elsewhere
+    leaves it alone.
+    """
+    best = plan.owners
+    assert isinstance(best, BestImage)
+    common = _common(plan, settings)
+    if settings.choice is not None:
+        common |= {"choice": _facts(settings.choice, None) | {"prefer": None}, "levels": best.levels}
+    if settings.accuracy:
+        common |= {"errors": known_errors(address, plan, settings).facts}
+    shared = _digest(common)
+    scenes = [_digest(facts) for facts in address.facts]
+
+    @cache
+    def key(index: int) -> str | None:
+        place = int(plan.tiles.indices.searchsorted(index))
+        if place == len(plan.tiles) or plan.tiles.indices[place] != index:
+            return None
+        tile = plan.tiles[place]
+        at, reach = tile.window, halo(plan.fill_hidden) if plan.fill_hidden else 0
+        filled = Window(at.col - reach, at.row - reach, at.width + 2 * reach, at.height + 2 * reach)
+        wide = filled if plan.feather is None else plan.feather.around(filled)
+        images = [(row, scenes[row], best.ranks[row] if best.ranks else 0.0) for row in tile.sources]
+        return _digest([shared, index, images, _rows(best.drawn, wide), _rows(plan.clip, tile.window)])[:32]
+
+    return key
+
+
+def _rows(drawn: Drawn | None, window: Window) -> str | None:
+    """Of what is drawn in a window of a product."""
+    return None if drawn is None else hashlib.sha256(drawn.rows(window).tobytes()).hexdigest()
+
+
+def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions: str | None = None) -> str:
+    """Hash of what decides a product's pixels, and of nothing else.
+
+    Another key means that finished tiles are of no use.
+    """
+    facts = {
+        **_common(plan, settings),
+        "scene": scenes,
+        "choice": None if settings.choice is None else _facts(settings.choice, regions),
+        **({} if plan.clip is None else {"clip": plan.clip.digest(0.0)}),
+    }
+    return _digest(facts)
+
+
+def _common(plan: ProductPlan, settings: OrthoSettings) -> dict[str, Any]:
+    """What all tiles of a product depend on, whatever its images."""
+    assert isinstance(plan.target, MapTarget)
+    grid = plan.target.grid
+    return {
+        "version": __version__,
+        "grid": [grid.left, grid.top, grid.resolution, grid.width, grid.height, grid.crs],
+        "rule": [plan.rule.tolerance, plan.rule.radius, plan.tiles.side],
+        "kernel": settings.kernel,
+        "nodata": settings.nodata,
+        "hidden": settings.hidden,
+        "method": [settings.method, settings.fill],
+        **({"fill_hidden": settings.fill_hidden} if settings.fill_hidden else {}),
+    }
+
+
+def _digest(facts: Any) -> str:
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def _facts(choice: Choice, regions: str | None) -> dict[str, Any]:
+    """What of a choice decides pixels: of files what they say, not their names."""
+    return {**asdict(choice), "name": "", "seams": regions, "sheets": None}
+
+
+#: A product is at most so many times finer than its images see the ground.
+_FINER = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What an image sees of the terrain."""
+
+    footprint: Footprint
+    """Where it lies."""
+    gsd: float
+    """Its mean ground sampling distance, metres."""
+    blur: float = 0.0
+    """By how many powers of two its fine detail, beside the coarser, is weaker than that of the sharpest image of the
+    same ground; 0 where nobody has asked."""
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """An image that sees terrain."""
+
+    name: str
+    scene: Scene
+    look: Look
+
+
+def look_at(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Looked], list[str]]:
+    """Oriented images that see terrain, and a line for each of the others."""
+    names, blind = project.oriented(names, approximate=force)
+    events.done(len(blind))
+    scenes: dict[str, Scene] = {}
+    seen: dict[str, tuple[JudgedView | None, ImagePlausibility]] = {}
+    for place in map_order(project, names):
+        # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
+        scenes[names[place]] = scene = open_scene(project, names[place])
+        if scene.footprint.bounds is not None:
+            seen[names[place]] = judged(project, project.any_image(names[place]), scene.ground)
+        events.done()
+    if not force:
+        _refuse_faults(project, seen, scenes)
+        _refuse_feet(list(scenes.values()))
+    looked = []
+    for name, scene in ((name, scenes[name]) for name in names):
+        if scene.footprint.bounds is None:
+            blind.append(_sees_no_terrain(scene, name))
+        else:
+            looked.append(Looked(name, scene, Look(scene.footprint, mean_gsd(scene.camera, scene.footprint))))
+    return looked, blind
+
+
+def with_resolution(settings: OrthoSettings, looked: Sequence[Looked], force: bool) -> OrthoSettings:
+    """Settings with a resolution: the images' own if none is chosen."""
+    own = two_figures(float(np.mean([one.look.gsd for one in looked]))) if looked else 1.0
+    resolution = settings.resolution or own
+    if looked and not force:
+        _refuse_too_fine(resolution, settings, looked)
+    return replace(settings, resolution=resolution)
+
+
+def _refuse_faults(
+    project: Project, seen: dict[str, tuple[JudgedView | None, ImagePlausibility]], scenes: dict[str, Scene]
+) -> None:
+    """Refuse what `check` calls a fault or read wrongly; images that see no terrain are told otherwise."""
+    if not seen:
+        return
+    faults = [found for _, found in seen.values() if found.fault is not None]
+    other = reading_of_block(project, seen, scenes[next(iter(seen))].ground)
+    forced = "nothing is made of them unless you say `force`"
+    if faults:
+        raise GeometryError(
+            f"image {faults[0].name!r}: {faults[0].fault} ({len(faults)} of {len(seen)} images have such faults, "
+            f"`photoplan check` lists them); {forced}" + ("" if other is None else f". {other}")
+        )
+    if other is not None:
+        raise GeometryError(f"another reading of the orientations fits better; {forced}. {other}")
+
+
+def _refuse_feet(scenes: Sequence[Scene]) -> None:
+    told = heights_in_feet(scenes[0].surface, [scene.camera for scene in scenes]) if scenes else None
+    if told is not None:
+        raise GeometryError(f"{told}; nothing is made of it unless you say `force`")
+
+
+def heights_in_feet(surface: Terrain, cameras: Sequence[Camera]) -> str | None:
+    """What to say of objects that rise above every camera, but would stand on the ground in feet; None: none does."""
+    highest = max(float(camera.vantage.point[2]) for camera in cameras)
+    tall = as_if_in_feet(surface, highest)
+    if not tall:
+        return None
+    name, top = next(iter(tall.items()))
+    more = f" (and {len(tall) - 1} more)" if len(tall) > 1 else ""
+    return (
+        f"object {name!r}{more} rises to {top:.1f} m, above all cameras (the highest is at {highest:.1f} m), and would "
+        "stand on the ground if its heights were in feet: convert them to metres"
+    )
+
+
+def _refuse_too_fine(resolution: float, settings: OrthoSettings, looked: Sequence[Looked]) -> None:
+    """Refuse a resolution at which most pixels would be made up."""
+    finest = min((one.look.gsd for one in looked if one.look.gsd > 0), default=0.0)
+    if not resolution * _FINER < finest:
+        return
+    pixels = tiles = 0.0
+    for name, bounds in ((one.name, settings.bounds or one.look.footprint.bounds) for one in looked):
+        assert bounds is not None
+        width, height = ((bounds[k + 2] - bounds[k]) / resolution for k in (0, 1))
+        refuse_absurd((width, height), settings.tile, f"{name}: resolution {resolution:g} m")
+        pixels += width * height
+        tiles += math.ceil(width / settings.tile) * math.ceil(height / settings.tile)
+    raise UsageError(
+        f"resolution {resolution:g} m is {finest / resolution:.3g} times finer than the images see the ground "
+        f"({finest:.3g} m): {pixels:.3g} pixels in {tiles:.3g} tiles, most of them made up; "
+        f"choose {advised(finest / 2)} m or more, or say `force`"
+    )
+
+
+def two_figures(value: float) -> float:
+    """A positive number rounded to two significant figures."""
+    digits = 1 - math.floor(math.log10(value))
+    return round(value, digits)
+
+
+def _sees_no_terrain(scene: Scene, name: str) -> str:
+    """Extents of both the terrain and what the image looks at, on a level that the terrain has."""
+    vantage = scene.camera.vantage
+    x, y, z = vantage.point
+    center = f"{name}: projection centre {x:.0f} {y:.0f} {z:.0f}"
+    if not vantage.central:
+        center = f"{name}: near {x:.0f} {y:.0f}, known for heights from {vantage.floor:.0f} to {z:.0f},"
+    bounds = scene.ground.bounds
+    if bounds is None:
+        return f"{center} sees nothing of the level terrain; is it above it, and do height systems and angles fit?"
+    level = some_height(scene.ground.bare, bounds, x, y)
+    if not (vantage.central or vantage.floor < level < z):
+        level = (vantage.floor + z) / 2
+    foot = on_level(scene.camera, image_border(scene.camera.size), level)[:, :2]
+    if np.isfinite(foot).any():
+        (xmin, ymin), (xmax, ymax) = np.nanmin(foot, axis=0), np.nanmax(foot, axis=0)
+        looks = f"looks at {extent_text((xmin, ymin, xmax, ymax))} on the level {level:.0f}"
+    else:
+        looks = f"does not look down to the level {level:.0f}"
+    return f"{center} {looks}; the terrain is {extent_text(bounds)}"
+
+
+def extent_text(bounds: tuple[float, float, float, float] | None) -> str:
+    """Bounds as a message shows them: whole metres, or finer where they are narrower than 10 m."""
+    if bounds is None:
+        return "everywhere"
+    sides = [side for side in (bounds[2] - bounds[0], bounds[3] - bounds[1]) if 1e-6 < side < 10.0]
+    digits = max(0, math.ceil(1 - math.log10(min(sides, default=10.0))))
+    return " ".join(f"{b:.{digits}f}" for b in bounds)
+
 
 #: What it counts that a user prefers an image: more than any penalty of the score.
 PREFERRED = 1000.0

@@ -18,22 +18,18 @@ from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MOST_TILES, MapGrid
 from photoplan.io.disk import disk_error, library_error
-from photoplan.io.names import file_in
+from photoplan.io.files import file_in
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project
-from photoplan.io.regions import Regions
+from photoplan.io.vector_layer import Regions
 from photoplan.plain import pick, plain
-from photoplan.plan.footprint import Footprint
+from photoplan.plan.footprint import Footprint, Tiles
 from photoplan.plan.product import compile_tile
-from photoplan.plan.tiles import Tiles
-from photoplan.products.orthophoto.keys import keyed
-from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.mosaic import drawn_regions
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, product_plan
+from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, OrthoSettings, keyed, product_plan
 from photoplan.products.orthophoto.quadtree import PlanSquares
-from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import input_files
 from photoplan.surfaces.objects import SingleObject
 

@@ -18,13 +18,12 @@ import shapely
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_step, nearest_turn
 from photoplan.geometry.grid import MapGrid
+from photoplan.io.files import safe_stem
 from photoplan.io.image_metadata import read_image_metadata
-from photoplan.io.names import safe_stem
-from photoplan.io.naming import write_atomically
-from photoplan.io.polygons import read_features
+from photoplan.io.product import write_virtual
 from photoplan.io.project.model import Project
-from photoplan.io.regions import Regions
-from photoplan.io.virtual import write_virtual
+from photoplan.io.store import write_atomically
+from photoplan.io.vector_layer import Regions, read_features
 from photoplan.products.orthophoto.finished import ProductResult
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
 

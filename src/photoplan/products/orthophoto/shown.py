@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from photoplan.engine.execute import Painted, render
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.plan.compile import AnchorRule
-from photoplan.plan.owner import InSight
+from photoplan.plan.anchors import AnchorRule
+from photoplan.plan.footprint import Tile, Tiles
 from photoplan.plan.product import ProductPlan
-from photoplan.plan.tiles import Tile, Tiles
+from photoplan.plan.sources import InSight
 from photoplan.project.scene import Scene
 from photoplan.targets.map import MapTarget
 

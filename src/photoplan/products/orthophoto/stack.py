@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from photoplan.io.names import safe_stem
-from photoplan.io.virtual import write_stacked
+from photoplan.io.files import safe_stem
+from photoplan.io.product import write_stacked
 from photoplan.products.orthophoto.finished import ProductResult
 from photoplan.products.orthophoto.plan import OrthoPlan
 

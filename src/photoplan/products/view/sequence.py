@@ -12,14 +12,12 @@ from typing import Any
 from photoplan.engine.executors import Workers
 from photoplan.engine.run import Kept, Work
 from photoplan.errors import PhotoplanError, UsageError
-from photoplan.io.naming import give_name, scratch, together
 from photoplan.io.product import check_output
-from photoplan.io.run_record import recorded_result, run_key
+from photoplan.io.store import give_name, recorded_result, run_key, scratch, together
 from photoplan.products.run import Run
-from photoplan.products.view.camera import CameraRequest
-from photoplan.products.view.ground import open_view_ground
+from photoplan.products.view.camera import CameraRequest, open_view_ground
+from photoplan.products.view.lines import cameras, stations
 from photoplan.products.view.make import ViewPlan, ViewRequest, plan_view, view_work
-from photoplan.products.view.path import cameras, stations
 
 
 @dataclass(frozen=True)

@@ -10,18 +10,22 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from photoplan.io.polygons import check_vectors, write_features
 from photoplan.io.product import check_output
-from photoplan.io.run_record import recording
+from photoplan.io.store import recording
 from photoplan.io.tables import write_table
-from photoplan.products.view.camera import ViewCamera, view_camera
-from photoplan.products.view.ground import ViewGround, open_view_ground
-from photoplan.products.view.job import seen_surface
-from photoplan.products.view.make import ViewRequest, camera_request
-from photoplan.products.view.photo_skyline import PhotoMatch, PhotoSkylineRequest, against_photo, draw_match
-from photoplan.products.view.refined import RefinedCamera, refined_camera, write_refined
-from photoplan.surfaces.seen import Seen
-from photoplan.surfaces.skyline import skyline_of
+from photoplan.io.vector_layer import check_vectors, write_features
+from photoplan.products.view.camera import ViewCamera, ViewGround, open_view_ground, view_camera
+from photoplan.products.view.make import ViewRequest, camera_request, seen_surface
+from photoplan.products.view.photo import (
+    PhotoMatch,
+    PhotoSkylineRequest,
+    RefinedCamera,
+    against_photo,
+    draw_match,
+    refined_camera,
+    write_refined,
+)
+from photoplan.surfaces.seen import Seen, skyline_of
 from photoplan.targets.view import ViewTarget
 
 COLUMNS = ("x", "y", "E", "N", "H", "distance", "azimuth_deg")

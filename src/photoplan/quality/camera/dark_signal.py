@@ -1,20 +1,176 @@
-"""Dark signal: what a sensor shows without light, how it grows with the exposure and with temperature.
-
-The mean grey value of dark frames grows with the exposure by the dark current, and the current doubles every few
-degrees: I(T) = I₀ 2^((T − T₀)/T_d) (EMVA 1288 release 4 linear, sections 3 and 7).
-"""
+"""Dark signal, fixed pattern, frame statistics, defects."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from math import log
+from itertools import pairwise
+from math import log, nan, sqrt
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, special
 
+from photoplan.adjustment.least_squares import spread
 from photoplan.errors import InputError
-from photoplan.quality.camera.frame_statistics import Level, check_level, cut_off
-from photoplan.quality.camera.straight_line import StraightLine, fit_line
+from photoplan.quality.camera.straight_lines import StraightLine, fit_line
+
+#: Share of zeros beyond which black is cut off, and mean and variance are not those of the signal.
+ZERO_SHARE = 0.005
+#: Pixels below which no figure is derived.
+LEAST_PIXELS = 64
+
+
+@dataclass(frozen=True)
+class Level:
+    """Summary of the frames of one condition; variances are squared grey values."""
+
+    frames: int
+    pixels: int
+    mean: float
+    """Grey value, mean over pixels and frames."""
+    temporal_variance: float
+    """Of a pixel from frame to frame, without the variation of the frames' means; NaN for a single frame."""
+    spatial_variance: float
+    """Of the mean image, with the rest of the temporal noise in it."""
+    frame_mean_sigma: float
+    """Standard deviation of the frames' means; NaN for a single frame."""
+    saturated_share: float
+    """Share of samples at or above saturation."""
+    zero_share: float
+    """Share of samples at zero, where black may be cut off; 0 where samples are negative too."""
+    largest: float
+    smallest: float
+
+    @property
+    def is_cut_off(self) -> bool:
+        """Whether black is cut off: more zeros than noise about a positive bias would give."""
+        return self.zero_share > ZERO_SHARE
+
+    @property
+    def mean_sigma(self) -> float:
+        """Standard deviation of `mean`: by the noise of pixels, or of whole frames where that is clearly larger."""
+        if self.frames < 2:
+            return float("nan")
+        of_pixels = self.temporal_variance / self.pixels
+        of_frames = self.frame_mean_sigma**2
+        # About the 1 % point of the scatter that pixels alone would give to the means of so few frames.
+        usual = of_pixels * (1 + 4 * np.sqrt(2 / (self.frames - 1)))
+        return float(np.sqrt((of_frames if of_frames > usual else of_pixels) / self.frames))
+
+    def sigma_of_mean(self, step: float) -> float:
+        """The same; of a single frame, which says nothing of its noise, by rounding and the scatter between pixels."""
+        if np.isfinite(self.mean_sigma):
+            return self.mean_sigma
+        return float(np.sqrt(max(self.spatial_variance, step**2 / 12) / self.pixels))
+
+    @property
+    def degrees(self) -> int:
+        """Degrees of freedom of the temporal variance."""
+        return (self.frames - 1) * (self.pixels - 1)
+
+    @property
+    def variance_sigma(self) -> float:
+        """Standard deviation of the temporal variance, for noise that is nearly Gaussian."""
+        return float(self.temporal_variance * np.sqrt(2.0 / self.degrees)) if self.degrees else float("nan")
+
+
+def cut_off(levels: Iterable[Level], of: str = "") -> str:
+    """That black is cut off in some levels, as the beginning of a refusal; empty: it is not."""
+    share = max((level.zero_share for level in levels if level.is_cut_off), default=0.0)
+    return f"black is cut off: {100 * share:.3g} % of the samples{of} are zero" if share else ""
+
+
+def check_level(level: Level) -> None:
+    """Refuse a level that says nothing: too few pixels, or frames that are copies of each other."""
+    if level.pixels < LEAST_PIXELS:
+        raise InputError(f"{level.pixels} pixels count; {LEAST_PIXELS} or more are needed: give a larger roi or mask")
+    if level.frames > 1 and not level.temporal_variance > 0 and level.saturated_share < 0.5 and level.zero_share < 0.5:
+        raise InputError(
+            f"the {level.frames} frames of mean {level.mean:.4g} DN do not differ in any pixel: they are copies of "
+            "one file, or their noise was removed; give raw frames"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameStack:
+    """Images of the frames of one condition."""
+
+    level: Level
+    mean: NDArray[np.float64]
+    """Mean image, shape (h, w)."""
+    variance: NDArray[np.float64] | None
+    """Temporal variance of every pixel; None for a single frame."""
+    counted: NDArray[np.bool_] | None
+    """Pixels that the summary counts; None: all."""
+
+    def only_counted(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean image or variance with NaN where pixels do not count."""
+        return image if self.counted is None else np.where(self.counted, image, np.nan)
+
+
+class StackSums:
+    """Gathers frames one after the other: memory holds two images, however many frames there are."""
+
+    def __init__(self, saturation: float, counted: NDArray[np.bool_] | None = None) -> None:
+        self._saturation, self._counted = saturation, counted
+        self._means: list[float] = []
+        self._saturated = self._zero = 0
+        self._largest, self._smallest = -np.inf, np.inf
+        self._mean: NDArray[np.float64] | None = None
+        self._squares: NDArray[np.float64] | None = None
+
+    def add(self, frame: NDArray[Any]) -> None:
+        """One more frame, shape (h, w)."""
+        seen = frame if self._counted is None else frame[self._counted]
+        if not seen.size:
+            raise InputError("no pixel of the frame counts")
+        values = frame.astype(np.float64)
+        self._saturated += int(np.count_nonzero(seen >= self._saturation))
+        self._zero += int(np.count_nonzero(seen == 0))
+        self._largest = max(self._largest, float(seen.max()))
+        self._smallest = min(self._smallest, float(seen.min()))
+        self._means.append(float(np.mean(seen, dtype=np.float64)))
+        if self._mean is None or self._squares is None:
+            self._mean, self._squares = values, np.zeros_like(values)
+            return
+        if values.shape != self._mean.shape:
+            raise InputError(f"frame of shape {values.shape}; the others have {self._mean.shape}")
+        # Welford 1962: stable, and needs no second pass.
+        difference = values - self._mean
+        self._mean += difference / len(self._means)
+        self._squares += difference * (values - self._mean)
+
+    def stack(self) -> FrameStack:
+        """What the frames say."""
+        count = len(self._means)
+        if self._mean is None or self._squares is None:
+            raise InputError("no frame given")
+        mean, squares = self._mean, self._squares
+        seen = mean.ravel() if self._counted is None else mean[self._counted]
+        pixels = seen.size
+        temporal = sigma = float("nan")
+        if count > 1:
+            inner = float(squares.sum() if self._counted is None else squares[self._counted].sum())
+            between = float(np.sum((np.array(self._means) - np.mean(self._means)) ** 2))
+            if pixels > 1:
+                temporal = max(inner - pixels * between, 0.0) / ((count - 1) * (pixels - 1))
+            sigma = float(np.sqrt(between / (count - 1)))
+        level = Level(
+            frames=count,
+            pixels=pixels,
+            mean=float(seen.mean()),
+            temporal_variance=temporal,
+            spatial_variance=float(seen.var(ddof=1)) if pixels > 1 else float("nan"),
+            frame_mean_sigma=sigma,
+            saturated_share=self._saturated / (count * pixels),
+            zero_share=0.0 if self._smallest < 0 else self._zero / (count * pixels),
+            largest=self._largest,
+            smallest=self._smallest,
+        )
+        variance = squares / (count - 1) if count > 1 else None
+        return FrameStack(level, mean, variance, self._counted)
 
 
 @dataclass(frozen=True)
@@ -90,3 +246,381 @@ def doubling_temperature(
     doubling = log(2.0) / line.slope
     current = float(np.exp(line.offset))
     return DoublingTemperature(doubling, doubling * line.slope_sigma / line.slope, reference, current)
+
+
+#: Side of an image from which rows and columns can be told from pixels.
+_LEAST_SIDE = 16
+
+
+@dataclass(frozen=True)
+class PatternVariance:
+    """Spatial variances of a mean image in squared grey values; a small negative one is the noise of zero."""
+
+    total: float
+    total_sigma: float
+    row: float
+    """Of rows against each other."""
+    row_sigma: float
+    column: float
+    column_sigma: float
+    pixel: float
+    pixel_sigma: float
+    mean: float
+    """Grey value."""
+    filtered: bool
+    """Whether the slow variation was taken out."""
+
+
+def pattern_variance(
+    mean: NDArray[np.float64], temporal_variance: float, frames: int, *, filtered: bool = False
+) -> PatternVariance:
+    """Spatial variances of the mean image of several frames."""
+    height, width = mean.shape
+    if min(height, width) < _LEAST_SIDE:
+        raise InputError(f"image of {width} × {height} pixels; the fixed pattern needs {_LEAST_SIDE} × {_LEAST_SIDE}")
+    if not np.isfinite(temporal_variance) or frames < 2:
+        raise InputError("a single frame; the fixed pattern needs two or more, to tell it from the temporal noise")
+    values = high_pass(mean) if filtered else mean
+    white, line = (WHITE_SHARE, LINE_SHARE) if filtered else (1.0, 1.0)
+    rest = temporal_variance / frames
+    measured = float(values.var(ddof=1))
+    of_rows = float(values.mean(axis=1).var(ddof=1)) / line
+    of_columns = float(values.mean(axis=0).var(ddof=1)) / line
+    # With q = pixel + rest: E[of_rows] = row + q / width, E[of_columns] = column + q / height and
+    # E[measured] = line (row + column) + white q; without the filter line = white = 1.
+    inner = (measured - line * (of_rows + of_columns)) / (white - line / width - line / height)
+    row, column, pixel = of_rows - inner / width, of_columns - inner / height, inner - rest
+    total = row + column + pixel
+    measured_sigma = inner * sqrt(2 / (mean.size - 1))
+    row_sigma = of_rows * sqrt(2 / (height - 1))
+    column_sigma = of_columns * sqrt(2 / (width - 1))
+    # What is left of the temporal noise is itself estimated.
+    rest_sigma = rest * sqrt(2 / ((frames - 1) * (mean.size - 1)))
+    pixel_sigma = sqrt(measured_sigma**2 + rest_sigma**2)
+    total_sigma = sqrt(row_sigma**2 + column_sigma**2 + pixel_sigma**2)
+    return PatternVariance(
+        total=total,
+        total_sigma=total_sigma,
+        row=row,
+        row_sigma=row_sigma,
+        column=column,
+        column_sigma=column_sigma,
+        pixel=pixel,
+        pixel_sigma=pixel_sigma,
+        mean=float(mean.mean()),
+        filtered=filtered,
+    )
+
+
+def signed_root(variance: float, sigma: float) -> tuple[float, float]:
+    """Standard deviation of a variance and its sigma; 0 where the variance is not above zero."""
+    if variance <= 0:
+        return 0.0, sqrt(sigma) if sigma > 0 else 0.0
+    root = sqrt(variance)
+    return root, min(sigma / (2 * root), sqrt(sigma))
+
+
+def prnu_percent(bright: PatternVariance, dark: PatternVariance | float = 0.0) -> tuple[float, float]:
+    """Photo response non-uniformity in percent of the signal, and its sigma."""
+    below, of_dark, of_dark_sigma = (
+        (dark.mean, dark.total, dark.total_sigma) if isinstance(dark, PatternVariance) else (dark, 0.0, 0.0)
+    )
+    signal = bright.mean - below
+    if signal <= 0:
+        raise InputError(f"flat frames of mean {bright.mean:.4g} DN are not brighter than the dark ones")
+    root, sigma = signed_root(bright.total - of_dark, sqrt(bright.total_sigma**2 + of_dark_sigma**2))
+    return 100 * root / signal, 100 * sigma / signal
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrogram:
+    """Spectrum along rows or columns, mean over them."""
+
+    frequency: NDArray[np.float64]
+    """Cycles per pixel of the plane, without 0."""
+    amplitude: NDArray[np.float64]
+    """Root of the power, grey values; white noise of standard deviation s has s everywhere."""
+    white: float
+    """Level of the white part: the median."""
+    excess: float
+    """Whole power over that of the white part; 1 for white noise."""
+    peak_frequency: float
+    """Frequency of the largest peak that stands out (5 times its neighbourhood); NaN: there is none."""
+
+
+def spectrogram(mean: NDArray[np.float64], axis: int) -> Spectrogram:
+    """Spectrogram of a mean image along an axis: 1 along rows (horizontal), 0 along columns."""
+    values = mean - mean.mean()
+    length = values.shape[axis]
+    power = (np.abs(np.fft.rfft(values, axis=axis)) ** 2).mean(axis=1 - axis) / length
+    power, frequency = power[1:], np.fft.rfftfreq(length)[1:]
+    white = float(np.median(power))
+    excess = float(power.mean() / white) if white > 0 else nan
+    peak = int(np.argmax(power))
+    around = np.delete(power[max(0, peak - 8) : peak + 9], min(peak, 8))
+    standing = around.size and power[peak] > 5 * float(np.median(around)) and power[peak] > 5 * white
+    return Spectrogram(
+        frequency=np.asarray(frequency, np.float64),
+        amplitude=np.sqrt(power),
+        white=sqrt(max(white, 0.0)),
+        excess=excess,
+        peak_frequency=float(frequency[peak]) if standing else nan,
+    )
+
+
+#: Sides of the boxes, pixels, and one row of the binomial filter, by the standard.
+_BOXES = (7, 11)
+_BINOMIAL = (0.25, 0.5, 0.25)
+#: Side of a block of `background`, pixels.
+BLOCK = 16
+
+
+def _smooth(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    for side in _BOXES:
+        image = ndimage.uniform_filter(image, side, mode="reflect")
+    for axis in (0, 1):
+        image = ndimage.correlate1d(image, _BINOMIAL, axis=axis, mode="reflect")
+    return np.asarray(image)
+
+
+def _share(image: NDArray[np.float64]) -> float:
+    return float(np.sum((image - _smooth(image))[:, 20] ** 2))
+
+
+def _impulse() -> NDArray[np.float64]:
+    impulse = np.zeros((41, 41))
+    impulse[20, 20] = 1.0
+    return impulse
+
+
+WHITE_SHARE = float(np.sum((_impulse() - _smooth(_impulse())) ** 2))
+"""Part of the variance of white noise that `high_pass` leaves."""
+LINE_SHARE = _share(np.repeat(_impulse()[:, 20:21], 41, axis=1))
+"""Part of the variance of independent offsets of rows, or of columns, that it leaves."""
+
+
+def high_pass(image: NDArray[Any]) -> NDArray[np.float64]:
+    """An image without its slow variation, shape (h, w); white noise keeps `WHITE_SHARE` of its variance."""
+    values = np.asarray(image, np.float64)
+    return values - _smooth(values)
+
+
+def _median(block: NDArray[np.float64]) -> float:
+    known = block[~np.isnan(block)]
+    return float(np.median(known)) if known.size else float("nan")
+
+
+def background(image: NDArray[Any]) -> NDArray[np.float64]:
+    """Slow variation of an image by medians of blocks of 16 × 16 pixels, linear between their middles.
+
+    NaN does not count; a block without a value takes that of the nearest block with one.
+    """
+    values = np.asarray(image, np.float64)
+    height, width = values.shape
+    rows, cols = max(1, height // BLOCK), max(1, width // BLOCK)
+    y = np.linspace(0, height, rows + 1).astype(int)
+    x = np.linspace(0, width, cols + 1).astype(int)
+    medians = np.array([[_median(values[a:b, c:d]) for c, d in pairwise(x)] for a, b in pairwise(y)])
+    if np.isnan(medians).any():
+        medians = medians[
+            tuple(ndimage.distance_transform_edt(np.isnan(medians), return_distances=False, return_indices=True))
+        ]
+    middle_y, middle_x = (y[:-1] + y[1:] - 1) / 2, (x[:-1] + x[1:] - 1) / 2
+    along = np.array([np.interp(np.arange(width), middle_x, row) for row in medians])
+    at = np.interp(np.arange(height), middle_y, np.arange(rows))
+    low = np.minimum(at.astype(int), max(rows - 2, 0))
+    part = (at - low)[:, None]
+    return np.asarray(along[low] * (1 - part) + along[np.minimum(low + 1, rows - 1)] * part)
+
+
+Kind = Literal["hot", "dark", "blinking", "row", "column"]
+#: False alarms that are expected in a whole image.
+_ALARMS = 0.01
+#: Defects that are listed at most.
+MOST = 5000
+#: Lines to each side with whose running median a line is compared.
+_REACH = 8
+#: Side of the smallest image in which a pixel has surroundings.
+LEAST_SIDE = 16
+
+
+@dataclass(frozen=True)
+class Defect:
+    """One element; positions are those of the plane's array."""
+
+    kind: Kind
+    col: float
+    """NaN for a whole row."""
+    row: float
+    """NaN for a whole column."""
+    value: float
+    """Deviation from the surroundings, grey values; for blinking the temporal standard deviation."""
+    ratio: float
+    """The same over the threshold."""
+
+
+@dataclass(frozen=True, eq=False)
+class DefectList:
+    """Defects of one kind and how they were told."""
+
+    defects: tuple[Defect, ...]
+    """The strongest first; `MOST` at most."""
+    count: int
+    """All of them."""
+    threshold: float
+    """Grey values; the median where it differs from place to place."""
+    scatter: float
+    """Standard deviation of what most pixels show, grey values."""
+    deviation: NDArray[np.float64] | None
+    """Deviation of every pixel; None for lines and blinking."""
+
+
+def _scatter(values: NDArray[np.float64], least: float) -> float:
+    """Robust standard deviation, not below `least`."""
+    return max(spread(values, None), least)
+
+
+def _factor(count: int) -> float:
+    """How many standard deviations a Gaussian value exceeds by chance in 0.01 of such images."""
+    return float(-special.ndtri(_ALARMS / max(count, 1) / 2))
+
+
+def find_defects(
+    mean: NDArray[np.float64],
+    temporal_variance: float,
+    frames: int,
+    kinds: tuple[Kind, ...],
+    share: float = 0.0,
+    step: float = 1.0,
+    cut: bool = False,
+) -> DefectList:
+    """Pixels that differ from their surroundings.
+
+    Notes
+    -----
+    The threshold is the number of scatters that Gaussian noise exceeds once in a hundred images; the scatter is at
+    least that of rounding and of the temporal noise of the mean.
+    """
+    if min(mean.shape) < LEAST_SIDE:
+        raise InputError(
+            f"image of {mean.shape[1]} × {mean.shape[0]} pixels; defects are looked for in {LEAST_SIDE} × {LEAST_SIDE} "
+            "pixels or more"
+        )
+    ground = background(mean)
+    deviation = mean - ground
+    rest = temporal_variance / frames if np.isfinite(temporal_variance) else 0.0
+    scatter = _scatter(deviation, sqrt(step**2 / 12 / frames + max(rest, 0.0)))
+    if cut:
+        # From one to two standard deviations above the middle, which zeros and few hot pixels leave as they are.
+        scatter = max(scatter, float(np.diff(np.nanquantile(deviation, (0.8413, 0.9772)))[0]))
+    # A mean of few frames has rounded values: one step of the grey values in one of them is no defect.
+    threshold = max(_factor(int(np.isfinite(mean).sum())) * scatter, 1.5 * step / frames)
+    limit = np.maximum(threshold, share * np.abs(ground))
+    found = np.zeros(mean.shape, bool)
+    if "hot" in kinds:
+        found |= deviation > limit
+    if "dark" in kinds:
+        found |= deviation < -limit
+    listed = _strongest(
+        found, lambda r, c: "hot" if deviation[r, c] > 0 else "dark", deviation, np.abs(deviation) / limit
+    )
+    return DefectList(
+        defects=listed,
+        count=int(found.sum()),
+        threshold=float(np.nanmedian(limit)),
+        scatter=scatter,
+        deviation=deviation,
+    )
+
+
+def _strongest(
+    found: NDArray[np.bool_], kind: Callable[[int, int], Kind], value: NDArray[np.float64], ratio: NDArray[np.float64]
+) -> tuple[Defect, ...]:
+    """The pixels that were found, by how far they are beyond the threshold."""
+    rows, cols = np.nonzero(found)
+    order = np.argsort(-ratio[rows, cols], kind="stable")[:MOST]
+    return tuple(
+        Defect(kind=kind(r, c), col=float(c), row=float(r), value=float(value[r, c]), ratio=float(ratio[r, c]))
+        for r, c in zip(rows[order], cols[order])
+    )
+
+
+def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0) -> DefectList:
+    """Pixels whose grey value changes from frame to frame far more than that of most."""
+    if frames < 4:
+        raise InputError(f"{frames} frames at a setting; blinking pixels need four or more")
+    usual = float(np.nanmedian(variance)) * (frames - 1) / float(special.chdtri(frames - 1, 0.5))
+    if usual < 1e-3 * step**2:
+        raise InputError(
+            "most pixels do not change at all from frame to frame (black cut off, or rounding): there is no noise with "
+            "which a blinking pixel could be compared"
+        )
+    usual = max(usual, float(np.nanmean(np.minimum(variance, 16 * usual))))
+    # Shot noise differs from pixel to pixel with its light, so the limit is taken generously.
+    limit = 1.5 * usual * float(special.chdtri(frames - 1, _ALARMS / np.isfinite(variance).sum())) / (frames - 1)
+    found, sigma = variance > limit, np.sqrt(variance)
+    listed = _strongest(found, lambda r, c: "blinking", sigma, sigma / sqrt(limit))
+    return DefectList(
+        defects=listed, count=int(found.sum()), threshold=sqrt(limit), scatter=sqrt(usual), deviation=None
+    )
+
+
+def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
+    """Whole rows and columns brighter or darker than their neighbours: by their medians against running ones.
+
+    `step` is the distance of neighbouring grey values. NaN does not count, nor do lines with fewer than 16 values.
+    """
+    listed: list[Defect] = []
+    worst_limit = worst_scatter = 0.0
+    kinds: tuple[tuple[Kind, int], ...] = (("row", 1), ("column", 0))
+    for kind, axis in kinds:
+        count = np.isfinite(mean).sum(axis=axis)
+        seen = np.flatnonzero(count >= LEAST_SIDE)
+        if not seen.size:
+            continue
+        lines = mean.take(seen, 1 - axis)
+        profile = np.nanmedian(lines, axis=axis, keepdims=True)
+        # Medians of grey values come in steps, so that something of the mean helps; a few hot pixels make no line.
+        around = lines - profile
+        most = 3 * _scatter(around, step * sqrt(1 / 12))
+        mixed = profile.ravel() + 0.1 * np.nanmean(np.clip(around, -most, most), axis=axis)
+        deviation = mixed - ndimage.median_filter(mixed, 2 * min(_REACH, mixed.size - 1) + 1, mode="mirror")
+        pixel = _scatter(mean - background(mean), step * sqrt(1 / 12))
+        of_pixels = pixel / np.sqrt(count[seen]) + 0.02 * step
+        scatter = np.maximum(_scatter(deviation, 0.0), of_pixels)
+        # A quarter more: the scatter of a hundred lines is itself known to a tenth only.
+        limit = np.maximum(1.25 * _factor(seen.size) * scatter, 0.5 * step)
+        for k in np.flatnonzero(np.abs(deviation) > limit):
+            col, row = (float("nan"), float(seen[k])) if kind == "row" else (float(seen[k]), float("nan"))
+            listed.append(
+                Defect(
+                    kind=kind, col=col, row=row, value=float(deviation[k]), ratio=float(abs(deviation[k]) / limit[k])
+                )
+            )
+        worst_limit = max(worst_limit, float(np.median(limit)))
+        worst_scatter = max(worst_scatter, float(np.median(scatter)))
+    listed.sort(key=lambda d: -d.ratio)
+    return DefectList(
+        defects=tuple(listed[:MOST]), count=len(listed), threshold=worst_limit, scatter=worst_scatter, deviation=None
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LogHistogram:
+    """How many pixels deviate by how much, and how many would by Gaussian noise."""
+
+    deviation: NDArray[np.float64]
+    """Middles of the classes, grey values."""
+    count: NDArray[np.int64]
+    model: NDArray[np.float64]
+    """Expected counts of a Gaussian with the robust scatter."""
+
+
+def log_histogram(deviation: NDArray[np.float64], scatter: float) -> LogHistogram:
+    """Histogram for a logarithmic axis, over the whole range; classes of a third of the scatter, 4000 at most."""
+    low, high = float(deviation.min()), float(deviation.max())
+    classes = int(np.clip(3 * (high - low) / scatter, 20, 4000)) if scatter > 0 else 200
+    edges = np.linspace(low, high if high > low else low + 1.0, classes + 1)
+    count, _ = np.histogram(deviation, edges)
+    model = np.diff(special.ndtr((edges - float(np.median(deviation))) / scatter)) * deviation.size
+    return LogHistogram((edges[:-1] + edges[1:]) / 2, count, model)

@@ -1,34 +1,306 @@
-"""Light fall-off measured in a flat image: natural and artificial part, told apart where they can be (Behr, §4.2.1)."""
+"""Fall-off of light: adjustment and estimate."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from photoplan.adjustment.iterate import by_differences
-from photoplan.adjustment.robust import spread
+from photoplan.adjustment.least_squares import bisquare, by_differences, solve, spread
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.camera.fall_off_adjust import (
-    CONSTANT,
-    POINT,
-    Blocks,
-    FallOffFit,
-    FallOffSettings,
-    adjust,
-    design,
-    moved,
-    separability,
-    significant,
-    to_blocks,
-    weakest,
-)
-from photoplan.quality.camera.fall_off_model import FallOffModel
+from photoplan.quality.camera.fall_off_model import MOST_DEGREE, FallOffModel, surface_terms, term_values
 
 Array = NDArray[np.float64]
+
+#: Standard deviations above which a term counts.
+SIGNIFICANT = 4.0
+
+
+@dataclass(frozen=True)
+class FallOffSettings:
+    """What is known, and what is estimated."""
+
+    natural: Literal["given", "estimated", "none"] = "none"
+    """Camera constant of cos⁴ω: given, estimated from the fall-off, or no natural part apart from the terms."""
+    camera_constant: float | None = None
+    """Pixels; needed where it is given."""
+    principal_point: tuple[float, float] | None = None
+    """Column and row; None: the middle of the image."""
+    estimate_principal_point: bool = False
+    """Whether it is estimated too."""
+    artificial: Literal["surface", "radial", "none"] = "surface"
+    """A general polynomial surface, one of even powers of the radius, or no artificial part."""
+    degree: int = 6
+    dark: float = 0.0
+    """Grey value of no light that was left in the flat image; it is passed on to the model."""
+
+    def __post_init__(self) -> None:
+        if (self.natural == "given") != (self.camera_constant is not None):
+            raise InputError(
+                f"natural light fall-off {self.natural!r} with camera constant {self.camera_constant}; give the camera "
+                "constant with 'given' and only with it"
+            )
+        if self.camera_constant is not None and not 0.0 < self.camera_constant < math.inf:
+            raise InputError(f"camera constant {self.camera_constant} px; a positive number is needed")
+        if not 2 <= self.degree <= MOST_DEGREE:
+            raise InputError(f"polynomial of degree {self.degree}; 2 to {MOST_DEGREE} are allowed")
+
+    def terms(self) -> tuple[tuple[int, int], ...]:
+        """Terms that are tried for the artificial part."""
+        if self.artificial == "none":
+            return ()
+        found = surface_terms(self.degree)
+        return found if self.artificial == "surface" else tuple(t for t in found if t[1] == 0)
+
+
+#: Unknowns of the natural part.
+CONSTANT, POINT = "camera constant", ("column of the principal point", "row of the principal point")
+
+
+@dataclass(frozen=True, eq=False)
+class FallOffFit:
+    """Unknowns: those of the natural part first, see `moved`, then level and level · coefficients."""
+
+    model: FallOffModel
+    linear: Array
+    covariance: Array
+    weights: Array
+    residuals: Array
+    free: tuple[str, ...]
+
+
+def design(blocks: Blocks, model: FallOffModel) -> Array:
+    """Columns of the linear unknowns for all known blocks, shape (n, 1 + terms): the level, then each term."""
+    u, v = ((at - p) / model.half_diagonal for at, p in zip((blocks.x, blocks.y), model.principal_point))
+    natural = model.natural(blocks.x, blocks.y)
+    return natural[:, None] * np.column_stack([np.ones_like(u), *(term_values(u, v, t) for t in model.terms)])
+
+
+def moved(model: FallOffModel, free: tuple[str, ...], step: Array) -> FallOffModel:
+    """A model whose natural part has gone a step: log of the camera constant, principal point in half diagonals."""
+    by, unit, c, point = dict(zip(free, step)), model.half_diagonal, model.camera_constant, list(model.principal_point)
+    if CONSTANT in by and c is not None:
+        c = float(np.clip(c * math.exp(by[CONSTANT]), 0.05 * unit, 1e3 * unit))
+    for k, (name, side) in enumerate(zip(POINT, model.size)):
+        if name in by:
+            point[k] = float(np.clip(point[k] + by[name] * unit, -side, 2.0 * side))
+    return replace(model, principal_point=(point[0], point[1]), camera_constant=c)
+
+
+def adjust(
+    blocks: Blocks, settings: FallOffSettings, terms: tuple[tuple[int, int], ...], weights: Array | None = None
+) -> FallOffFit:
+    """Gauss-Newton for the unknowns of the natural part beside the linear ones.
+
+    Weights are those of the blocks, shape (n,); None: all equal.
+    """
+    free = ((CONSTANT,) if settings.natural == "estimated" else ()) + (
+        POINT if settings.estimate_principal_point else ()
+    )
+    start = settings.principal_point or ((blocks.size[0] - 1) / 2.0, (blocks.size[1] - 1) / 2.0)
+    c = settings.camera_constant if settings.natural != "estimated" else _start_constant(blocks, start)
+    model = FallOffModel(
+        size=blocks.size,
+        principal_point=start,
+        camera_constant=c,
+        terms=terms,
+        coefficients=(0.0,) * len(terms),
+        dark=settings.dark,
+    )
+    y = blocks.known
+    w = np.ones_like(y) if weights is None else weights
+    for step in range(40):
+        fit = solve(design(blocks, model), y, w)
+        by = solve(_design_with(blocks, model, fit.unknowns, free), -fit.residuals, w).unknowns[: len(free)]
+        change = np.clip(by, -0.3, 0.3)
+        model = moved(model, free, change)
+        if weights is None and step < 30:
+            size = spread(fit.residuals)
+            w = bisquare(fit.residuals / size) if size > 0.0 else np.ones_like(y)
+        if step >= 6 and np.abs(change).max(initial=0.0) < 1e-7:
+            break
+    fit = solve(design(blocks, model), y, w)
+    linear, residuals = fit.unknowns, -fit.residuals
+    return FallOffFit(
+        model=replace(model, coefficients=tuple(float(a) for a in linear[1:] / linear[0])),
+        linear=linear,
+        covariance=_covariance(blocks, _design_with(blocks, model, linear, free), residuals, w),
+        weights=w,
+        residuals=residuals,
+        free=free,
+    )
+
+
+def _start_constant(blocks: Blocks, point: tuple[float, float]) -> float:
+    """From the curvature at the principal point, where cos⁴ω falls by 2 r² / c²."""
+    plain = FallOffModel(
+        size=blocks.size,
+        principal_point=point,
+        camera_constant=None,
+        terms=((1, 1), (1, -1), (2, 0)),
+        coefficients=(0.0, 0.0, 0.0),
+    )
+    found = solve(design(blocks, plain), blocks.known).unknowns
+    fall = -found[3] / found[0]
+    if not fall > 1e-4:
+        raise GeometryError(
+            "the brightness does not fall off from the principal point; no camera constant can be estimated from it. "
+            "Give the camera constant, or ask for no natural part"
+        )
+    return plain.half_diagonal * math.sqrt(2.0 / fall)
+
+
+def _design_with(blocks: Blocks, model: FallOffModel, linear: Array, free: tuple[str, ...]) -> Array:
+    """Derivatives by all unknowns, those of the natural part by differences."""
+    by = by_differences(lambda step: design(blocks, moved(model, free, step)) @ linear, np.zeros(len(free)), 1e-4)
+    return np.column_stack([by, design(blocks, model)])
+
+
+def _covariance(blocks: Blocks, J: Array, residuals: Array, w: Array) -> Array:
+    """Of all unknowns; larger by what neighbouring residuals resemble each other, as fewer blocks are independent."""
+    used = w > 0.0
+    freedom = max(int(used.sum()) - J.shape[1], 1)
+    # Weights below 1 make residuals smaller than they are: the variance is that of the spread's robust measure.
+    variance = spread(residuals[used]) ** 2 * used.sum() / freedom
+    return solve(J, residuals, w).cofactors * variance * blocks.inflation(np.where(used, residuals, np.nan))
+
+
+def separability(blocks: Blocks, fit: FallOffFit) -> dict[str, float]:
+    """For each estimated unknown, the sine of the angle between its effect and what all others can do."""
+    whole = _design_with(blocks, fit.model, fit.linear, fit.free)
+    shares = {}
+    for k, name in enumerate(fit.free):
+        rest = solve(np.delete(whole, k, axis=1), whole[:, k], fit.weights).square
+        shares[name] = math.sqrt(rest / float(fit.weights @ whole[:, k] ** 2))
+    return shares
+
+
+def significant(blocks: Blocks, fit: FallOffFit) -> tuple[tuple[int, int], ...]:
+    """Terms that are significant after all of lower degree, and those of the same direction below them."""
+    terms = fit.model.terms
+    if not terms:
+        return ()
+    root = np.sqrt(fit.weights)
+    A = design(blocks, fit.model) * root[:, None]
+    Q, _ = np.linalg.qr(A / np.linalg.norm(A, axis=0))
+    used = fit.weights > 0.0
+    size = spread(fit.residuals[used])
+    size *= math.sqrt(blocks.inflation(np.where(used, fit.residuals, np.nan)))
+    effect = np.abs(Q.T @ (blocks.known * root))[1:]
+    strong = {term for term, e in zip(terms, effect) if e > SIGNIFICANT * max(size, 1e-300)}
+    return tuple(t for t in terms if any(s[1] == t[1] and s[0] >= t[0] for s in strong))
+
+
+def weakest(fit: FallOffFit) -> tuple[int, int] | None:
+    """The least significant term of those that are the highest of their direction; None: all of these count.
+
+    What `significant` keeps may have carried a part of terms of higher degree, since terms are not at right angles to
+    each other on a rectangle.
+    """
+    first, terms = len(fit.free) + 1, fit.model.terms
+    sigmas = np.sqrt(np.maximum(np.diag(fit.covariance)[first:], 1e-300))
+    tops = {m: max(n for n, other in terms if other == m) for _, m in terms}
+    values = {term: abs(a) / s for term, a, s in zip(terms, fit.linear[1:], sigmas) if tops[term[1]] == term[0]}
+    term = min(values, key=values.__getitem__, default=None)
+    return term if term is not None and values[term] < SIGNIFICANT else None
+
+
+#: Blocks along the longer side.
+ACROSS = 96
+"""Tukey's constant: 95 % efficient for normal noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Means of square blocks of an image."""
+
+    size: tuple[int, int]
+    """Width and height of the image, pixels."""
+    side: int
+    """Of a block, pixels."""
+    offset: tuple[int, int]
+    """Column and row of the first block's first pixel."""
+    values: Array
+    """Shape (rows, columns); NaN: not known."""
+
+    @property
+    def known(self) -> Array:
+        """Values of the blocks that have one, shape (n,)."""
+        return self.values[np.isfinite(self.values)]
+
+    @property
+    def x(self) -> Array:
+        """Columns of their middles, shape (n,)."""
+        return self._middles(1)
+
+    @property
+    def y(self) -> Array:
+        """Rows of their middles, shape (n,)."""
+        return self._middles(0)
+
+    def corner(self, column: int, row: int) -> tuple[float, float]:
+        """Column and row of the upper left corner of a block."""
+        return self.offset[0] + column * self.side - 0.5, self.offset[1] + row * self.side - 0.5
+
+    def spread_out(self, known: Array) -> Array:
+        """Values of the known blocks where they lie, NaN elsewhere, shape (rows, columns)."""
+        out = np.full(self.values.shape, np.nan)
+        out[np.isfinite(self.values)] = known
+        return out
+
+    def neighbour_correlation(self, known: Array) -> float:
+        """Correlation of values of blocks beside and below each other; NaN among them is left out."""
+        return float(np.mean(self._correlations(known)))
+
+    def inflation(self, known: Array) -> float:
+        """By how much variances grow as neighbours are not independent (first-order Markov process in both ways)."""
+        count = int(np.isfinite(known).sum())
+        factor = 1.0
+        for r in self._correlations(known):
+            r = min(r, 0.9)
+            if r > 3.0 / math.sqrt(max(count, 1)):
+                factor *= (1.0 + r) / (1.0 - r)
+        return factor
+
+    def _correlations(self, known: Array) -> tuple[float, float]:
+        field = self.spread_out(known)
+        field = field - np.nanmean(field)
+        variance = float(np.nanmean(field**2))
+        if not variance > 0.0:
+            return 0.0, 0.0
+        beside = float(np.nanmean(field[:, 1:] * field[:, :-1])) / variance
+        below = float(np.nanmean(field[1:] * field[:-1])) / variance
+        return beside, below
+
+    def _middles(self, axis: int) -> Array:
+        index = np.indices(self.values.shape)[axis][np.isfinite(self.values)]
+        return self.offset[1 - axis] + index * self.side + (self.side - 1) / 2.0
+
+
+def to_blocks(image: NDArray[np.floating]) -> Blocks:
+    """Reduce an image to about `ACROSS` blocks along its longer side, each the mean of the middle half of its values.
+
+    Single dust grains, hot and dead pixels leave such a mean alone, and it is finer than the steps of grey values.
+    A block with an unknown pixel (NaN) is unknown. Pixels at the borders that fill no block are left out.
+    """
+    height, width = image.shape
+    side = max(1, round(max(height, width) / ACROSS))
+    rows, columns = height // side, width // side
+    left, top = (width - columns * side) // 2, (height - rows * side) // 2
+    values = np.empty((rows, columns))
+    n = side * side
+    low, high = n // 4, n - n // 4
+    for row in range(rows):
+        strip = np.asarray(image[top + row * side : top + (row + 1) * side, left : left + columns * side], float)
+        parts = strip.reshape(side, columns, side).transpose(1, 0, 2).reshape(columns, n)
+        known = np.isfinite(parts).all(axis=1)
+        values[row] = np.where(known, np.sort(parts, axis=1)[:, low:high].mean(axis=1), np.nan)
+    return Blocks((width, height), side, (left, top), values)
+
 
 #: Least part of what an unknown changes that no other one can do as well.
 SEPARABLE = 0.05

@@ -1,28 +1,20 @@
-"""Photon transfer: temporal variance against mean grey value gives gain, read noise and full well.
-
-Photons arrive independently, so the variance of electrons is their number, and with a gain K (grey values per electron)
-the variance in squared grey values grows as K times the mean (Janesick 2007, ch. 5; EMVA 1288 release 4 linear,
-section 2.4: σ²_y = σ²_read + K (μ_y − μ_bias)). Electrons of the dark current obey the same law, so dark frames lie on
-the same line.
-
-A response that bends, y = K e − a e², has the variance (K − 2 a e)² e = K y − 3 (a / K) y² + …: three times the bend of
-its mean. Where the levels show one, a parabola takes the place of the line, and K is its slope at black.
-"""
+"""Photon transfer: gain, linearity, saturation, EMVA 1288."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot, nan, sqrt
+from math import hypot, inf, isfinite, log10, nan, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import erfc
 
-from photoplan.adjustment.chances import chance_chi_square, chance_t
-from photoplan.adjustment.linear import solve
+from photoplan.adjustment.least_squares import solve, spread
+from photoplan.adjustment.statistics import chance_chi_square, chance_t
 from photoplan.errors import InputError
-from photoplan.quality.camera.frame_statistics import Level, check_level, cut_off
-from photoplan.quality.camera.straight_line import fit_line
+from photoplan.quality.camera.dark_signal import Level, check_level, cut_off
+from photoplan.quality.camera.straight_lines import fit_line
 
 #: Variance of rounding to whole grey values (Behr 1989, eq. 3.14); of other steps times their square.
 QUANTISATION = 1.0 / 12.0
@@ -334,3 +326,431 @@ def _full_well(levels: Sequence[Level], peak: int | None, curve: VarianceCurve) 
     # y = K e − a e² with a = −K · bend / 3, solved for e.
     electrons = signal / curve.slope * (1 - curve.bend * signal / (3 * curve.slope))
     return signal, sigma, electrons, electrons * hypot(sigma / signal, sqrt(curve.covariance[1][1]) / curve.slope)
+
+
+#: Parts of saturation between which levels count (EMVA 1288 release 4 linear).
+LOW, HIGH = 0.05, 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Linearity:
+    """Result for one series of levels."""
+
+    exposure: NDArray[np.float64]
+    """Of the levels, increasing, in the unit that was given (ms, photons …)."""
+    signal: NDArray[np.float64]
+    """Grey values above black."""
+    response: NDArray[np.float64]
+    """Signal over exposure."""
+    response_sigma: NDArray[np.float64]
+    segment: NDArray[np.float64]
+    """Slope between each level and the one before; NaN for the first."""
+    used: NDArray[np.bool_]
+    """Levels between 5 % and 95 % of saturation."""
+    offset: float
+    slope: float
+    """Line of least relative deviations."""
+    slope_sigma: float
+    deviation_percent: NDArray[np.float64]
+    """Relative deviation from the line, %."""
+    error_percent: float
+    """Linearity error: mean absolute deviation of the used levels."""
+    error_percent_sigma: float
+    """With what noise alone is expected to add to the error."""
+    error_min_percent: float
+    """Largest negative deviation of the used levels."""
+    error_max_percent: float
+
+
+def linearity(
+    exposure: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturation: float, usable: ArrayLike | None = None
+) -> Linearity:
+    """Linearity error and response of levels."""
+    order = np.argsort(np.asarray(exposure, float), kind="stable")
+    x, y, s = (np.asarray(v, float)[order] for v in (exposure, signal, sigma))
+    if x.size and (x[0] <= 0 or (np.diff(x) <= 0).any()):
+        raise InputError("exposures must be positive and differ from level to level")
+    used = (y >= LOW * saturation) & (y <= HIGH * saturation)
+    if usable is not None:
+        used &= np.asarray(usable, bool)[order]
+    _refuse_falling(x, y, s, HIGH * saturation)
+    if np.count_nonzero(used) < 3:
+        raise InputError(
+            f"{np.count_nonzero(used)} of {x.size} levels lie between 5 % and 95 % of saturation ({saturation:.4g} "
+            "DN); linearity needs 3"
+        )
+    u, v = x[used], y[used]
+    design = np.column_stack([1 / v, u / v])  # minimises the sum of ((y − a − b x) / y)²
+    fit = solve(design, np.ones_like(u))
+    offset, slope = fit.unknowns
+    fitted = offset + slope * x
+    deviation = 100 * (y - fitted) / fitted
+    error = float(np.abs(deviation[used]).mean())
+    relative = s[used] / v
+    error_sigma = _error_sigma(deviation[used], np.eye(u.size) - design @ fit.influence, 100 * relative)
+    with np.errstate(invalid="ignore"):
+        segment = np.concatenate([[np.nan], np.diff(y) / np.diff(x)])
+    return Linearity(
+        exposure=x,
+        signal=y,
+        response=y / x,
+        response_sigma=s / x,
+        segment=segment,
+        used=used,
+        offset=float(offset),
+        slope=float(slope),
+        slope_sigma=float(np.sqrt((fit.influence[1] ** 2) @ relative**2)),
+        deviation_percent=deviation,
+        error_percent=error,
+        error_percent_sigma=error_sigma,
+        error_min_percent=float(deviation[used].min()),
+        error_max_percent=float(deviation[used].max()),
+    )
+
+
+def _error_sigma(deviation: NDArray[np.float64], residual: NDArray[np.float64], sigma: NDArray[np.float64]) -> float:
+    """Standard deviation of a mean of absolute deviations, which share the noise of the line.
+
+    Noise alone makes an amount larger than 0, so what it is expected to add to each counts as well.
+    """
+    scatter = (np.sign(deviation) @ residual / deviation.size) * sigma
+    spread = np.maximum(np.sqrt(residual**2 @ sigma**2), 1e-12)
+    # What all deviations together have beyond twice the noise: less may be noise alone.
+    share = max(0.0, 1 - 2 * float(np.sum(spread**2)) / max(float(np.sum(deviation**2)), 1e-300))
+    true = np.abs(deviation) * np.sqrt(share)
+    # The mean of the amount of a Gaussian variable about `true`, less that.
+    added = spread * np.sqrt(2 / np.pi) * np.exp(-0.5 * (true / spread) ** 2) - true * erfc(true / spread / np.sqrt(2))
+    return float(np.hypot(np.sqrt(scatter @ scatter), added.mean()))
+
+
+def _refuse_falling(x: NDArray[np.float64], y: NDArray[np.float64], s: NDArray[np.float64], top: float) -> None:
+    """A signal that falls while the exposure grows is no series of exposures."""
+    noise = 5 * np.hypot(s[1:], s[:-1]) + 0.01 * np.maximum(np.abs(y[:-1]), 1.0)
+    falls = (np.diff(y) < -np.nan_to_num(noise)) & (y[:-1] < top)
+    if falls.any():
+        k = int(np.argmax(falls))
+        raise InputError(
+            f"the signal falls from {y[k]:.4g} to {y[k + 1]:.4g} DN while the exposure grows from {x[k]:g} to "
+            f"{x[k + 1]:g}; check the exposures of the frames, the lamp, and that automatic gain is off"
+        )
+
+
+#: Share of samples at the largest grey value from which on a level is clipped.
+_CLIPPED = 0.01
+#: Share at the last level from which on it shows saturation, not a bright spot.
+_MOSTLY = 0.5
+#: Standard deviations below the level of a full sensor down to which its samples lie.
+_SPREAD = 4.0
+#: Part of the response that is lost where a level departs from the line.
+_DEPARTED = 0.05
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """Where and why it saturates."""
+
+    level_dn: float
+    """Mean grey value of the most exposed level: what saturation looks like."""
+    rule: str
+    """``clipping``, ``response`` or ``variance``."""
+    last_unsaturated: float
+    """Largest exposure without the sign."""
+    first_saturated: float
+    exposure: float
+    """Exposure at which the line of the darker levels reaches `level_dn`; NaN if it lies not between the two."""
+    exposure_sigma: float
+
+
+@dataclass(frozen=True)
+class FullWell:
+    """A sensor that is full below the largest grey value that is written."""
+
+    level_dn: float
+    """Grey value of its full elements, their median."""
+    least_dn: float
+    """Grey value from which on a sample may be one of a full element."""
+
+
+def full_well(mean: ArrayLike, temporal_variance: float, step: float = 1.0) -> FullWell:
+    """Grey values of full elements, from frames in which most elements are full."""
+    values = np.asarray(mean, float)
+    level = float(np.median(values))
+    pattern = spread(values, level)
+    noise = sqrt(pattern**2 + (temporal_variance if isfinite(temporal_variance) else 0.0) + step**2 / 12)
+    return FullWell(level, level - _SPREAD * noise)
+
+
+def find_saturation(
+    exposure: ArrayLike, mean: ArrayLike, black: float, saturated_share: ArrayLike, variance: ArrayLike | None = None
+) -> Saturation | None:
+    """Saturation of levels with growing exposure; None where none of them shows a sign of it."""
+    x, y, share = (np.asarray(v, float) for v in (exposure, mean, saturated_share))
+    if x.size < 4 or (np.diff(x) <= 0).any():
+        raise InputError(f"{x.size} levels; saturation needs four of increasing exposure")
+    if not isfinite(black):
+        black = _black_of_line(x[: max(3, x.size // 2)], y[: max(3, x.size // 2)])
+    signal = y - black
+    found = {
+        "clipping": _first(share > _CLIPPED) if share[-1] >= _MOSTLY else None,
+        "response": _first_departure(x, signal),
+        "variance": None if variance is None else _first_collapse(np.asarray(variance, float)),
+    }
+    if found["clipping"] == 0:
+        raise InputError("every level has saturated samples; take shorter exposures")
+    known = {rule: k for rule, k in found.items() if k is not None and k > 0}
+    if not known:
+        return None
+    rule = min(known, key=lambda name: (known[name], list(known).index(name)))
+    first = known[rule]
+    level = float(y[-1])
+    response = float(np.median(signal[:first] / x[:first]))
+    # Of a median, whose variance is π / 2 times that of a mean.
+    spread = float(np.std(signal[:first] / x[:first])) * sqrt(pi / 2 / max(first - 1, 1))
+    at = (level - black) / response if response > 0 else inf
+    # Clipped shares begin before the mean arrives: the crossing may lie a little outside of the two levels.
+    inside = 0.8 * x[first - 1] <= at <= 1.2 * x[first]
+    sigma = at * spread / response if inside and first > 1 else nan
+    return Saturation(
+        level_dn=level,
+        rule=rule,
+        last_unsaturated=float(x[first - 1]),
+        first_saturated=float(x[first]),
+        exposure=at if inside else nan,
+        exposure_sigma=sigma,
+    )
+
+
+def _black_of_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    """Grey value at no exposure of the line of least relative deviations; not below 0, nor above the darkest level."""
+    below = np.maximum(y, 1e-300)
+    offset, _ = solve(np.column_stack([1 / below, x / below]), np.ones_like(x)).unknowns
+    return float(np.clip(offset, 0.0, max(0.0, float(y[0]))))
+
+
+def _first(signs: NDArray[np.bool_]) -> int | None:
+    """The first level from which on all show the sign."""
+    without = np.flatnonzero(~signs)
+    first = int(without[-1]) + 1 if without.size else 0
+    return first if first < signs.size else None
+
+
+def _first_departure(x: NDArray[np.float64], signal: NDArray[np.float64]) -> int | None:
+    """Level from which on the response stays below that of the darker ones, with a flat end."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        response = signal / x
+    reference = float(np.median(response[: max(2, x.size // 2)]))
+    first = _first(response < (1 - _DEPARTED) * reference)
+    if first is None or first == x.size:
+        return None
+    last_slope = (signal[-1] - signal[-2]) / (x[-1] - x[-2])
+    return first if last_slope < 0.1 * reference else None
+
+
+def _first_collapse(variance: NDArray[np.float64]) -> int | None:
+    """Level behind the largest variance, where the last is less than half of it."""
+    if not np.isfinite(variance).all():
+        return None
+    top = int(np.argmax(variance))
+    return top + 1 if top + 1 < variance.size and variance[-1] < 0.5 * variance[top] else None
+
+
+#: Part of the signal at saturation up to which levels count, by the standard.
+
+
+@dataclass(frozen=True, eq=False)
+class EmvaPoints:
+    """Levels of one measurement: bright and dark at the same exposure; arrays of shape (n,)."""
+
+    photons: NDArray[np.float64]
+    """Mean photons per pixel; NaN: unknown (then neither efficiency nor threshold)."""
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    dark_mean: NDArray[np.float64]
+    dark_variance: NDArray[np.float64]
+    samples: NDArray[np.float64]
+    """Degrees of freedom of each variance."""
+    mean_sigma: NDArray[np.float64]
+    """Standard deviation of the signal (mean less dark mean), the flicker of the lamp included."""
+
+    def __post_init__(self) -> None:
+        shapes = set()
+        for name in ("photons", "mean", "variance", "dark_mean", "dark_variance", "samples", "mean_sigma"):
+            array = np.array(getattr(self, name), np.float64)
+            array.setflags(write=False)
+            shapes.add(array.shape)
+            object.__setattr__(self, name, array)
+        if len(shapes) != 1 or self.mean.ndim != 1 or self.mean.size < 5:
+            raise InputError(f"{self.mean.size} levels; the EMVA 1288 sheet needs five, each with all of its figures")
+
+    def sorted(self) -> EmvaPoints:
+        """By growing signal."""
+        order = np.argsort(self.photons if np.isfinite(self.photons).all() else self.mean, kind="stable")
+        return EmvaPoints(*(getattr(self, name)[order] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True, eq=False)
+class EmvaSheet:
+    """The figures; NaN where `refused` says why."""
+
+    gain: float
+    """K, DN per electron."""
+    gain_sigma: float
+    responsivity: float
+    """R, DN per photon."""
+    responsivity_sigma: float
+    quantum_efficiency_percent: float
+    quantum_efficiency_percent_sigma: float
+    temporal_dark_noise_dn: float
+    temporal_dark_noise_e: float
+    temporal_dark_noise_e_sigma: float
+    saturation_photons: float
+    saturation_e: float
+    saturation_e_sigma: float
+    threshold_photons: float
+    """Absolute sensitivity threshold: photons at which signal and noise are equal."""
+    threshold_e: float
+    dynamic_range: float
+    dynamic_range_db: float
+    snr_max: float
+    snr_max_db: float
+    linearity: Linearity | None
+    saturation_index: int
+    """Level of the largest variance."""
+    used: NDArray[np.bool_]
+    """Levels between 0 and 70 % of saturation."""
+    refused: Mapping[str, str]
+
+
+def emva_sheet(points: EmvaPoints, step: float = 1.0) -> EmvaSheet:
+    """The sheet of a measurement, whose grey values have a distance of `step`."""
+    p = points.sorted()
+    refused: dict[str, str] = {}
+    signal, variance = p.mean - p.dark_mean, p.variance - p.dark_variance
+    top = int(np.argmax(p.variance))
+    reached = top + 1 < p.mean.size and p.variance[-1] < 0.5 * p.variance[top]
+    if not reached:
+        refused["saturation"] = (
+            "the variance does not fall at the brightest levels: saturation was not reached; take longer exposures"
+        )
+    used = (signal <= _RANGE * signal[top]) & (np.arange(signal.size) <= top)
+    if np.count_nonzero(used & (signal > 0)) < 3:
+        raise InputError("fewer than three levels lie between dark and 70 % of saturation")
+    weights = np.sqrt(2.0 / p.samples[used]) * np.hypot(p.variance[used], p.dark_variance[used])
+    gain, gain_sigma = _through_origin(signal[used], variance[used], weights)
+    if not gain > 3 * gain_sigma:
+        raise InputError("the variance does not grow with the signal; these are not raw frames of a linear sensor")
+    light = _responsivity(p, signal, used, refused)
+    efficiency = 100 * light[0] / gain
+    efficiency_sigma = efficiency * sqrt((light[1] / light[0]) ** 2 + (gain_sigma / gain) ** 2) if light[0] > 0 else nan
+    dark_dn, dark_e, dark_sigma = _dark_noise(p, (gain, gain_sigma), step, refused)
+    well = _saturation(p, signal, top if reached else None, gain, gain_sigma, light[0])
+    threshold_e = sqrt(p.dark_variance[0] / gain**2 + 0.25) + 0.5 if isfinite(dark_e) else nan
+    threshold = threshold_e / (light[0] / gain) if light[0] > 0 else nan
+    rng = well[0] / threshold if isfinite(well[0]) and isfinite(threshold) else _ratio(well[1], threshold_e)
+    snr = sqrt(well[1]) if isfinite(well[1]) else nan
+    return EmvaSheet(
+        gain=gain,
+        gain_sigma=gain_sigma,
+        responsivity=light[0],
+        responsivity_sigma=light[1],
+        quantum_efficiency_percent=efficiency,
+        quantum_efficiency_percent_sigma=efficiency_sigma,
+        temporal_dark_noise_dn=dark_dn,
+        temporal_dark_noise_e=dark_e,
+        temporal_dark_noise_e_sigma=dark_sigma,
+        saturation_photons=well[0],
+        saturation_e=well[1],
+        saturation_e_sigma=well[2],
+        threshold_photons=threshold,
+        threshold_e=threshold_e,
+        dynamic_range=rng,
+        dynamic_range_db=_db(rng),
+        snr_max=snr,
+        snr_max_db=_db(snr),
+        linearity=_linearity(p, signal, top if reached else None, refused),
+        saturation_index=top,
+        used=used,
+        refused=refused,
+    )
+
+
+def _ratio(a: float, b: float) -> float:
+    return a / b if isfinite(a) and b > 0 else nan
+
+
+def _db(ratio: float) -> float:
+    return 20 * log10(ratio) if isfinite(ratio) and ratio > 0 else nan
+
+
+def _through_origin(x: NDArray[np.float64], y: NDArray[np.float64], sigma: ArrayLike) -> tuple[float, float]:
+    """Slope of an unweighted line through the origin, and its sigma by propagation, or by the scatter where larger."""
+    slope = float(x @ y / (x @ x))
+    stated = float(np.sqrt(np.sum((x * np.asarray(sigma)) ** 2)) / (x @ x))
+    # Each residual by itself, since the noise may grow with x; enlarged by what the line took of it.
+    residual = (y - slope * x) / np.sqrt(np.maximum(1 - x**2 / (x @ x), 0.1))
+    scatter = float(np.sqrt(np.sum((x * residual) ** 2)) / (x @ x))
+    return slope, max(stated, scatter)
+
+
+def _responsivity(
+    p: EmvaPoints, signal: NDArray[np.float64], used: NDArray[np.bool_], refused: dict[str, str]
+) -> tuple[float, float]:
+    if not np.isfinite(p.photons).all() or not (p.photons > 0).all():
+        refused["quantum efficiency"] = (
+            "photons per pixel are not stated; give photons_per_pixel, or irradiance_uw_cm2 with wavelength_nm, "
+            "exposure_ms and camera.pixel_size_um"
+        )
+        return nan, nan
+    return _through_origin(p.photons[used], signal[used], p.mean_sigma[used])
+
+
+def _dark_noise(
+    p: EmvaPoints, gain_of: tuple[float, float], step: float, refused: dict[str, str]
+) -> tuple[float, float, float]:
+    """Of the shortest exposure: grey values, electrons, sigma."""
+    gain, gain_sigma = gain_of
+    least, rounding = LEAST_VARIANCE * step**2, QUANTISATION * step**2
+    variance = float(p.dark_variance[0])
+    if not isfinite(variance):
+        refused["dark noise"] = "there are no dark frames, two or more at an exposure"
+        return nan, nan, nan
+    if variance < least:
+        refused["dark noise"] = (
+            f"the dark variance is {variance:.3g} DN²; below {least:.3g} DN² rounding hides the noise, the "
+            f"standard states it as below {0.4 * step / gain:.3g} electrons"
+        )
+        return sqrt(variance), nan, nan
+    noise = sqrt(variance - rounding) / gain
+    relative = variance * sqrt(2.0 / p.samples[0]) / (2 * (variance - rounding))
+    return sqrt(variance), noise, noise * sqrt(relative**2 + (gain_sigma / gain) ** 2)
+
+
+def _saturation(
+    p: EmvaPoints, signal: NDArray[np.float64], top: int | None, gain: float, gain_sigma: float, responsivity: float
+) -> tuple[float, float, float]:
+    """Saturation capacity in photons and electrons, and the sigma of the latter by the spacing of the levels."""
+    if top is None:
+        return nan, nan, nan
+    gap = float(signal[min(top + 1, signal.size - 1)] - signal[max(top - 1, 0)]) / 2 / sqrt(3.0)
+    relative = sqrt((gap / signal[top]) ** 2 + (gain_sigma / gain) ** 2)
+    if isfinite(responsivity):
+        photons = float(p.photons[top])
+        electrons = photons * responsivity / gain
+        return photons, electrons, electrons * relative
+    electrons = float(signal[top]) / gain
+    return nan, electrons, electrons * relative
+
+
+def _linearity(
+    p: EmvaPoints, signal: NDArray[np.float64], top: int | None, refused: dict[str, str]
+) -> Linearity | None:
+    if not np.isfinite(p.photons).all():
+        refused["linearity error"] = "photons per pixel are not stated"
+        return None
+    limit = float(signal[top]) if top is not None else float(signal.max()) / 0.95
+    end = signal.size if top is None else top + 1
+    try:
+        return linearity(p.photons[:end], signal[:end], p.mean_sigma[:end], limit)
+    except InputError as error:
+        refused["linearity error"] = str(error)
+        return None

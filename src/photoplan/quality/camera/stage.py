@@ -9,11 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.adjustment.chances import chance_f, chance_gain
-from photoplan.adjustment.iterate import by_differences
-from photoplan.adjustment.linear import Fit, solve
-from photoplan.cameras.affine_facts import AffineFacts, affine_facts
-from photoplan.cameras.plane import Affine2D
+from photoplan.adjustment.least_squares import Fit, by_differences, solve
+from photoplan.adjustment.statistics import chance_f, chance_gain
+from photoplan.cameras.fiducials import Affine2D, AffineFacts, affine_facts
 from photoplan.errors import GeometryError, InputError
 
 Array = NDArray[np.float64]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from photoplan.errors import InputError
-from photoplan.quality.apertures import disc_transfer, pupil_transfer
 from photoplan.quality.formation.parts import Aperture, Spread
 from photoplan.quality.formation.shapes import disc_share
+from photoplan.quality.mtf_curve import disc_transfer, pupil_transfer
 
 _Array = NDArray[np.float64]
 _Transfer = Callable[[_Array, _Array], NDArray[Any]]

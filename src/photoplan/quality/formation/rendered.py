@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Rays
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.surfaces.base import Terrain
-from photoplan.surfaces.intersect import ray_paths
-from photoplan.surfaces.rays import Hits
+from photoplan.surfaces.base import Hits, Terrain
+from photoplan.surfaces.shifted import ray_paths
 
 _Array = NDArray[np.float64]
 #: Rays that are followed at once.

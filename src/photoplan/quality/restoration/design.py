@@ -1,22 +1,393 @@
-"""Which filter restores an image: the one of least expected error, or the exact inverse for whoever asks for it."""
+"""Design of restoration filters: apertures, noise, compression, inverse and regularised filters."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import pi, sqrt
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dctn
+from scipy.linalg import svdvals, toeplitz
 
 from photoplan.errors import InputError
-from photoplan.quality.mtf_curve import MtfCurve
-from photoplan.quality.restoration.filters import FilterKernel
-from photoplan.quality.restoration.inverse import Condition, condition_of, exact_inverse
-from photoplan.quality.restoration.regularised import Expectation, curve_transfer, sharpest
-from photoplan.quality.restoration.scene import SceneStatistics, Transfer
-from photoplan.quality.spread import GAUSSIAN_WIDTH, SpreadFunction
+from photoplan.quality.mtf_curve import GAUSSIAN_WIDTH, MtfCurve, SpreadFunction, disc_transfer
+from photoplan.quality.restoration.restorer import FilterKernel
+from photoplan.quality.restoration.scene import FOLDS, SceneStatistics, Transfer, block_spectra, frequency_grid
+
+#: Frequencies per axis over which the series of the inverse is summed.
+_GRID = 256
+#: Where less than this of a frequency is left, the aperture cannot be undone.
+LEAST_TRANSFER = 0.05
+
+
+def aperture_transfer(
+    shape: Literal["square", "round"], ratio: float, u: NDArray[np.float64], v: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Transfer function of an aperture."""
+    if shape == "square":
+        return np.asarray(np.sinc(ratio * u) * np.sinc(ratio * v))
+    return disc_transfer(ratio / 2.0, np.hypot(u, v))
+
+
+def aperture_filter(shape: Literal["square", "round"], ratio: float = 1.0, half: int = 4) -> NDArray[np.float64]:
+    """Filter that undoes an aperture: the Fourier series of the inverse transfer function up to 0.5 cycles per step.
+
+    With ratio 1 and nine values a side these are He's matrices; the square one is printed divided by its sum, the
+    round one before that.
+    """
+    if not 0.0 < ratio <= 10.0:
+        raise InputError(f"aperture by step {ratio:g}; allowed are numbers above 0 up to 10")
+    if not 1 <= half <= 50:
+        raise InputError(f"a filter of {half} pixels to each side; allowed are 1 to 50")
+    frequency = (np.arange(_GRID) + 0.5) / _GRID - 0.5
+    transfer = aperture_transfer(shape, ratio, frequency[None, :], frequency[:, None])
+    least = float(transfer.min())
+    if least < LEAST_TRANSFER:
+        raise InputError(
+            f"a {shape} aperture of {ratio:g} steps leaves {max(least, 0.0):.3f} of a frequency that the scan shows; "
+            "undoing it would amplify noise without bound. Use a regularised filter, or ratios up to "
+            f"{_largest_ratio(shape):.2f}"
+        )
+    waves = np.cos(2.0 * pi * np.outer(np.arange(-half, half + 1), frequency))
+    series = waves @ (1.0 / transfer) @ waves.T / _GRID**2
+    return np.asarray(series / series.sum())
+
+
+def _largest_ratio(shape: Literal["square", "round"]) -> float:
+    """The largest ratio, in hundredths, at which everything up to the corner of the frequency square is left."""
+    corner = np.array(0.5)
+    ratios = np.arange(1.0, 3.0, 0.01)
+    left = [float(aperture_transfer(shape, float(r), corner, corner)) for r in ratios]
+    return float(ratios[int(np.argmax(np.array(left) < LEAST_TRANSFER)) - 1])
+
+
+Array = NDArray[np.float64]
+
+#: Side of the blocks that are compressed, pixels.
+BLOCK = 8
+#: Steps that are tried, grey values.
+_STEPS = range(2, 121)
+#: Mean cosine of a coefficient's place between multiples of a step from which on the step is found; 1: on them all.
+_ON_STEPS = 0.5
+#: Share of the coefficients that are not rounded to zero, and number of them, that a step needs.
+_SEEN, _COUNT = 0.002, 8
+#: Share of the frequencies that must show steps, for the image to count as compressed.
+_COMPRESSED = 0.2
+#: Part of an image's power that coefficients must hold for it to be the scene's and not that of borders of blocks.
+_HELD = 0.3
+
+
+def kept_by_compression(pixels: Array) -> Array:
+    """Share of what an image shows at each frequency that is the scene, as compression by blocks has left it.
+
+    It is the slope of the scene on the rounded coefficients, for a Laplacian distribution of the coefficients (Lam and
+    Goodman 2000) by the share of them that are zero.
+    """
+    parts = pixels.reshape(pixels.shape[0], pixels.shape[1] // BLOCK, BLOCK, -1, BLOCK).swapaxes(2, 3)
+    coefficients = dctn(parts.reshape(-1, BLOCK, BLOCK), axes=(1, 2), norm="ortho").reshape(-1, BLOCK * BLOCK)
+    steps = np.array([0.0, *(_step(row) for row in coefficients.T[1:])])
+    if (steps > 0.0).mean() < _COMPRESSED:
+        return np.ones((BLOCK, BLOCK))
+    kept = np.array([_slope(row, step) for row, step in zip(coefficients.T, steps, strict=True)])
+    spectrum = np.mean([block_spectra(window).mean(axis=0) for window in pixels], axis=0)
+    at = np.arange(BLOCK) * spectrum.shape[0] // (2 * BLOCK)
+    seen = (spectrum[np.ix_(at, at)] + spectrum[np.ix_(-at, at)]) / 2.0
+    held = (coefficients**2).mean(axis=0).reshape(BLOCK, BLOCK) > _HELD * seen
+    # The window of the spectra spreads the mean over the lowest frequencies.
+    held[:2, :2] = True
+    return np.asarray(kept.reshape(BLOCK, BLOCK) * held)
+
+
+def at_frequencies(kept: Array, u: Array, v: Array) -> Array:
+    """What `kept_by_compression` found at frequencies up to 0.5 cycles per pixel; arrays that broadcast."""
+    at = np.arange(BLOCK) / (2.0 * BLOCK)
+    along, down = (np.stack([np.interp(np.abs(f), at, unit) for unit in np.eye(BLOCK)]) for f in (u, v))
+    return np.asarray(np.einsum("ij,i...,j...->...", kept, down, along))
+
+
+def _step(values: Array) -> float:
+    """Step of which coefficients are multiples; 0 if there is none."""
+    best, found = _ON_STEPS, 0.0
+    size = np.sort(np.abs(values))
+    for step in _STEPS:
+        beyond = size[np.searchsorted(size, step / 2.0) :]
+        if beyond.size < max(_COUNT, _SEEN * size.size):
+            break
+        on = float(np.cos(2.0 * np.pi * beyond / step).mean())
+        if on >= best:
+            best, found = on, float(step)
+    return found
+
+
+def _slope(values: Array, step: float) -> float:
+    """Slope of true on rounded coefficients; 1 where no step is known."""
+    size = np.abs(np.rint(values / step)) if step > 0.0 else np.zeros(1)
+    if not size.any():
+        return 1.0
+    rate = -2.0 * np.log(max(1.0 - float((size == 0.0).mean()), 1e-6))
+    if rate <= 0.0:
+        return 1.0
+    # The mean of a Laplacian distribution within a step lies so much nearer to 0 than its middle.
+    nearer = 0.5 / np.tanh(rate / 2.0) - 1.0 / rate
+    return float(1.0 - nearer * size.mean() / (size**2).mean())
+
+
+#: Side of the blocks, pixels.
+BLOCK_IMAGE_NOISE = 24
+#: Share of the blocks, the most even ones, that are taken to show noise alone.
+_EVEN = 0.1
+#: What the most even tenth of blocks of pure noise shows less than its standard deviation, found by simulation.
+_TOO_SMALL = 0.894
+
+
+def block_noise(grey: NDArray[np.float64], valid: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    """Standard deviation of the noise in each whole block of an image, if the scene is even there.
+
+    Differences of differences in both directions, [1 -2 1] times [1 -2 1], leave nothing of planes and of edges along
+    rows or columns; their root mean square, divided by 6, is the noise of a pixel.
+    """
+    rows, columns = (side // BLOCK_IMAGE_NOISE * BLOCK_IMAGE_NOISE for side in grey.shape)
+    if rows == 0 or columns == 0:
+        return np.empty(0)
+    blocks = _blocks(np.asarray(grey, np.float64)[:rows, :columns])
+    mixed = np.diff(np.diff(blocks, n=2, axis=1), n=2, axis=2)
+    noise = np.sqrt((mixed**2).mean(axis=(1, 2))) / 6.0
+    whole = np.isfinite(blocks).all(axis=(1, 2))
+    if valid is not None:
+        whole &= _blocks(valid[:rows, :columns]).all(axis=(1, 2))
+    return np.asarray(noise[whole])
+
+
+def image_noise(blocks: NDArray[np.float64]) -> float:
+    """Noise of an image from that of its blocks: what the most even ones show; NaN if there is none."""
+    seen = np.sort(blocks[blocks > 0.0])
+    if seen.size == 0:
+        return float("nan")
+    count = max(1, round(_EVEN * seen.size))
+    return float(seen[:count].mean() / _TOO_SMALL)
+
+
+def _blocks(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Shape (blocks, BLOCK, BLOCK)."""
+    rows, columns = pixels.shape
+    parts = pixels.reshape(
+        rows // BLOCK_IMAGE_NOISE, BLOCK_IMAGE_NOISE, columns // BLOCK_IMAGE_NOISE, BLOCK_IMAGE_NOISE
+    )
+    return parts.swapaxes(1, 2).reshape(-1, BLOCK_IMAGE_NOISE, BLOCK_IMAGE_NOISE)
+
+
+#: Rows of the band matrix: its borders do not reach the middle any more (Kölbl 2006, §3, takes 20).
+BAND_ROWS = 61
+#: Frequencies at which transfer functions are examined.
+_FREQUENCIES = np.linspace(0.0, 0.5, 1001)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Whether a spread function can be inverted exactly."""
+
+    neighbour_ratio: float
+    """A / Z; exact restoration needs less than 1/2: two objects one pixel apart do not fuse (Kölbl 2006, §2)."""
+    least_transfer: float
+    """Smallest modulus of the transfer function up to 0.5 cycles/pixel; 0: a frequency is lost."""
+    at_frequency: float
+    """Where it is, cycles per pixel."""
+    smallest_singular: float
+    """Smallest singular value of the band matrix."""
+    largest_singular: float
+    """Largest singular value of the band matrix."""
+
+    @property
+    def number(self) -> float:
+        """Condition number of the band matrix: largest by smallest singular value."""
+        return self.largest_singular / self.smallest_singular if self.smallest_singular > 0.0 else float("inf")
+
+    @property
+    def holds(self) -> bool:
+        """Whether the exact inverse exists and means something."""
+        return self.neighbour_ratio < 0.5 and self.least_transfer > 1e-6 and self.number < 1e6
+
+    def __str__(self) -> str:
+        verdict = "holds" if self.holds else "does not hold"
+        return (
+            f"A/Z = {self.neighbour_ratio:.3f} (limit 0.5), singular values {self.smallest_singular:.3f} to "
+            f"{self.largest_singular:.3f}, least transfer {self.least_transfer:.3f} at {self.at_frequency:.2f} "
+            f"cycles/px: the condition {verdict}"
+        )
+
+
+def band_matrix(spread: SpreadFunction, rows: int = BAND_ROWS) -> NDArray[np.float64]:
+    """Band matrix that makes image values of object values, shape (rows, rows) (Kölbl 2006, eq. 2)."""
+    half = spread.half
+    down, right = np.zeros(rows), np.zeros(rows)
+    count = min(half + 1, rows)
+    # Image i = sum over objects j of values[half + i - j]: below the diagonal the light that moved onwards.
+    down[:count] = spread.values[half : half + count]
+    right[:count] = spread.values[half::-1][:count]
+    return np.asarray(toeplitz(down, right))
+
+
+def condition_of(spread: SpreadFunction) -> Condition:
+    """Condition of the exact inverse."""
+    side = spread.side()
+    transfer = np.abs(spread.transfer(_FREQUENCIES))
+    least = int(np.argmin(transfer))
+    singular = svdvals(band_matrix(spread))
+    return Condition(
+        neighbour_ratio=float(side[1] / side[0])
+        if side.size > 1 and side[0] > 0.0
+        else float("inf" if side[0] <= 0.0 else 0.0),
+        least_transfer=float(transfer[least]),
+        at_frequency=float(_FREQUENCIES[least]),
+        smallest_singular=float(singular[-1]),
+        largest_singular=float(singular[0]),
+    )
+
+
+def exact_inverse(spread: SpreadFunction, half: int = 5, rows: int = BAND_ROWS) -> NDArray[np.float64]:
+    """The one-dimensional filter that undoes a spread function: the middle row of the inverse band matrix (eq. 3).
+
+    Parameters
+    ----------
+    half : int
+        How many values of the row are kept to each side.
+    rows : int
+        Size of the band matrix, odd.
+
+    Returns
+    -------
+    ndarray, shape (2 half + 1,)
+        Not divided by its sum: what is cut off on both sides is missing in it.
+
+    Raises
+    ------
+    InputError
+        The band matrix has no inverse.
+    """
+    if rows % 2 == 0 or rows < 2 * half + 1:
+        raise InputError(f"the band matrix has an odd number of rows, at least {2 * half + 1}; given: {rows}")
+    try:
+        inverse = np.linalg.inv(band_matrix(spread, rows))
+    except np.linalg.LinAlgError:
+        raise InputError("the band matrix of the spread function has no inverse: a frequency is lost") from None
+    middle = rows // 2
+    # A row of the inverse is read along the objects that give to it; as a filter it is turned round.
+    return np.asarray(inverse[middle, middle - half : middle + half + 1][::-1].copy())
+
+
+def curve_transfer(x: MtfCurve, y: MtfCurve) -> Transfer:
+    """Transfer function of two MTF curves; between the axes it goes over with the squared cosine of the direction.
+
+    Beyond the last frequency of a curve it is 0. Curves without standard deviations count as known.
+    """
+
+    def transfer(u: Array, v: Array) -> tuple[Array, Array]:
+        square = u**2 + v**2
+        frequency = np.sqrt(square)
+        share = np.where(square > 0.0, u**2 / np.where(square > 0.0, square, 1.0), 0.5)
+        along = [
+            [
+                np.zeros_like(frequency) if values is None else np.interp(frequency, curve.frequency, values, right=0.0)
+                for values in (curve.modulation, curve.sigma)
+            ]
+            for curve in (x, y)
+        ]
+        modulation, sigma = (share * one + (1.0 - share) * other for one, other in zip(*along, strict=True))
+        return modulation, sigma
+
+    return transfer
+
+
+def sharpest(transfer: Transfer, sigmas: float = 1.96) -> Transfer:
+    """The sharpest that a transfer function may be, by so many standard deviations; it counts as known."""
+
+    def known(u: Array, v: Array) -> tuple[Array, Array]:
+        modulation, sigma = transfer(u, v)
+        # A sharpened image has modulations above 1.
+        return np.maximum(modulation, np.minimum(modulation + sigmas * sigma, 1.0)), np.zeros_like(sigma)
+
+    return known
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Expected square errors of the filters of an image; all over one frequency square, what folds back included."""
+
+    seen: Array
+    """Power of the image, noise included."""
+    cross: Array
+    """Cross power of the image with the ideal one."""
+    ideal: Array
+    """Power of the ideal image."""
+
+    @classmethod
+    def of(
+        cls, transfer: Transfer, scene: SceneStatistics, aperture: float = 1.0, kept: Array | None = None
+    ) -> Expectation:
+        """What is expected of an image."""
+        u, v = frequency_grid()
+        power, (modulation, sigma) = scene.power(u, v), transfer(u, v)
+        ideal = np.sinc(aperture * u) * np.sinc(aperture * v)
+        seen = ((modulation**2 + sigma**2) * power).sum(axis=0)
+        seen += scene.noise_power(u[0] + FOLDS, v[0] + FOLDS)
+        cross = (modulation * ideal * power).sum(axis=0)
+        if kept is not None:
+            cross = cross * at_frequencies(kept, u[0] + FOLDS, v[0] + FOLDS)
+        return cls(seen, cross, (ideal**2 * power).sum(axis=0))
+
+    @classmethod
+    def mean(cls, each: Sequence[Expectation]) -> Expectation:
+        """Mean of expectations, each of them in units of the error that the image has as it is."""
+        shares = [1.0 / (len(each) * max(one.error(np.ones((1, 1))), 1e-300) ** 2) for one in each]
+        names = ("seen", "cross", "ideal")
+        return cls(*(sum(s * getattr(one, name) for s, one in zip(shares, each, strict=True)) for name in names))
+
+    def gain(self, kernel: Array) -> float:
+        """Expected error after a filter by that of the image as it is."""
+        return self.error(kernel) / max(self.error(np.ones((1, 1))), 1e-300)
+
+    def error(self, kernel: Array) -> float:
+        """Expected root mean square difference to the ideal image after a filter, in the light of the scene."""
+        base = frequency_grid()[0][0, 0]
+        left, right = (
+            np.exp(-2j * pi * np.outer(base, np.arange(side) - side // 2)) for side in np.asarray(kernel).shape
+        )
+        response = left @ kernel @ right.T
+        square = (np.abs(response) ** 2 * self.seen - 2.0 * response.real * self.cross + self.ideal).mean()
+        return sqrt(max(float(square), 0.0))
+
+    def best(self, half: tuple[int, int]) -> Array:
+        """Kernel of least expected error, symmetric in x and in y, sum 1."""
+        # A quadrant of the kernel is unknown; its waves are products of one per axis.
+        down, right = (_waves(frequency_grid()[0][0, 0], reach) for reach in half)
+        count = self.seen.size
+        basis = (down[:, None, :, None] * right[None, :, None, :]).reshape(count, -1)
+        normal = basis.T @ (basis * self.seen.reshape(-1, 1)) / count
+        at_zero = np.multiply.outer(*(np.where(np.arange(reach + 1) > 0, 2.0, 1.0) for reach in half)).ravel()
+        quadrant = _with_sum_one(normal, basis.T @ self.cross.ravel() / count, at_zero)
+        quadrant = quadrant.reshape(half[0] + 1, half[1] + 1)
+        rows = np.concatenate([quadrant[:0:-1], quadrant])
+        return np.concatenate([rows[:, :0:-1], rows], axis=1)
+
+
+def _waves(frequency: Array, half: int) -> Array:
+    """Real waves of the values 0 to half to both sides of a symmetric kernel, shape (frequencies, half + 1)."""
+    waves = np.cos(2.0 * pi * np.outer(frequency, np.arange(half + 1)))
+    waves[:, 1:] *= 2.0
+    return np.asarray(waves)
+
+
+def _with_sum_one(normal: Array, right: Array, at_zero: Array) -> Array:
+    """Least squares under the condition that the kernel's sum is 1, so that brightness stays."""
+    count = right.size
+    # Without noise some kernels cost nothing; a trace of noise keeps the equations solvable and changes no figure.
+    bordered = np.zeros((count + 1, count + 1))
+    bordered[:count, :count] = normal + np.eye(count) * 1e-9 * np.trace(normal) / count
+    bordered[:count, count] = bordered[count, :count] = at_zero
+    return np.asarray(np.linalg.solve(bordered, np.append(right, 1.0))[:count])
 
 
 def radial_filter(

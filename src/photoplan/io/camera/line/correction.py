@@ -13,7 +13,7 @@ from photoplan.cameras.line_correction import LineCorrection, PoseErrors, TrackS
 from photoplan.errors import InputError
 from photoplan.io.camera.line.model import MAX_BYTES
 from photoplan.io.camera.model import Entry, Number, Positive, Triple
-from photoplan.io.plain_files import read_entries
+from photoplan.io.files import read_entries
 
 _Floats = NDArray[np.float64]
 _Row = tuple[Number, Number, Number, Number, Number, Number]

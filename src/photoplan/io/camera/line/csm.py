@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.line_track import LineTrack
+from photoplan.cameras.pushbroom_rays import LineTrack
 from photoplan.errors import InputError
-from photoplan.geometry.motion import EvenTable, between, conjugate, continuous, cubic, rotations, times
+from photoplan.geometry.pose import EvenTable, between, conjugate, continuous, cubic, rotations, times
 from photoplan.io.camera.isd import FORM, FRAME_MODEL, Isd
 from photoplan.io.camera.line.csm_lens import look
 from photoplan.io.camera.line.model import StatedLine

@@ -16,8 +16,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.line_bend import LineBend
-from photoplan.cameras.line_look import LineLook
+from photoplan.cameras.pushbroom_rays import LineBend, LineLook
 from photoplan.errors import InputError
 from photoplan.io.camera.isd import Isd
 from photoplan.io.camera.isd_lens import LENSES, lens_of, not_known

@@ -11,7 +11,7 @@ from numpy.polynomial import Chebyshev, polynomial
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from photoplan.cameras.line_look import LineLook
+from photoplan.cameras.pushbroom_rays import LineLook
 from photoplan.errors import InputError
 from photoplan.io.camera.line.number_table import read_numbers
 from photoplan.io.camera.model import Entry, Number, Pixels, Positive

@@ -17,11 +17,10 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
-from photoplan.cameras.line_look import LineLook
-from photoplan.cameras.line_track import LineTrack
+from photoplan.cameras.pushbroom_rays import LineLook, LineTrack
 from photoplan.errors import InputError
-from photoplan.geometry.body import EARTH_RADII
-from photoplan.geometry.motion import EvenTable, odd_step
+from photoplan.geometry.local import EARTH_RADII
+from photoplan.geometry.pose import EvenTable, odd_step
 from photoplan.io.camera.line.model import StatedLine
 
 _Floats = NDArray[np.float64]

@@ -6,11 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.io.appearance import looks_like
 from photoplan.io.camera.line import csm, dimap, strip
 from photoplan.io.camera.line.model import MAX_BYTES, StatedLine
-from photoplan.io.markup_files import read_xml
-from photoplan.io.plain_files import read_json
+from photoplan.io.files import looks_like, read_json, read_xml
 
 
 def _isd(path: Path) -> StatedLine:

@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from photoplan.cameras.line import LineCamera
-from photoplan.cameras.line_chips import ChippedLine
-from photoplan.cameras.line_look import LineLook
-from photoplan.cameras.line_track import LineTrack
-from photoplan.geometry.body import BodyGround
+from photoplan.cameras.pushbroom import ChippedLine, LineCamera
+from photoplan.cameras.pushbroom_rays import LineLook, LineTrack
+from photoplan.geometry.local import BodyGround
 
 #: Nothing that holds a trajectory and what belongs to an image is larger.
 MAX_BYTES = 200_000_000

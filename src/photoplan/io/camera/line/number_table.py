@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.plain_files import read_text
+from photoplan.io.files import read_text
 
 
 def read_numbers(path: Path, columns: str, max_bytes: int) -> NDArray[np.float64]:

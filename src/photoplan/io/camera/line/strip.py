@@ -15,17 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from photoplan.cameras.line_track import LineTrack
+from photoplan.cameras.pushbroom_rays import LineTrack
 from photoplan.errors import HeightSystemError, InputError
-from photoplan.geometry.body import EARTH_RADII, BodyGround
 from photoplan.geometry.bounds import odd_angles, odd_place
-from photoplan.geometry.motion import continuous, cubic, odd_step, quaternions
-from photoplan.geometry.rotation import ANGLE_UNITS, rotation_from_angles, rotation_opk
+from photoplan.geometry.local import EARTH_RADII, BodyGround
+from photoplan.geometry.pose import (
+    ANGLE_UNITS,
+    continuous,
+    cubic,
+    odd_step,
+    quaternions,
+    rotation_from_angles,
+    rotation_opk,
+)
 from photoplan.io.camera.line.detectors import StripDetectors, looks_of
 from photoplan.io.camera.line.model import MAX_BYTES, StatedLine
 from photoplan.io.camera.line.number_table import read_numbers
 from photoplan.io.camera.model import Entry, Name, Number, Pixels, Positive
-from photoplan.io.plain_files import read_entries, read_head
+from photoplan.io.files import read_entries, read_head
 
 _Floats = NDArray[np.float64]
 FORM = "aerial strip (photoplan)"

@@ -8,11 +8,9 @@ from pathlib import Path
 
 from photoplan.cameras.rpc import RationalFunctions
 from photoplan.errors import InputError
-from photoplan.io.appearance import looks_like
 from photoplan.io.camera.rpc import digitalglobe, dimap, geom, rpb, tags, text
 from photoplan.io.camera.rpc.model import MAX_BYTES, StatedRpc
-from photoplan.io.markup_files import read_xml
-from photoplan.io.plain_files import read_head
+from photoplan.io.files import looks_like, read_head, read_xml
 
 #: Kinds of XML documents.
 _DOCUMENTS = (digitalglobe, dimap)

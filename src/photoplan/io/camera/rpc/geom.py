@@ -12,7 +12,7 @@ from pathlib import Path
 from photoplan.cameras.rpc import RationalFunctions
 from photoplan.errors import InputError
 from photoplan.io.camera.rpc.model import GROUPS, MAX_BYTES, SINGLE, stated
-from photoplan.io.plain_files import read_text
+from photoplan.io.files import read_text
 
 FORM = "OSSIM keyword list (.geom)"
 #: Place in RPC00A of every term of RPC00B.

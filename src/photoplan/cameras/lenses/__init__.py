@@ -1,1 +1,0 @@
-"""Lenses: how a real lens deviates from central projection, one kind per file."""

@@ -1,1 +1,0 @@
-"""Objects on the terrain: houses, bridges, trees; one format per file."""

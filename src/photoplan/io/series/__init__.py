@@ -1,1 +1,0 @@
-"""The file that describes a series of frames, and its frames."""

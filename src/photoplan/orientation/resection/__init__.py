@@ -1,1 +1,0 @@
-"""Space resection of single images."""

@@ -1,1 +1,0 @@
-"""Orientation from nothing: relative orientation, models that grow, similarity."""

@@ -1,1 +1,0 @@
-"""`balance`: tables by which the images of a project agree in colour."""

@@ -1,1 +1,0 @@
-"""Control points from an old orthophoto and a height model."""

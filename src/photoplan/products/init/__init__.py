@@ -1,1 +1,0 @@
-"""A project file from the files that users have."""

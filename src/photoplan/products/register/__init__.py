@@ -1,1 +1,0 @@
-"""Registration of two images against each other."""

@@ -1,0 +1,984 @@
+"""Restoration of images: filters, design, and execution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan import __version__
+from photoplan.engine.executors import threads
+from photoplan.engine.run import Kept, Made, Runner, Tally, Work, tiles_in_flight
+from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.geometry.grid import Window
+from photoplan.io.disk import make_folder, make_parents
+from photoplan.io.files import fingerprint, unique_stems
+from photoplan.io.product import ProductFacts, ProductFile, check_output
+from photoplan.io.quality_files import filter_text
+from photoplan.io.quicklook import write_quicklook
+from photoplan.io.raster import RasterReader
+from photoplan.io.raster_info import ImageForm, form_of, placement_of
+from photoplan.io.storage import COMPRESSIONS, Nodata
+from photoplan.io.store import (
+    input_entry,
+    record_path,
+    recorded_result,
+    run_key,
+    run_times,
+    standing,
+    tidy,
+    together,
+    write_run_record,
+)
+from photoplan.plain import pick
+from photoplan.plan.footprint import Tile, Tiles
+from photoplan.products.chromatic import load_chromatic, measured_once, model_figures, save_chromatic
+from photoplan.products.mtf.edges import LightImage, MtfRequest, measure_mtf
+from photoplan.products.mtf.result import ImageMtf, MtfReport
+from photoplan.project.align import AlignStep
+from photoplan.project.steps import (
+    PART,
+    FallOffFile,
+    FallOffStep,
+    SteppedReader,
+    entries_of,
+    kept_nodata,
+    linearisation_of,
+    load_fall_off,
+    load_filter,
+    read_counted,
+    restoration_of,
+    restored,
+    save_filter,
+)
+from photoplan.quality.colour import ChromaticModel
+from photoplan.quality.edges.groups import LEAST_EDGES, sharpness_of
+from photoplan.quality.edges.response import EdgeMeasurement
+from photoplan.quality.linearise import Linearisation
+from photoplan.quality.restoration.design import (
+    BLOCK,
+    Design,
+    DesignOptions,
+    Sharpness,
+    aperture_filter,
+    block_noise,
+    curve_transfer,
+    design_filter,
+    image_noise,
+    kept_by_compression,
+)
+from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
+from photoplan.quality.restoration.scene import SceneStatistics, block_spectra, scenes_of
+
+#: Windows of an image in which its contrast is looked for, in each direction, and their side.
+_WINDOWS = 5
+_SIDE = 256
+#: Share of the blocks of an image that must hold no saturated pixel, for the noise to be looked for in these alone.
+_CLEAN = 0.1
+
+
+@dataclass(frozen=True)
+class DesignRequest:
+    """What is asked."""
+
+    images: tuple[Path, ...]
+    linearisation: str | None = None
+    """``linear``, ``srgb`` or a file with a table: the light that the filter holds for; None: linear, with a warning
+    for images of 8 bits."""
+    per_band: bool = False
+    """A filter for each band instead of one for all, from the luminance."""
+    cells: int = 1
+    """Parts of the field in each direction that get filters of their own, where they have edges enough."""
+    most_edges: int = 200
+    """Edges of an image that are measured."""
+    least_length: float | None = None
+    """Of an edge, pixels; None: 20."""
+    noise: float | None = None
+    """Standard deviation of the white noise in the images' light; None: found in them."""
+    options: DesignOptions = field(default_factory=DesignOptions)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.cells <= 15:
+            raise UsageError(f"a field of {self.cells} × {self.cells} parts; allowed are 1 to 15")
+        if self.noise is not None and not 0.0 <= self.noise < float("inf"):
+            raise UsageError(f"`noise` {self.noise:g}; it is a standard deviation in light, 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class DesignedPart:
+    """The filter of one band in one part of the field."""
+
+    band: int | None
+    """None: all bands."""
+    at: tuple[float, float] | None
+    """Column and row of the middle of the part; None: the whole field."""
+    edges: int
+    """Edges it was measured with."""
+    sharpness: tuple[Sharpness, Sharpness]
+    """Along rows and along columns."""
+    missing: tuple[str, ...]
+    """``x`` or ``y`` where no edges show the sharpness along rows or columns and that of the other stands for it."""
+    scenes: tuple[SceneStatistics, ...]
+    """What the images may show: more than one where noise and texture are not told apart."""
+    design: Design
+
+    @property
+    def scene(self) -> SceneStatistics:
+        """What the filter is judged by."""
+        return self.design.scene or self.scenes[0]
+
+    def facts(self) -> dict[str, Any]:
+        """Figures for the filter's file."""
+        return {
+            "band": self.band,
+            "at": None if self.at is None else list(self.at),
+            "edges": self.edges,
+            "noise": self.scene.noise,
+            "contrast": self.scene.contrast,
+            "exponent": round(self.scene.exponent, 3),
+            "noise_smoothed": round(self.scene.smoothed, 3),
+            "texture": self.scene.texture,
+            "mtf50_x": round(self.sharpness[0].modulation().mtf50, 4),
+            "mtf50_y": round(self.sharpness[1].modulation().mtf50, 4),
+            "spread_x": [round(float(v), 5) for v in self.sharpness[0].spread.side()],
+            "spread_y": [round(float(v), 5) for v in self.sharpness[1].spread.side()],
+            "condition_x": str(self.design.condition_x),
+            "condition_y": str(self.design.condition_y),
+            "noise_gain": round(self.design.noise_gain, 3),
+            "method": self.design.method,
+            "expected_error": {method: float(f"{error:.4g}") for method, error in self.design.expected.items()},
+            "rule": self.design.reason,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredFilter:
+    """A filter and what it was measured with."""
+
+    filter: RestorationFilter
+    parts: tuple[DesignedPart, ...]
+    mtf: MtfReport
+    notes: tuple[str, ...]
+    """What a user should know: edge enhancement, parts of the field without edges."""
+
+
+def design_restoration(request: DesignRequest, events: Events = SILENT) -> MeasuredFilter:
+    """Measure the sharpness of images at their edges, all together, and design the filter that restores them.
+
+    Raises
+    ------
+    UsageError
+        Images of different size or bands: they cannot have one filter.
+    InputError
+        No image can be used, the edges are too few, or an exact inverse is asked for that does not exist.
+    """
+    band = "all" if request.per_band else None
+    asked = MtfRequest(
+        request.images,
+        linearisation=request.linearisation,
+        band=band,
+        most_edges=request.most_edges,
+        least_length=request.least_length,
+        grid=1,
+    )
+    mtf = measure_mtf(asked, events)
+    if not mtf.images:
+        raise InputError("no image can be measured: " + "; ".join(mtf.failed.values()))
+    size = _common_size(mtf.images)
+    light = linearisation_of(request.linearisation or "linear")
+    opened = [LightImage.open(image.file, light) for image in mtf.images]
+    parts: list[DesignedPart] = []
+    notes = [f"not measured: {why}" for why in mtf.failed.values()]
+    for channel in _channels(mtf.images, request.per_band):
+        scene = _spectrum(opened, channel)
+        edges = [e.measured for image in mtf.images for e in image.edges if e.channel == channel]
+        parts += _parts(request, channel if request.per_band else None, size, edges, scene, notes)
+    if mtf.enhancement is not None and mtf.enhancement.enhanced:
+        notes.append(mtf.enhancement.warning)
+    return MeasuredFilter(_filter(request, parts, size), tuple(parts), mtf, tuple(notes))
+
+
+def _common_size(images: Sequence[ImageMtf]) -> tuple[int, int]:
+    sizes = {image.size for image in images}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{w} × {h}" for w, h in sorted(sizes))
+        raise UsageError(
+            f"the images are of different size ({listed}); measure a filter for those of each camera alone"
+        )
+    return sizes.pop()
+
+
+def _channels(images: Sequence[ImageMtf], per_band: bool) -> list[int]:
+    """Channels that get a filter of their own."""
+    channels = sorted({edge.channel for image in images for edge in image.edges})
+    return [c for c in channels if c > 0] if per_band else channels[:1]
+
+
+def _parts(
+    request: DesignRequest,
+    band: int | None,
+    size: tuple[int, int],
+    edges: Sequence[EdgeMeasurement],
+    scene: SceneSpectrum,
+    notes: list[str],
+) -> list[DesignedPart]:
+    """The filters of a band: for the whole field, or for each part of it that has edges enough."""
+    whole = _designed(request, band, None, edges, scene)
+    for axis in whole.missing:
+        lacking, other = ("rows", "columns") if axis == "x" else ("columns", "rows")
+        notes.append(f"too few edges show the sharpness along {lacking}; that along {other} stands for it")
+    if request.cells == 1:
+        return [whole]
+    n, found = request.cells, []
+    poor = 0
+    for row in range(n):
+        for col in range(n):
+            at = ((col + 0.5) * size[0] / n - 0.5, (row + 0.5) * size[1] / n - 0.5)
+            here = [edge for edge in edges if _cell(edge, size, n) == (col, row)]
+            part = _designed(request, band, at, here, scene, whole)
+            poor += part.edges == 0
+            found.append(part)
+    if poor:
+        name = "" if band is None else f"band {band}: "
+        notes.append(
+            f"{name}{poor} of {n * n} parts of the field have fewer than {LEAST_EDGES} edges along rows and along "
+            "columns; they get the filter of the whole field"
+        )
+    return found
+
+
+def _cell(edge: EdgeMeasurement, size: tuple[int, int], n: int) -> tuple[int, int]:
+    """Column and row of the part of the field that an edge lies in."""
+    return int((edge.col + 0.5) * n / size[0]), int((edge.row + 0.5) * n / size[1])
+
+
+def _designed(
+    request: DesignRequest,
+    band: int | None,
+    at: tuple[float, float] | None,
+    edges: Sequence[EdgeMeasurement],
+    spectrum: SceneSpectrum,
+    whole: DesignedPart | None = None,
+) -> DesignedPart:
+    """The filter of edges; what a part of the field does not show is taken from the whole."""
+    try:
+        x, y, missing = sharpness_of(edges)
+    except InputError:
+        if whole is None:
+            raise
+        return replace(whole, band=band, at=at, edges=0)
+    if whole is not None:
+        x = whole.sharpness[0] if "x" in missing or x.doubt else x
+        y = whole.sharpness[1] if "y" in missing or y.doubt else y
+    transfer = curve_transfer(x.modulation(), y.modulation())
+    scenes = whole.scenes if whole is not None else scenes_of(spectrum.power, transfer, spectrum.noise, request.noise)
+    design = design_filter(x, y, scenes, request.options, spectrum.kept)
+    return DesignedPart(
+        band=band, at=at, edges=len(edges), sharpness=(x, y), missing=missing, scenes=scenes, design=design
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSpectrum:
+    """What images show of their scenes, in their light."""
+
+    power: NDArray[np.float64]
+    """Mean spectrum of their blocks."""
+    noise: float
+    """Standard deviation in the most even blocks; 0 if there is none."""
+    kept: NDArray[np.float64]
+    """What compression has left of them, shape (8, 8)."""
+
+
+def _spectrum(images: Sequence[LightImage], channel: int) -> SceneSpectrum:
+    """Spectrum and noise of images, from windows over the whole of them, in their light."""
+    noises: list[list[NDArray[np.float64]]] = [[], []]
+    # All blocks, and those without a saturated pixel: number of them, sum of their spectra.
+    sums: list[list[Any]] = [[0, 0.0], [0, 0.0]]
+    for image in images:
+        for window in _windows(image.size):
+            picture = image.picture(window, channel)
+            grey = picture.grey.astype(np.float64)
+            if picture.valid is not None:
+                grey[~picture.valid] = np.nan
+            usable = [None, None if picture.saturated is None else ~picture.saturated]
+            for mask, blocks, total in zip(usable, noises, sums, strict=True):
+                blocks.append(block_noise(grey, mask))
+                spectra = block_spectra(grey, mask)
+                total[0] += len(spectra)
+                total[1] = total[1] + spectra.sum(axis=0)
+    every, whole = (np.concatenate(blocks) for blocks in noises)
+    # A full sky seems to have no noise, and its few pixels below the end seem to be all of it.
+    noise = image_noise(whole if whole.size >= _CLEAN * every.size else every)
+    count, total = sums[1] if sums[1][0] >= _CLEAN * sums[0][0] else sums[0]
+    if count == 0 or not total.any():
+        raise InputError("the images have no contrast")
+    kept = np.mean([_kept(image, channel) for image in images], axis=0)
+    return SceneSpectrum(total / count, noise if np.isfinite(noise) else 0.0, kept)
+
+
+def _kept(image: LightImage, channel: int) -> NDArray[np.float64]:
+    """What compression has left of an image."""
+    size = image.size[0] // BLOCK * BLOCK, image.size[1] // BLOCK * BLOCK
+    if image.reader.dtype != np.uint8 or 0 in size:
+        return np.ones((BLOCK, BLOCK))
+    at = [replace(w, col=w.col // BLOCK * BLOCK, row=w.row // BLOCK * BLOCK) for w in _windows(size)]
+    return kept_by_compression(np.array([image.stored(window, channel) for window in at]))
+
+
+def _windows(size: tuple[int, int]) -> list[Window]:
+    """Windows spread over an image."""
+    side = min(_SIDE, size[0]), min(_SIDE, size[1])
+    places = [
+        (round(j * (size[0] - side[0]) / (_WINDOWS - 1)), round(i * (size[1] - side[1]) / (_WINDOWS - 1)))
+        for i in range(_WINDOWS)
+        for j in range(_WINDOWS)
+    ]
+    return [Window(*place, *side) for place in sorted(set(places))]
+
+
+def _where(part: DesignedPart, parts: Sequence[DesignedPart]) -> str:
+    """Which of several parts is spoken of, and how many are restored how; empty for a single one."""
+    if len(parts) == 1:
+        return ""
+    methods = [one.design.method for one in parts]
+    counted = ", ".join(f"{methods.count(each)} {each}" for each in ("exact", "regularised", "none") if each in methods)
+    band = [] if part.band is None else [f"band {part.band}"]
+    place = [] if part.at is None else [f"at column {part.at[0]:.0f}, row {part.at[1]:.0f}"]
+    which = " ".join(band + place)
+    return f"of {len(parts)} parts {counted}; the noisiest, {which}: "
+
+
+def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[int, int]) -> RestorationFilter:
+    kernels = tuple(FilterKernel(part.design.kernel, part.at, part.band) for part in parts)
+    # Of several parts the one that restoration costs most tells of the condition.
+    worst = max(parts, key=lambda part: part.design.noise_gain)
+    names = ", ".join(path.name for path in request.images[:3])
+    more = f" and {len(request.images) - 3} more" if len(request.images) > 3 else ""
+    scale = ", full scale 1" if request.linearisation in (None, "linear", "srgb") else ""
+    facts: dict[str, Any] = {
+        "condition": _where(worst, parts)
+        + f"along rows: {worst.design.condition_x}; along columns: {worst.design.condition_y}",
+        "rule": _where(worst, parts) + worst.design.reason,
+        "expected": _where(worst, parts) + f"error {worst.design.expectation} (rms in light{scale})",
+        "rotation": f"{request.options.rotation}: weights off the axes follow from those on them",
+        "linearisation": request.linearisation or "linear",
+        "noise_gain": round(max(part.design.noise_gain for part in parts), 3),
+        "parts": [{k: v for k, v in part.facts().items() if v is not None} for part in parts],
+    }
+    placed = any(part.at is not None for part in parts)
+    return RestorationFilter(kernels, size if placed else None, f"measured at edges of {names}{more}", facts)
+
+
+#: File that a measured filter is written to, in the folder of the results.
+FILTER_NAME = "restoration_filter.toml"
+#: Description of the filter that leaves images as they are.
+NO_FILTER = "none"
+
+
+@dataclass(frozen=True)
+class FilterRequest:
+    """Where a filter comes from: one of these."""
+
+    file: Path | None = None
+    aperture: str | None = None
+    """``square`` or ``round``, with ``:RATIO`` of aperture by step where that is not 1."""
+    design: DesignRequest | None = None
+    none: bool = False
+    """No filter: the image is corrected otherwise alone."""
+
+    def __post_init__(self) -> None:
+        if sum(source is not None for source in (self.file, self.aperture, self.design)) + self.none != 1:
+            raise UsageError("give a filter file, the aperture of a scanner, or images to measure; one of them")
+
+
+@dataclass(frozen=True, eq=False)
+class FoundFilter:
+    """A filter and where it comes from."""
+
+    filter: RestorationFilter
+    origin: str
+    """In words: "the file …"; empty: there is no filter."""
+    measured: MeasuredFilter | None = None
+    """What was measured, where it was."""
+
+
+def requested_filter(request: FilterRequest, events: Events = SILENT) -> FoundFilter:
+    """The filter that is asked for."""
+    if request.none:
+        return FoundFilter(RestorationFilter((FilterKernel(np.ones((1, 1))),), description=NO_FILTER), "")
+    if request.file is not None:
+        return FoundFilter(load_filter(request.file), f"the file {request.file}")
+    if request.aperture is not None:
+        return FoundFilter(_for_aperture(request.aperture), f"the aperture of a scanner, {request.aperture}")
+    assert request.design is not None
+    found = design_restoration(request.design, events)
+    for line in _lines(found):
+        events.talk(line)
+    return FoundFilter(found.filter, "edges of the images", found)
+
+
+def keep_filter(path: Path, filter_: RestorationFilter, *, overwrite: bool = False) -> Path:
+    """Write a filter beside its results, unless the file holds the very same one already."""
+    try:
+        if path.read_text(encoding="utf-8") == filter_text(entries_of(filter_)):
+            return path
+    except (OSError, UnicodeDecodeError):
+        pass
+    try:
+        make_parents(path.parent)
+    except OSError as error:
+        raise UsageError(f"{path.parent}: cannot be made ({error.strerror})") from None
+    return save_filter(path, filter_, overwrite=overwrite)
+
+
+def _for_aperture(text: str) -> RestorationFilter:
+    shape, _, stated = text.partition(":")
+    try:
+        ratio = float(stated) if stated else 1.0
+    except ValueError:
+        ratio = float("nan")
+    if shape not in ("square", "round") or ratio != ratio:
+        raise UsageError(
+            f"`aperture` {text}; it is square or round, with :RATIO of aperture by step, such as round:1.2"
+        )
+    kernel = FilterKernel(aperture_filter(cast(Literal["square", "round"], shape), ratio))
+    facts = {"rule": f"inverse of the transfer function of a {shape} aperture of {ratio:g} steps (Ecker 1991, eq. 4.5)"}
+    return RestorationFilter((kernel,), description=f"{shape} aperture, {ratio:g} steps", facts=facts)
+
+
+def _lines(found: MeasuredFilter) -> list[str]:
+    """What was measured, for people."""
+    lines = []
+    for part in found.parts[:9]:
+        name = "all bands" if part.band is None else f"band {part.band}"
+        where = "" if part.at is None else f" at column {part.at[0]:.0f}, row {part.at[1]:.0f}"
+        sides = ["  ".join(f"{v:.3f}" for v in one.spread.side()[:4]) for one in part.sharpness]
+        lines.append(
+            f"{name}{where}: {part.edges} edges; spread function along rows {sides[0]}, along columns {sides[1]}; "
+            f"{part.design.method}, noise grows {part.design.noise_gain:.1f} times"
+        )
+    if len(found.parts) > 9:
+        lines.append(f"… and {len(found.parts) - 9} more parts; the filter file has them all")
+    return lines + list(found.notes)
+
+
+#: What `dtype` may be; grey values keep their scale in all of them.
+TYPES = ("same", "float32", "uint16")
+
+
+@dataclass(frozen=True)
+class RestoreRequest:
+    """What is asked."""
+
+    images: tuple[Path, ...]
+    filter: RestorationFilter | Path
+    """The filter, or its file."""
+    output: Path | None = None
+    """Folder of the results; None: `restored` beside the first image."""
+    bands: tuple[int, ...] = ()
+    """Bands that are restored, from 1; all if empty. The others stay as they are."""
+    linearisation: str = "linear"
+    """``linear``, ``srgb`` or a file with a table."""
+    dtype: str = "same"
+    """Type of the results: ``same``, ``float32`` or ``uint16``."""
+    chromatic: ChromaticModel | Path | Literal["measure"] | None = None
+    """Lateral chromatic aberration, which is corrected before the filter: a model, its file, or ``measure``: every
+    image's own discs or edges; None: the bands stay where they are."""
+    fall_off: Path | None = None
+    """A correction of light fall-off, which comes before all others."""
+    compress: str = "deflate"
+    workers: int = 1
+    memory: int | None = None
+    """Bytes the run should stay under; None: no bound but the tiles in flight."""
+    overwrite: bool = False
+    quicklook: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.images:
+            raise UsageError("no image is given")
+        if self.dtype not in TYPES:
+            raise UsageError(f"dtype {self.dtype!r}; allowed are {', '.join(TYPES)}")
+        if self.compress not in COMPRESSIONS:
+            raise UsageError(f"compression {self.compress!r}; allowed are {', '.join(COMPRESSIONS)}")
+
+    @property
+    def folder(self) -> Path:
+        """Where the results are written."""
+        return self.images[0].parent / "restored" if self.output is None else self.output
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What decides the results beside images and filter, as plain values."""
+        return {
+            "bands": list(self.bands),
+            "linearisation": self.linearisation,
+            "dtype": self.dtype,
+            "chromatic": "a model"
+            if isinstance(self.chromatic, ChromaticModel)
+            else self.chromatic and str(self.chromatic),
+            "fall_off": self.fall_off and str(self.fall_off),
+            "compress": self.compress,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One image and what becomes of it."""
+
+    reader: SteppedReader
+    target: Path
+    form: ImageForm
+    key: str
+    """Digest of image, filter and settings: finished tiles of another key are of no use."""
+    nodata: Nodata
+    digest: str
+    """Of the image."""
+    tools: tuple[Path, ...]
+    """Files of the filter and of corrections: with the image they are what the result is made from."""
+    inputs: tuple[Path, ...]
+    """Files that must not be overwritten."""
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of the image."""
+        width, height = self.reader.size
+        return -(-width // PART) * -(-height // PART)
+
+    @property
+    def chromatic_file(self) -> Path:
+        """Where a measured model of lateral chromatic aberration is written."""
+        return self.target.with_name(self.target.stem.removesuffix("_restored") + "_chromatic.toml")
+
+    @property
+    def picture(self) -> Path:
+        """The quick look."""
+        return self.target.with_suffix(".png")
+
+
+@dataclass(frozen=True)
+class RestoredImage:
+    """What became of one image."""
+
+    image: str
+    path: Path
+    dtype: str
+    noise_gain: float
+    """Factor by which uncorrelated noise grew, the largest of all kernels."""
+    below: tuple[int, ...]
+    """Valid pixels of each band that were darker than the type can hold, and were clipped."""
+    above: tuple[int, ...]
+    """The same for brighter ones."""
+    valid_share: float
+    pixels: int
+    """Pixels of a band."""
+    tiles: int
+    resumed: int
+    """Tiles taken over from an earlier run."""
+    seconds: float
+    picture: Path | None = None
+
+    @property
+    def clipped_share(self) -> float:
+        """Clipped pixels among the valid ones of all bands, 0 to 1."""
+        valid = self.valid_share * self.pixels * len(self.below)
+        return (sum(self.below) + sum(self.above)) / valid if valid else 0.0
+
+    def json_fields(self) -> dict[str, Any]:
+        """With the share of clipped pixels."""
+        own = ("image", "path", "dtype", "noise_gain", "clipped_share", "valid_share", "pixels", "tiles", "seconds")
+        return pick(self, *own, clipped_below="below", clipped_above="above", resumed_tiles="resumed")
+
+
+def memory_of_a_tile(reader: SteppedReader) -> int:
+    """Bytes that one tile in flight takes at most: pixels as read, as light, and as the result."""
+    margin = restoration_of(reader).restorer.margin
+    area = (PART + 6 * margin.columns) * (PART + 6 * margin.rows)
+    each = reader.bands * (2 * reader.dtype_before(len(reader.steps) - 1).itemsize + 2 * reader.dtype.itemsize) + 48
+    if reader.step(FallOffStep) is not None:
+        # Stored pixels, light before and after, and the terms of the gain.
+        each += reader.bands * (np.dtype(reader.info.dtype).itemsize + 20) + 100
+    if reader.step(AlignStep) is not None:
+        # The same pixels before they are displaced, and the displacements.
+        each += 2 * reader.bands * reader.dtype_before(len(reader.steps) - 1).itemsize + 56
+    return int(area * each)
+
+
+def earlier_result(job: Job, settings: dict[str, Any]) -> RestoredImage | None:
+    """The result of an earlier run with the same image, filter and settings; None if there is none."""
+
+    def result(made: dict[str, Any], recorded: object) -> RestoredImage | None:
+        if recorded != settings or not job.target.is_file():
+            return None
+        return RestoredImage(
+            image=made["image"],
+            path=job.target,
+            dtype=made["dtype"],
+            noise_gain=made["noise_gain"],
+            below=tuple(made["clipped_below"]),
+            above=tuple(made["clipped_above"]),
+            valid_share=made["valid_share"],
+            pixels=made["pixels"],
+            tiles=made["tiles"],
+            resumed=made["tiles"],
+            seconds=made["seconds"],
+            picture=job.picture if job.picture.is_file() else None,
+        )
+
+    return recorded_result(job.target, job.key, result)
+
+
+@dataclass(frozen=True, eq=False)
+class RestoreJob:
+    """What a worker is told once."""
+
+    reader: SteppedReader
+
+    def __call__(self, tile: Tile) -> Made:
+        """Restored pixels of a tile, and how many were clipped."""
+        pixels = read_counted(self.reader, tile.window)
+        record = {"below": [int(n) for n in pixels.below], "above": [int(n) for n in pixels.above]}
+        return Made(((pixels.values, pixels.valid),), record)
+
+
+def restoration(job: Job, how: RestoreRequest, events: Events) -> Work[RestoredImage | None]:
+    """What there is to do for an image, or for what an earlier run has left of it."""
+    reader = job.reader
+    for note in reader.info.warnings:
+        events.talk(f"note: {note}")
+    if not restoration_of(reader).restorer.is_compiled:
+        events.talk("compiling the filter kernels, once (some seconds)")
+    file = ProductFile(
+        job.target,
+        placement_of(reader.info),
+        reader.bands,
+        reader.dtype,
+        run_key=job.key,
+        nodata=job.nodata,
+        compress=how.compress,
+        tile=PART,
+        overwrite=how.overwrite,
+        inputs=job.inputs,
+        threads=how.workers,
+        form=job.form,
+    )
+    tiles = Tiles.every(file.placement.window, file.tile)
+    return Work(
+        name=job.target.stem,
+        job=RestoreJob(reader),
+        tiles=tiles,
+        count=len(tiles),
+        sinks=(file,),
+        complete=partial(_complete, job, how, file, run_times()),
+    )
+
+
+def _complete(
+    job: Job, how: RestoreRequest, file: ProductFile, times: Callable[[], dict[str, Any]], tally: Tally
+) -> RestoredImage:
+    """Give the product its name, its record and its quick look."""
+    if tally.failed:
+        raise PhotoplanError(f"{job.target}: {tally.reasons[0]}; finished tiles are kept")
+    with together():
+        facts = file.complete(_tags(job))
+        reader = job.reader
+        aligned = reader.step(AlignStep)
+        if how.chromatic == "measure" and aligned is not None:
+            save_chromatic(job.chromatic_file, aligned.model)
+        ran = times()
+        nothing = [0] * reader.bands
+        result = RestoredImage(
+            image=reader.info.path.name,
+            path=job.target,
+            dtype=str(reader.dtype),
+            noise_gain=restoration_of(reader).restorer.filter.noise_gain,
+            below=tuple(tally.totals.get("below", nothing)),
+            above=tuple(tally.totals.get("above", nothing)),
+            valid_share=facts.valid_share,
+            pixels=reader.size[0] * reader.size[1],
+            tiles=job.tiles,
+            resumed=tally.resumed,
+            seconds=ran["seconds"],
+            picture=job.picture if how.quicklook else None,
+        )
+        if how.quicklook:
+            write_quicklook(standing(job.target), job.picture)
+        write_run_record(
+            job.target,
+            key=job.key,
+            inputs=[input_entry(reader.info.path, job.digest), *job.tools],
+            run={"workers": how.workers, "memory": how.memory, **ran},
+            **_record(job, how, result, facts),
+        )
+    return result
+
+
+def _tags(job: Job) -> dict[str, str]:
+    """What the file itself says of its origin."""
+    return {
+        "PHOTOPLAN_VERSION": __version__,
+        "PHOTOPLAN_IMAGE": job.reader.info.path.name,
+        "PHOTOPLAN_RESTORED": restoration_of(job.reader).restorer.filter.description or "yes",
+        "PHOTOPLAN_KEY": job.key,
+        "TIFFTAG_SOFTWARE": f"photoplan {__version__}",
+    }
+
+
+def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: ProductFacts) -> dict[str, Any]:
+    """What a person needs to answer for the result, and to make it again."""
+    restorer = restoration_of(job.reader).restorer
+    aligned, lit = job.reader.step(AlignStep), job.reader.step(FallOffStep)
+    return {
+        "product": result,
+        "settings": how.settings,
+        "linearisation": restorer.linearisation.describe(),
+        "chromatic": None if aligned is None else model_figures(aligned.model),
+        "fall_off": lit and lit.fall_off,
+        "filter": {
+            "description": restorer.filter.description,
+            "image_size": restorer.filter.image_size,
+            "facts": dict(restorer.filter.facts),
+            "kernels": [
+                {"band": k.band, "at": k.at, "noise_gain": k.noise_gain, "sum": k.total, "values": k.values}
+                for k in restorer.filter.kernels
+            ],
+        },
+        "values_moved_off_nodata": facts.moved_values,
+        "bytes": facts.bytes,
+    }
+
+
+#: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
+BASE_MEMORY = 416 * 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class RestoreReport:
+    """What became of all images."""
+
+    images: tuple[RestoredImage, ...]
+    failed: dict[str, str]
+    """Why an image could not be restored, by its name."""
+    filter: RestorationFilter
+    folder: Path
+
+    def json_fields(self) -> dict[str, Any]:
+        """The filter by its figures."""
+        return {**pick(self, "images", "failed", "folder"), "filter": filter_figures(self.filter)}
+
+
+def filter_figures(filter_: RestorationFilter) -> dict[str, Any]:
+    """Size, noise gain and making of a filter as plain values."""
+    columns, rows = filter_.margin
+    return {
+        "description": filter_.description,
+        "size": [2 * columns + 1, 2 * rows + 1],
+        "kernels": len(filter_.kernels),
+        "noise_gain": filter_.noise_gain,
+        "sums": sorted({round(kernel.total, 6) for kernel in filter_.kernels}),
+        "facts": dict(entries_of(filter_).facts),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class OpticalCorrections:
+    """What is corrected before the filter: light fall-off, then lateral chromatic aberration."""
+
+    fall_off: FallOffFile | None
+    chromatic: ChromaticModel | Literal["measure"] | None
+    light: Linearisation
+
+    @classmethod
+    def of(cls, request: RestoreRequest, light: Linearisation) -> OpticalCorrections:
+        """Those that are asked for, their files read."""
+        fall_off = None if request.fall_off is None else load_fall_off(request.fall_off)
+        model = load_chromatic(request.chromatic) if isinstance(request.chromatic, Path) else request.chromatic
+        return cls(fall_off, model, light)
+
+    def source(self, path: Path) -> SteppedReader:
+        """The pixels of an image, corrected."""
+        source = SteppedReader(RasterReader(path))
+        if self.fall_off is not None:
+            source = source.then(FallOffStep(self.fall_off, self.light, source.dtype))
+        if self.chromatic is None:
+            return source
+        return source.then(AlignStep(measured_once(path) if self.chromatic == "measure" else self.chromatic))
+
+
+@dataclass(frozen=True, eq=False)
+class RestorePlan:
+    """All images that can be restored, before any pixel is."""
+
+    request: RestoreRequest
+    filter: RestorationFilter
+    jobs: tuple[Job, ...]
+    failed: dict[str, str]
+    in_flight: int
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of all images."""
+        return sum(job.tiles for job in self.jobs)
+
+
+def plan_restoration(request: RestoreRequest) -> RestorePlan:
+    """Open the filter and all images, and see where the results go; nothing is written.
+
+    Raises
+    ------
+    UsageError
+        An image is given twice, a result exists or would replace an input, or `memory` is too small for a tile.
+    InputError
+        The filter or the table of the linearisation cannot be used.
+    """
+    given = request.filter
+    filter_ = load_filter(given) if isinstance(given, Path) else given
+    text = filter_text(entries_of(filter_))
+    light = linearisation_of(request.linearisation)
+    corrections = OpticalCorrections.of(request, light)
+    files = [path.resolve() for path in request.images]
+    twice = [path for path in files if files.count(path) > 1]
+    if twice:
+        raise UsageError(f"image {twice[0]} is given twice")
+    stems = unique_stems(str(path.absolute()) for path in request.images)
+    tools = [path for path in (given, request.chromatic, request.fall_off) if isinstance(path, Path)]
+    tools += [] if request.linearisation in ("linear", "srgb") else [Path(request.linearisation)]
+    jobs, failed = [], {}
+    for path in request.images:
+        try:
+            source = corrections.source(path)
+            out = np.dtype(source.info.dtype if request.dtype == "same" else request.dtype)
+            _check_bands(path, source.bands, request.bands)
+            chosen = _only(filter_, request.bands)
+            reader = restored(source, chosen, light, out)
+            target = request.folder / f"{stems[str(path.absolute())]}_restored.tif"
+            jobs.append(_job(request, reader, target, text, tuple(tools)))
+        except InputError as error:
+            failed[path.name] = str(error)
+    for job in jobs:
+        _check_outputs(job, request)
+    return RestorePlan(
+        request=request, filter=filter_, jobs=tuple(jobs), failed=failed, in_flight=_in_flight(request, jobs)
+    )
+
+
+def _check_bands(path: Path, count: int, wanted: Iterable[int]) -> None:
+    for band in wanted:
+        if not 1 <= band <= count:
+            raise InputError(f"{path}: band {band} is asked for; the image has {count}")
+
+
+def _only(filter_: RestorationFilter, bands: tuple[int, ...]) -> RestorationFilter:
+    """The filter for some bands alone."""
+    if not bands:
+        return filter_
+    kernels = [replace(kernel, band=band) for band in sorted(set(bands)) for kernel in filter_.for_band(band)]
+    if not kernels:
+        raise InputError(f"the filter has no kernel for band {', '.join(map(str, bands))}")
+    return RestorationFilter(tuple(kernels), filter_.image_size, filter_.description, filter_.facts)
+
+
+def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str, tools: tuple[Path, ...]) -> Job:
+    info = reader.info
+    digest = fingerprint(info.path).digest
+    facts = [text, request.settings["bands"], str(reader.dtype), request.linearisation]
+    aligned, lit = reader.step(AlignStep), reader.step(FallOffStep)
+    if aligned is not None:
+        facts.append(model_figures(aligned.model))
+    if lit is not None:
+        facts += ["light fall-off", lit.fall_off.digest]
+    light = restoration_of(reader).restorer.linearisation
+    if light.grey is not None and light.light is not None:
+        facts += [light.grey.tolist(), light.light.tolist()]
+    key = run_key("restored image", facts, [{"sampled_sha256": digest}])
+    nodata: Nodata = kept_nodata(info, reader.dtype)
+    if request.compress == "jpeg" and (reader.dtype != np.uint8 or reader.bands not in (1, 3)):
+        raise InputError(
+            f"{info.path}: {reader.bands} bands of {reader.dtype}; compression jpeg takes one or three of uint8"
+        )
+    form: ImageForm = form_of(info)
+    return Job(
+        reader=reader,
+        target=target,
+        form=form,
+        key=key,
+        nodata=nodata,
+        digest=digest,
+        tools=tools,
+        inputs=(*request.images, *tools),
+    )
+
+
+def _check_outputs(job: Job, request: RestoreRequest) -> None:
+    """Refuse results that exist, but for those of this very run when it was interrupted."""
+    mine = earlier_result(job, request.settings) is not None
+    outputs = [job.target, *([job.picture] if request.quicklook else [])]
+    outputs += [job.chromatic_file] if request.chromatic == "measure" else []
+    for path in outputs:
+        check_output(path, job.inputs, overwrite=request.overwrite or mine)
+
+
+def _in_flight(request: RestoreRequest, jobs: list[Job]) -> int:
+    wanted = threads(request.workers).in_flight
+    each = max((memory_of_a_tile(job.reader) for job in jobs), default=0)
+    return tiles_in_flight(wanted, request.memory if jobs else None, BASE_MEMORY, each)
+
+
+def restore_images(request: RestoreRequest, events: Events = SILENT, more: bool = False) -> RestoreReport:
+    """Restore all images; one that cannot be used does not stop the others.
+
+    Parameters
+    ----------
+    events : Events
+        Told of tiles that are done, and of each image as soon as it is written.
+    more : bool
+        Whether the caller makes more of the images, such as a report: those that are all there are then no reason to
+        refuse.
+
+    Raises
+    ------
+    UsageError, InputError
+        See `plan_restoration`; nothing is done then.
+    ResourceError
+        Disk or memory ran out; the same request goes on where it stopped.
+    """
+    plan = plan_restoration(request)
+    settings = request.settings
+    kept = {job.target: earlier_result(job, settings) for job in plan.jobs} if not request.overwrite else {}
+    for job in plan.jobs:
+        if kept.get(job.target):
+            tidy([job.target, job.picture, job.chromatic_file, record_path(job.target)])
+    if plan.jobs and not more and all(kept.get(job.target) for job in plan.jobs):
+        first = plan.jobs[0].target
+        raise UsageError(f"{first}: exists already; choose another output or say `overwrite`")
+    make_folder(request.folder)
+    failed = dict(plan.failed)
+
+    def works() -> Iterator[Work[RestoredImage | None] | Kept[RestoredImage | None]]:
+        for job in plan.jobs:
+            found = kept.get(job.target)
+            if found is not None:
+                events.talk(f"{found.image}: is restored already")
+                yield Kept(found, job.tiles)
+                continue
+            try:
+                yield restoration(job, request, events)
+            except PhotoplanError as error:
+                failed[job.reader.info.path.name] = str(error)
+                events.done(job.tiles)
+
+    def excuse(work: Work[RestoredImage | None], error: PhotoplanError) -> None:
+        if isinstance(error, ResourceError | RunLocked):
+            raise error
+        failed[next(job.reader.info.path.name for job in plan.jobs if job.target.stem == work.name)] = str(error)
+
+    events.begin("restoring", plan.tiles)
+    with threads(request.workers) as workers:
+        results = Runner(workers, plan.in_flight, events, excuse).run(works())
+    return RestoreReport(tuple(r for r in results if r is not None), failed, plan.filter, request.folder)

@@ -1,1 +1,0 @@
-"""`photoplan restore`: filters measured, designed and applied."""

@@ -1,1 +1,0 @@
-"""Seams of a mosaic, found in what its images show."""

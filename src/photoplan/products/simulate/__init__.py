@@ -1,1 +1,0 @@
-"""Images of known truth, as a camera would take them."""

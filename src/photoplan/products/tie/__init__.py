@@ -1,1 +1,0 @@
-"""Tie points between the images of a project."""

@@ -1,0 +1,396 @@
+"""Geometry by straight lines and plumb edges."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import special
+
+from photoplan.adjustment.least_squares import solve
+from photoplan.adjustment.statistics import chance_chi_square
+from photoplan.errors import InputError
+
+#: Level of significance at which the scatter about the line is taken as larger than stated.
+_SIGNIFICANT = 0.01
+
+
+@dataclass(frozen=True)
+class StraightLine:
+    """y = offset + slope · x."""
+
+    offset: float
+    slope: float
+    covariance: tuple[float, float, float]
+    """Variance of the offset, covariance, variance of the slope."""
+    chi_square: float
+    """Weighted sum of squared residuals with the stated standard deviations."""
+    degrees: int
+
+    @property
+    def offset_sigma(self) -> float:
+        """Standard deviation of the offset."""
+        return sqrt(self.covariance[0])
+
+    @property
+    def slope_sigma(self) -> float:
+        """Standard deviation of the slope."""
+        return sqrt(self.covariance[2])
+
+    def at(self, x: ArrayLike) -> NDArray[np.float64]:
+        """y at x, same shape."""
+        return np.asarray(self.offset + self.slope * np.asarray(x, float))
+
+
+def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike) -> StraightLine:
+    """Line by weighted least squares.
+
+    Where the residuals are significantly (1 %) larger than the standard deviations allow, those of the result are
+    enlarged to the scatter that was found.
+    """
+    x, y, sigma = (np.asarray(v, np.float64) for v in (x, y, sigma))
+    if not (np.isfinite(x).all() and np.isfinite(y).all() and np.isfinite(sigma).all() and (sigma > 0).all()):
+        raise InputError("a straight line needs finite points with positive standard deviations")
+    if len(x) < 2 or np.ptp(x) == 0:
+        raise InputError(f"{len(x)} points with {len(set(x.tolist()))} different abscissas; a line needs 2")
+    # Shifted and scaled, so that the normal equations are well conditioned whatever the unit of x.
+    shift = float(np.average(x, weights=sigma**-2.0))
+    scale = float(np.abs(x - shift).max()) or 1.0
+    fit = solve(np.column_stack([np.ones_like(x), (x - shift) / scale]), y, sigma**-2.0)
+    scattered = fit.redundancy and chance_chi_square(fit.square, fit.redundancy) < _SIGNIFICANT
+    back = np.array([[1.0, -shift / scale], [0.0, 1.0 / scale]])
+    offset, slope = back @ fit.unknowns
+    c = back @ (fit.covariance if scattered else fit.cofactors) @ back.T
+    covariance = float(c[0, 0]), float(c[0, 1]), float(c[1, 1])
+    return StraightLine(
+        offset=float(offset), slope=float(slope), covariance=covariance, chi_square=fit.square, degrees=fit.redundancy
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class GreyWedge:
+    """Result for one wedge at one illumination."""
+
+    density: NDArray[np.float64]
+    """Increasing."""
+    signal: NDArray[np.float64]
+    """Grey values above black."""
+    transmission: NDArray[np.float64]
+    used: NDArray[np.bool_]
+    """Patches that are neither saturated nor black."""
+    gamma: float
+    """Slope of the logarithm of the signal over that of the transmission; 1 for a linear sensor."""
+    gamma_sigma: float
+    slope: float
+    """Grey values per transmission, line through the origin."""
+    error_percent: float
+    """Largest deviation from that line, % of the largest signal used."""
+    used_range_percent: float
+    """Part of the scale up to saturation that the brightest patch takes."""
+
+
+def grey_wedge(density: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturation: float) -> GreyWedge:
+    """Characteristic curve of patches."""
+    order = np.argsort(np.asarray(density, float), kind="stable")
+    d, y, s = (np.asarray(v, float)[order] for v in (density, signal, sigma))
+    if (np.diff(d) <= 0).any():
+        raise InputError("two patches have the same density; measure each once")
+    used = (y < 0.98 * saturation) & (y > np.maximum(5 * s, 0.002 * saturation))
+    if np.count_nonzero(used) < 3:
+        raise InputError(
+            f"{np.count_nonzero(used)} of {d.size} patches are neither saturated nor black; a grey wedge needs 3"
+        )
+    rises = np.diff(y) > 5 * np.hypot(s[1:], s[:-1]) + 0.01 * saturation
+    if rises.any():
+        k = int(np.argmax(rises))
+        raise InputError(
+            f"the patch of density {d[k + 1]:g} is brighter ({y[k + 1]:.4g} DN) than that of {d[k]:g} ({y[k]:.4g} DN); "
+            "check the densities and the patches' places"
+        )
+    transmission = 10.0**-d
+    t, v = transmission[used], y[used]
+    # A patch is even to about 1 %, whatever its noise.
+    relative = np.hypot(np.maximum(s[used], 1e-9) / v, 0.01)
+    line = fit_line(np.log10(t), np.log10(v), relative / np.log(10.0))
+    slope = float(np.sum(v / t) / v.size)
+    deviation = v - slope * t
+    return GreyWedge(
+        density=d,
+        signal=y,
+        transmission=transmission,
+        used=used,
+        gamma=line.slope,
+        gamma_sigma=line.slope_sigma,
+        slope=slope,
+        error_percent=float(100 * np.abs(deviation).max() / v.max()),
+        used_range_percent=float(100 * y.max() / saturation),
+    )
+
+
+Array = NDArray[np.float64]
+
+#: Lines below which a straight line and what leaves it cannot be told apart.
+LEAST_LINES = 16
+#: Lines above which a spectrum would take minutes.
+MOST_LINES = 10_000
+#: Length of the pattern in pixels (Behr 1989, §4.1.2).
+PATTERN = 10
+_REACH = 7
+"""Pixels on each side of an edge that are fitted."""
+_STEP = 4
+"""Pixels on each side that are averaged to find an edge."""
+_LARGEST = 1 << 26
+_CLEAR = 6.0
+"""Contrast over its standard deviation below which a line shows no edge."""
+_MISSING = 0.2
+"""Largest part of lines that may show no edge."""
+_GRAIN = 0.2
+"""Largest residual of the fitted edge as part of its contrast: more is texture."""
+_CUT = 0.3
+"""Largest part of a side's pixels that may lie at the end of the range."""
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeLines:
+    """Positions of one edge in successive lines."""
+
+    method: str
+    """`correlation` or `least squares`."""
+    position: Array
+    """Column in the window, shape (n,); NaN: no edge in this line."""
+    sigma: Array
+    """Standard deviations as the fit to the line's pixels states them; NaN where the method states none, (n,)."""
+    contrast: float
+    """Bright side minus dark side, grey values."""
+    width: float
+    """Standard deviation of the Gaussian that the edge is blurred by, pixels."""
+    noise: float
+    """Root mean square of the residuals of the fitted edge, grey values."""
+
+    @property
+    def gradient(self) -> float:
+        """Steepest slope, grey values per pixel."""
+        return self.contrast / (self.width * math.sqrt(2.0 * math.pi))
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Lines without an edge, counted from 0 in the window."""
+        return tuple(int(i) for i in np.flatnonzero(~np.isfinite(self.position)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    position: Array
+    contrast: Array
+    width: float
+    residuals: Array
+    sigma: Array
+    sigma_contrast: Array
+
+
+def fit_edge(grey: NDArray[np.floating], *, name: str = "edge", saturation: float | None = None) -> EdgeLines:
+    """Edge of every line by least squares: own position, contrast and base of each line, blur common to all."""
+    g = _window(grey, name)
+    coarse, contrast = _coarse(g, name)
+    _refuse_cut(g, coarse, contrast, name, saturation)
+    fit = _adjusted(g, coarse)
+    noise = math.sqrt(_typical_square(fit.residuals))
+    seen = np.abs(fit.contrast) > _CLEAR * fit.sigma_contrast
+    seen &= (np.sign(fit.contrast) == np.sign(contrast)) & (np.abs(fit.position - coarse) < _REACH / 2)
+    _refuse_missing(seen, name)
+    typical = float(np.median(np.abs(fit.contrast[seen])))
+    if not noise < _GRAIN * typical:
+        raise InputError(
+            f"{name}: residuals of {noise:.1f} grey values about an edge of contrast {typical:.1f}: texture or noise, "
+            "no clean edge; choose another window"
+        )
+    seen &= np.abs(fit.contrast) > typical / 4.0
+    _refuse_missing(seen, name)
+    position, sigma = np.where(seen, fit.position, np.nan), np.where(seen, fit.sigma, np.nan)
+    return EdgeLines(
+        method="least squares", position=position, sigma=sigma, contrast=typical, width=fit.width, noise=noise
+    )
+
+
+def correlate_edge(grey: NDArray[np.floating], fitted: EdgeLines, *, name: str = "edge") -> EdgeLines:
+    """Edge of every line by correlation with ten pixels of the middle line and a parabola (Behr 1989, eq. 4.8–4.10)."""
+    g = _window(grey, name)
+    known = np.flatnonzero(np.isfinite(fitted.position) & np.isfinite(g).all(axis=1))
+    if not known.size:
+        raise InputError(f"{name}: no line has both an edge and all its pixels")
+    middle = int(known[np.abs(known - len(g) // 2).argmin()])
+    at = float(fitted.position[middle])
+    start = min(max(round(at - (PATTERN - 1) / 2.0), 0), g.shape[1] - PATTERN)
+    r = _correlations(g, g[middle, start : start + PATTERN])
+    best = np.where(np.isfinite(r), r, -2.0).argmax(axis=1)
+    inside = (best > 0) & (best < r.shape[1] - 1)
+    k, rows = np.clip(best, 1, r.shape[1] - 2), np.arange(len(g))
+    # Eq. 4.9 and 4.10.
+    b = (r[rows, k + 1] - r[rows, k - 1]) / 2.0
+    a = (r[rows, k + 1] + r[rows, k - 1] - 2.0 * r[rows, k]) / 2.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        position = np.where(inside & (a < 0.0), k - b / (2.0 * a) + (at - start), np.nan)
+    position[~np.isfinite(fitted.position)] = np.nan
+    _refuse_missing(np.isfinite(position), name)
+    unknown = np.full(len(g), np.nan)
+    return EdgeLines(
+        method="correlation",
+        position=position,
+        sigma=unknown,
+        contrast=fitted.contrast,
+        width=fitted.width,
+        noise=fitted.noise,
+    )
+
+
+def _window(grey: NDArray[np.floating], name: str) -> Array:
+    if grey.ndim != 2 or grey.shape[0] < LEAST_LINES or grey.shape[1] < 2 * _REACH + 4:
+        raise InputError(
+            f"{name}: a window of {grey.shape[-1]} columns and {len(grey)} lines; at least {2 * _REACH + 4} columns "
+            f"and {LEAST_LINES} lines are needed"
+        )
+    if grey.size > _LARGEST or len(grey) > MOST_LINES:
+        raise InputError(
+            f"{name}: a window of {grey.shape[1]} columns and {len(grey)} lines; at most {_LARGEST} pixels and "
+            f"{MOST_LINES} lines are taken, choose a smaller one"
+        )
+    return np.asarray(grey, float)
+
+
+def _coarse(g: Array, name: str) -> tuple[NDArray[np.int64], float]:
+    """Column of the greatest step in every line, all steps of the direction that most have; signed contrast."""
+    total = np.concatenate([np.zeros((len(g), 1)), np.nancumsum(g, axis=1)], axis=1)
+    means = (total[:, _STEP:] - total[:, :-_STEP]) / _STEP
+    # Between column i + step − 1 and i + step; where pixels are unknown, there is no step.
+    steps = means[:, _STEP:] - means[:, :-_STEP]
+    bad = np.concatenate([np.zeros((len(g), 1)), np.cumsum(~np.isfinite(g), axis=1)], axis=1)
+    steps[(bad[:, 2 * _STEP :] - bad[:, : -2 * _STEP]) > 0] = 0.0
+    # Room for the pixels that are fitted.
+    first = _REACH - _STEP + 1
+    steps = steps[:, first : steps.shape[1] - first + 1]
+    up, down = float(np.median(steps.max(axis=1))), float(np.median(-steps.min(axis=1)))
+    sign = 1.0 if up >= down else -1.0
+    if not max(up, down) > 0.0:
+        raise InputError(f"{name}: no edge in the window: its grey values do not change along the lines")
+    column = (sign * steps).argmax(axis=1) + first + _STEP
+    return column.astype(np.int64), sign * max(up, down)
+
+
+def _sides(g: Array, coarse: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Pixels on the left and on the right of the edge, four to seven pixels away."""
+    offsets = np.arange(3, _REACH)
+    rows = np.arange(len(g))[:, None]
+    left = g[rows, np.clip(coarse[:, None] - 1 - offsets, 0, g.shape[1] - 1)]
+    right = g[rows, np.clip(coarse[:, None] + offsets, 0, g.shape[1] - 1)]
+    return left.ravel(), right.ravel()
+
+
+def _refuse_cut(g: Array, coarse: NDArray[np.int64], contrast: float, name: str, saturation: float | None) -> None:
+    """Raise where one side of the edge lies at the end of the range: its place would be wrong."""
+    left, right = _sides(g, coarse)
+    dark, bright = (left, right) if contrast > 0.0 else (right, left)
+    share_top = float((bright >= (np.nanmax(g) if saturation is None else saturation)).mean())
+    share_low = float((dark <= np.nanmin(g)).mean())
+    # A side at one value is cut if the other side shows noise; images without any noise are not.
+    noisy_dark, noisy_bright = share_low < _CUT, share_top < _CUT
+    if not noisy_bright and (saturation is not None or noisy_dark):
+        raise InputError(
+            f"{name}: saturated: {100 * share_top:.0f} % of the pixels on its bright side are at "
+            f"{np.nanmax(bright):g} or above the saturation; the edge's place would be wrong. Take the image with less "
+            "light"
+        )
+    if not noisy_dark and noisy_bright:
+        raise InputError(
+            f"{name}: cut off in the dark: {100 * share_low:.0f} % of the pixels on its dark side are at "
+            f"{np.nanmin(dark):g}; the edge's place would be wrong. Take the image with more light or a "
+            "higher black level"
+        )
+
+
+def _adjusted(g: Array, coarse: NDArray[np.int64]) -> _Fit:
+    """g = base + contrast Φ((x − p) / s) for every line, s common."""
+    n, m = len(g), 2 * _REACH
+    columns = coarse[:, None] + np.arange(-_REACH, _REACH)
+    part = g[np.arange(n)[:, None], columns]
+    whole = np.isfinite(part).all(axis=1)
+    part = np.where(np.isfinite(part), part, 0.0)
+    x = columns - (coarse[:, None] - 0.5)
+    p, s = np.zeros(n), 1.0
+    A = np.ones((n, m, 3))
+    for _ in range(25):
+        u = (x - p[:, None]) / s
+        bell = np.exp(-0.5 * u**2) / math.sqrt(2.0 * math.pi)
+        A[:, :, 1] = special.ndtr(u)
+        # Base and contrast are linear: found for the present place, with it as third unknown.
+        linear = _solve(A[:, :, :2], part)[0]
+        A[:, :, 2] = -linear[:, 1:2] * bell / s
+        found, Q = _solve(A, part)
+        residuals = part - np.einsum("nij,nj->ni", A, found)
+        widen = -linear[:, 1:2] * bell * u / s
+        # What the width adds beyond the three unknowns of each line.
+        beyond = widen - np.einsum("nij,nj->ni", A, _solve(A, widen)[0])
+        beyond[~whole] = 0.0
+        weight = _calm(residuals)
+        change = float((weight[:, None] * beyond * residuals).sum() / max((weight[:, None] * beyond**2).sum(), 1e-12))
+        s = float(np.clip(s + np.clip(change, -0.3, 0.3), 0.15, _REACH / 2.0))
+        moved = np.clip(found[:, 2], -1.0, 1.0)
+        p = np.clip(p + moved, -_REACH, _REACH)
+        if np.abs(moved).max() < 1e-7 and abs(change) < 1e-7:
+            break
+    variance = _typical_square(residuals[whole])
+    sigma, sigma_contrast = (np.sqrt(variance * Q[:, k, k]) for k in (2, 1))
+    position = np.where(whole, coarse - 0.5 + p, np.nan)
+    return _Fit(
+        position=position,
+        contrast=found[:, 1],
+        width=s,
+        residuals=residuals[whole],
+        sigma=sigma,
+        sigma_contrast=sigma_contrast,
+    )
+
+
+def _solve(A: Array, y: Array) -> tuple[Array, Array]:
+    """Least squares of many lines at once: unknowns and cofactors."""
+    N = np.einsum("nij,nik->njk", A, A)
+    N += 1e-12 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(A.shape[2])
+    Q = np.linalg.inv(N)
+    return np.einsum("njk,nik,ni->nj", Q, A, y), Q
+
+
+def _typical_square(residuals: Array) -> float:
+    """Variance of a grey value from the median line, so that lines that fit badly do not count."""
+    if not len(residuals):
+        return math.inf
+    freedom = residuals.shape[1] - 3
+    # Median of a chi-square after Wilson and Hilferty.
+    return float(np.median((residuals**2).sum(axis=1))) / (freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3)
+
+
+def _calm(residuals: Array) -> Array:
+    """Weights of lines: 0 where they fit far worse than most of them."""
+    rms = np.sqrt((residuals**2).mean(axis=1))
+    return (rms <= 4.0 * np.median(rms)).astype(float)
+
+
+def _correlations(g: Array, pattern: Array) -> Array:
+    """Coefficients of the pattern at every place of every line, eq. 4.1; NaN where grey values do not vary."""
+    windows = np.lib.stride_tricks.sliding_window_view(g, PATTERN, axis=1)
+    centred = pattern - pattern.mean()
+    product = windows @ centred
+    variance = windows.var(axis=2) * PATTERN
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(variance > 0.0, product / np.sqrt(variance * float(centred @ centred)), np.nan)
+
+
+def _refuse_missing(seen: NDArray[np.bool_], name: str) -> None:
+    lost = np.flatnonzero(~seen)
+    if len(lost) > _MISSING * len(seen) or len(seen) - len(lost) < LEAST_LINES:
+        listed = ", ".join(str(i) for i in lost[:8]) + (" …" if len(lost) > 8 else "")
+        raise InputError(
+            f"{name}: no edge in {len(lost)} of {len(seen)} lines ({listed}, counted from the window's first); at most "
+            f"{100 * _MISSING:.0f} % may lack it. Choose a window that the edge crosses from its first line to its last"
+        )

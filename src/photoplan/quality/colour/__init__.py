@@ -1,1 +1,0 @@
-"""Lateral chromatic aberration: measured between bands, modelled over the field."""

@@ -1,1 +1,0 @@
-"""Reports and pictures of terrain models."""

@@ -1,1 +1,0 @@
-"""Reports of edges and test patterns."""

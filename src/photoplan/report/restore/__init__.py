@@ -1,1 +1,0 @@
-"""Reports of restorations and pictures of filters."""

@@ -1,1 +1,0 @@
-"""Triangles of a hybrid model where lines pass."""

@@ -1,1 +1,0 @@
-"""Contradictions in measured points and lines, cleaned or reported."""
