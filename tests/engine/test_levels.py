@@ -167,6 +167,6 @@ def test_a_file_is_read_once_however_its_tiles_lie(tmp_path: Path, monkeypatch: 
     cam = Pinhole(Pose.from_angles((0, 0, 100), (0.01, 0.02, 0.8)), 2000.0, (2000, 2400))
     grid = MapGrid.covering((-100, -100, 100, 100), 0.5, "EPSG:32615")
     plan = product(grid, side=64)
-    for tile in plan.footprint:
+    for tile in plan.tiles:
         render(plan, tile, [Source(cam, reader)], LevelSurface(0.0), "bicubic")
     assert 0.9 * image.size < full.pixels < 1.2 * image.size

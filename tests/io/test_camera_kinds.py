@@ -85,9 +85,9 @@ def test_a_described_lens_has_the_coefficients_of_the_lens_that_computes(entry: 
     assert own == [field.name for field in fields(lens)]
 
 
-def test_no_file_is_longer_than_800_lines() -> None:
+def test_no_file_is_longer_than_1200_lines() -> None:
     long = {str(file.relative_to(ROOT)): len(file.read_text().splitlines()) for file in ROOT.rglob("*.py")}
-    assert {name: lines for name, lines in long.items() if lines > 800} == {}
+    assert {name: lines for name, lines in long.items() if lines > 1200} == {}
 
 
 def test_a_class_name_has_one_meaning() -> None:

@@ -100,7 +100,8 @@ from pathlib import Path
 import numpy as np
 sys.path.insert(0, sys.argv[2])
 import test_product_faults as here
-from photoplan.io import naming, product
+from photoplan.io import product
+from photoplan.io import store as naming
 
 moment = sys.argv[3]
 def die(*args, **kwargs):

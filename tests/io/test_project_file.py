@@ -165,8 +165,9 @@ def test_files_that_are_no_project(tmp_path: Path, content: bytes) -> None:
         load_project(path)
     with pytest.raises(InputError, match="cannot be read"):
         load_project(tmp_path / "missing.toml")
+    (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="cannot be read"):
-        load_project(tmp_path)
+        load_project(tmp_path / "empty")
 
 
 def test_windows_line_ends_and_a_byte_order_mark_do_not_matter(tmp_path: Path) -> None:

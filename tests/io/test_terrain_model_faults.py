@@ -29,7 +29,7 @@ import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from tools import small_model
-from photoplan.io import naming
+from photoplan.io import store as naming
 from photoplan.io.terrain import model_write as module
 
 moment = sys.argv[3]

@@ -204,7 +204,7 @@ def load_chromatic(path: Path) -> ChromaticModel:
 
 
 def save_chromatic(path: Path, model: ChromaticModel) -> None:
-    """Write a model; raises as `photoplan.io.disk.write_atomically`."""
+    """Write a model; raises as `photoplan.io.store.write_atomically`."""
     contents = {"image_size": model.size, **pick(model, "reference", "description")}
     keys = ("band", "kind", "terms", "sigmas", "residual", "count", "rejected")
     write_chromatic(path, contents, [pick(band, *keys) for band in model.bands])
