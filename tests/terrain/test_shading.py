@@ -92,7 +92,7 @@ def test_a_sphere_converges_with_the_square_of_the_pixel() -> None:
         v, u = np.mgrid[:n, :n]
         X, Y = np.moveaxis(grid.to_map(np.stack([u, v], axis=-1)), -1, 0)
         normal = np.stack([X, Y, f(X, Y)], axis=-1) / 50
-        worst.append(np.abs(shade - normal @ light.directions[0]).max())
+        worst.append(np.abs(shade - normal @ shading.directions(light)[0]).max())
     assert worst[0] < 0.002
     # The outermost pixels, where it is worst, move outwards with n: a little less than 16.
     assert worst[0] / worst[2] > 12

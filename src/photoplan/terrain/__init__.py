@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = public(
         "terrain.build": "BuildPlan Built build_terrain plan_build",
         "terrain.settings": "BuildSettings",
         "terrain.options": "ContourOptions Lighting",
-        "terrain.shading": "aspect hillshade slope_degrees surface_slopes",
+        "terrain.shading": "aspect directions hillshade slope_degrees surface_slopes",
         "terrain.volume": "volume_between",
         "terrain.flow": "flow_of",
     },
