@@ -16,6 +16,7 @@ from tools.command import Here
 from tools.facet_scene import GROUND, write_scene
 from tools.small_block import X0, Y0, Block
 
+from photoplan.products.surface import plan as surface_plan
 from photoplan.products.surface import run as surfaces
 
 
@@ -69,7 +70,8 @@ def test_fault_26_the_same_bytes_of_a_surface(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Heights, grey values and all that is beside them, in two tiles."""
-    monkeypatch.setattr(surfaces, "TILE", 128)
+    for module in (surface_plan, surfaces):
+        monkeypatch.setattr(module, "TILE", 128)
     scene, made = write_scene(tmp_path, 3), {}
     words = ("surface", scene.path, "--resolution", 0.5, "--bounds", X0 - 18, Y0 - 34, X0 + 18, Y0 + 34)
     words += ("--start", GROUND, "--residuals", "--workers", 2, "--no-quicklook", "-q", "--points", "points.ply")
