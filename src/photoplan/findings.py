@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from photoplan.errors import InputError, TilesFailed
 
 
 class Result:
@@ -30,3 +32,12 @@ class Result:
 def noted(notes: Iterable[str]) -> list[str]:
     """Return notes that begin with ``note:``, but for warnings, once each."""
     return [note if note.startswith(("note:", "warning:")) else f"note: {note}" for note in dict.fromkeys(notes)]
+
+
+def raise_failed(failed: Mapping[str, str], done: int, what: str = "images failed") -> None:
+    """Name the images that failed, with the reasons, if any did."""
+    if failed and not done:
+        raise InputError("\n".join(failed.values()))
+    if failed:
+        listed = "\n".join(f"  {reason}" for reason in failed.values())
+        raise TilesFailed(f"{len(failed)} of {len(failed) + done} {what}:\n{listed}")

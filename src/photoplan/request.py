@@ -22,7 +22,11 @@ _LIMITS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at 
 
 
 def opt(help: str, default: Any = ..., **how: Any) -> Any:
-    """Declare a field that is an option of the command line; without a default it is required."""
+    """Declare a field that is an option of the command line; without a default it is required.
+
+    Beside limits: `section`, `metavar`, `flag` (its name), `off` (it turns off what the field states), `writes`,
+    `listed` (values with commas), `choices` (words, or a mapping from words to values), `folder`, `project`, `size`.
+    """
     limits = {name: how.pop(name) for name in _LIMITS if name in how}
     if how.pop("infinite", False):
         limits["allow_inf_nan"] = True
@@ -73,6 +77,11 @@ class Request(BaseModel):
     def product(self) -> Path:
         """The file beside which pictures stand: the first that is written."""
         return next(path for paths in self.files_written().values() for path in paths)
+
+    @property
+    def drawn(self) -> Mapping[str, Path]:
+        """Pictures and reports whose places follow from other options, by their keys in the table of verbs."""
+        return {}
 
     def files_read(self) -> list[Path]:
         """Return the files that it reads, in the order of the fields."""

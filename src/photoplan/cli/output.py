@@ -7,11 +7,11 @@ option of the verb that runs: ``give --overwrite to replace it``. `` `report=Fal
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import click
 
-from photoplan.errors import InputError, TilesFailed
+from photoplan.findings import raise_failed as end_with_failures  # noqa: F401
 
 _PARAMETER = re.compile(r"`([a-z][a-z0-9_]*)(=False)?`")
 _DOUBT = re.compile(r"\s*(?:warning|note):")
@@ -94,12 +94,3 @@ def _spelled(text: object) -> str:
     context = click.get_current_context(silent=True)
     plain = printable(str(text))
     return spelled(plain, context.command, context.find_root().command) if context else plain
-
-
-def end_with_failures(failed: Mapping[str, str], done: int, what: str = "images failed") -> None:
-    """Name the images that failed, if any did."""
-    if failed and not done:
-        raise InputError("\n".join(failed.values()))
-    if failed:
-        listed = "\n".join(f"  {reason}" for reason in failed.values())
-        raise TilesFailed(f"{len(failed)} of {len(failed) + done} {what}:\n{listed}")

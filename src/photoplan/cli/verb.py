@@ -6,7 +6,7 @@ import importlib
 import types
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 import click
 
 from photoplan.cli.options import BYTES, NEW_FOLDER, PATH, PROJECT, all_cores, json_option, listed, quiet_option
-from photoplan.cli.output import can_draw, show, show_json, talking
+from photoplan.cli.output import can_draw, show, show_json, spelled, talking
 
 if TYPE_CHECKING:
+    from photoplan.report.page import ReportFile
     from photoplan.request import Request
 
 #: Sections of the help, in their order.
@@ -32,7 +33,8 @@ class Verb:
     request: str
     make: str
     draw: Mapping[str, str] = field(default_factory=dict)
-    """By option, or option and ending such as ``outputs.png``: the function that draws that file from the result."""
+    """The function that draws a file from the result, by option, option and ending such as ``outputs.png``, or key of
+    `Request.drawn`. That of a folder, such as ``pictures/``, returns pictures by place; `make` has checked places."""
     record: str = ""
     """Kind of the run record, for operations that write none themselves."""
 
@@ -69,7 +71,7 @@ class VerbCommand(click.Command):
             rows = [
                 p.get_help_record(ctx) for p in self.get_params(ctx) if self.section_of.get(p.name or "") == section
             ]
-            if rows := [row for row in rows if row is not None]:
+            if rows := [(row[0], spelled(row[1], self)) for row in rows if row is not None]:
                 with formatter.section(title):
                     formatter.write_dl(rows)
 
@@ -84,40 +86,40 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     """Run the operation of a verb, draw what is drawn, and print the result."""
     from photoplan.cli.telling import Telling
     from photoplan.io.store import recording, together
-    from photoplan.report.page import open_picture, open_report
 
-    dry_run, overwrite = getattr(request, "dry_run", False), getattr(request, "overwrite", False)
+    dry_run = getattr(request, "dry_run", False)
     talk = talking(quiet)
     drawn = {
-        path: verb.draw[key]
+        path: key
         for name, paths in request.files_written().items()
         for path in paths
-        for key in (name, name + path.suffix.lower())
+        for key in (name, name + path.suffix.lower(), f"{name}/")
         if key in verb.draw
-    }
+    } | {path: key for key, path in request.drawn.items()}
     picture = next((name for name in verb.draw if getattr(request, name, None) is True), None)
     if picture and not dry_run and can_draw(True, talk):
-        drawn[request.product.with_suffix(".png")] = verb.draw[picture]
-    opened = {} if dry_run else {
-        path: (open_report if path.suffix.lower() == ".html" else open_picture)(
-            path, request.files_read(), overwrite=overwrite
-        )
-        for path in drawn
-    }  # fmt: skip
+        drawn[request.product.with_suffix(".png")] = picture
+    opened = {} if dry_run else {path: _opened(path, key, request) for path, key in drawn.items()}
     recorded = recording(verb.record, request, request.files_read()) if verb.record and not dry_run else nullcontext()
     with recorded as record, together() if opened else nullcontext():
         with Telling(quiet) as events:
             result = load(verb.make)(request, events)
         made: list[Path] = []
         for path, file in opened.items():
-            if file is not None and (content := load(drawn[path])(result)) is not None:
-                file.write(content)
-                made.append(path)
+            if file is not None and (content := load(verb.draw[drawn[path]])(result)) is not None:
+                each = content if isinstance(content, Mapping) else {path: content}
+                made += [replace(file, path=place).write(one) for place, one in each.items()]
         files = [*result.written(), *made]
         if record is not None:
             record(files, result)
     if as_json:
-        more = {name: path for name in type(request).model_fields if (path := getattr(request, name)) in made}
+        more: dict[str, Any] = {
+            name: path if path in made else None
+            for name in type(request).model_fields
+            if isinstance(path := getattr(request, name), Path | None) and name in verb.draw
+        }
+        if request.drawn:
+            more["files"] = files
         if picture:
             more["picture"] = next((path for path in made if path not in more.values()), None)
         show_json(result, **more)
@@ -128,6 +130,18 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
         if not as_json or message.startswith(("note:", "warning:")):
             talk(message)
     result.raise_failures()
+
+
+def _opened(path: Path, key: str, request: Any) -> ReportFile | None:
+    """Return a picture, a report or a folder of pictures to be, checked before any work."""
+    from photoplan.report.drawing import load_matplotlib
+    from photoplan.report.page import ReportFile, open_picture, open_report
+
+    if key.endswith("/"):
+        load_matplotlib("a picture", "leave the pictures out")
+        return ReportFile(path)
+    opening, overwrite = open_report if key == "report" else open_picture, getattr(request, "overwrite", False)
+    return opening(path, request.files_read(), overwrite=overwrite, project=getattr(request, "project", None))
 
 
 def _request(kind: type[Request], given: dict[str, Any]) -> Request:
@@ -175,6 +189,8 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
             if how.get("listed"):
                 more["callback"] = _numbers if hint in (int, float) else _words
     choices = [str(each) for each in get_args(hint)] if get_origin(hint) is Literal else how.get("choices")
+    if isinstance(choices, Mapping):
+        more["callback"] = partial(_value_of, choices)
     kind: Any = click.Choice(choices) if choices else BYTES if how.get("size") else hint
     if hint is Path:
         kind = NEW_FOLDER if how.get("folder") else PROJECT if how.get("project") else PATH
@@ -183,11 +199,11 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     if how.get("argument"):
         if more.pop("multiple", False):
             more["nargs"] = -1
-        return click.Argument([name], type=kind, **more)
+        return click.Argument([name], type=kind, required=entry.is_required(), **more)
     flag = "--" + str(how.get("flag", name.replace("_", "-")))
     default = None if entry.is_required() else entry.get_default(call_default_factory=True)
     if hint is bool:
-        if flag[2:].startswith("no-"):
+        if how.get("off") or flag[2:].startswith("no-"):
             return click.Option([name, flag], is_flag=True, flag_value=False, default=True, help=entry.description)
         both = bool(default) or optional
         names = [name, flag + (f"/--{'no'}-{flag[2:]}" if both else "")]
@@ -195,6 +211,8 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     if name == "workers":
         more["callback"], kind, default = all_cores, click.IntRange(1), None
     names = [name, *(["-o"] if name in ("output", "outputs") else []), flag]
+    if isinstance(choices, Mapping):
+        default = next((word for word, value in choices.items() if value == default), None)
     shown = default is not None and default != () and "[" not in (entry.description or "")
     if "multiple" in more:
         default = default or None
@@ -202,6 +220,10 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     return click.Option(
         names, type=kind, required=needed, help=entry.description, default=default, show_default=shown, **more
     )
+
+
+def _value_of(choices: Mapping[str, Any], context: click.Context, parameter: click.Parameter, word: str | None) -> Any:
+    return None if word is None else choices[word]
 
 
 def _words(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> tuple[str, ...]:
