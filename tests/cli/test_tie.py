@@ -155,11 +155,15 @@ def test_unoriented_images_need_no_terrain(photoplan: Here, project: Path) -> No
     assert said.code == 0 and "1 tried (all pairs)" in said.out
 
 
-def test_small_standard_deviations_are_printed_with_two_figures(capsys: pytest.CaptureFixture[str]) -> None:
-    from photoplan.cli.tie import _print
-    from photoplan.products.tie import TieReport
-
-    none = {"output": None, "refined": None, "loops": None, "rays": {2: 7}, "notes": (), "parts": ()}
-    counts = {"factor": 1, "pairs": 1, "verified": 1, "tracks": 7, "ambiguous": 0, "points": 7}
-    _print(TieReport(**none, **counts, images=("a", "b"), chosen="all", per_image={"a": 7, "b": 7}, sigma=0.00556))  # type: ignore[arg-type]
-    assert "standard deviation 0.0056 px" in capsys.readouterr().out
+def test_small_standard_deviations_are_printed_with_two_figures() -> None:
+    counts = {
+        "factor": 1,
+        "pairs": 1,
+        "verified": 1,
+        "tracks": 7,
+        "points": 7,
+        "rays": {2: 7},
+        "per_image": {"a": 7, "b": 7},
+    }
+    report = tie_work.TieReport(None, ("a", "b"), "all", notes=(), sigma=0.00556, **counts)  # type: ignore[arg-type]
+    assert "standard deviation 0.0056 px" in "\n".join(report.summary())

@@ -25,7 +25,17 @@ VERBS: dict[str, str | Verb] = {
     "convert": "Orientations from one file format to another.",
     "fiducials": "Find the fiducial marks of film scans.",
     "interior": "Interior orientation of film scans from their marks.",
-    "tie": "Find tie points between images.",
+    "tie": Verb(
+        "Find tie points between images.",
+        """Find points that several images of PROJECT have in common.
+
+        They are written as a table (point, image, column, row, standard deviations), which becomes an entry of
+        [observations] in PROJECT. Images that are not connected with the others are named.
+        """,
+        "requests.orient:TieRequest",
+        "products.tie:find_ties",
+        {"picture": "report.tie:draw_ties"},
+    ),
     "control": Verb(
         "Propose control points from an orthophoto and heights.",
         """Propose control for the approximately oriented images of PROJECT.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from photoplan.cameras.observed import ImagePoints
 from photoplan.engine.run import Steps, Store, steps
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import lock_of
 from photoplan.io.files import ImageNames, fingerprint, read_text
@@ -67,6 +68,7 @@ from photoplan.products.rectify import rectify
 from photoplan.project.cameras import check_camera_size, pose_of
 from photoplan.project.ground import ground_of
 from photoplan.project.scene import Scene, input_files, open_scene
+from photoplan.requests.orient import TieRequest
 
 #: Up to so many images all pairs are tried where nothing is known of their places.
 FEW_IMAGES = 30
@@ -542,42 +544,6 @@ _FEATURE_SIGMA, _FEATURE_SHARE = 0.3, 0.2
 
 
 @dataclass(frozen=True)
-class TieRequest:
-    """What is asked."""
-
-    project: Path
-    images: tuple[str, ...] = ()
-    """Names or patterns; none: all."""
-    pairs: str = "auto"
-    """auto, all, or a file."""
-    scale: float | None = None
-    """Of the image in which features are looked for: 1, 0.5, 0.33 …; None: as the size of the images asks."""
-    features: int = 4000
-    """Features per image."""
-    levels: int = 4
-    """Kinds of features that are tried at most: as stated; where images stay unconnected at half and a quarter of the
-    scale, and more of them with less contrast."""
-    per_image: int = 500
-    """Tie points that an image is to have."""
-    refine: bool = True
-    use_orientation: bool = True
-    output: Path | None = None
-    workers: int = 1
-    overwrite: bool = False
-    dry_run: bool = False
-
-    @property
-    def table(self) -> Path:
-        """The table that is written."""
-        return self.output or self.project.resolve().parent / "tie_points.csv"
-
-    @property
-    def pairs_table(self) -> Path:
-        """The table of all pairs beside it."""
-        return self.table.with_name(f"{self.table.stem}_pairs.csv")
-
-
-@dataclass(frozen=True)
 class TriedPair:
     """A pair of images at one level of features."""
 
@@ -596,8 +562,8 @@ class TriedPair:
 
 
 @dataclass(frozen=True)
-class TieReport:
-    """What was found."""
+class TieReport(Result):
+    """Tie points of a project, and how they were found."""
 
     output: Path | None
     """The table of image points; None after a dry run."""
@@ -605,24 +571,24 @@ class TieReport:
     chosen: str
     """How pairs were chosen."""
     factor: int
-    """Features were looked for in means of so many pixels along each side."""
+    """Features were searched in means of so many pixels along each side."""
     pairs: int
-    verified: int
-    tracks: int
-    """Before thinning."""
-    ambiguous: int
-    """Dropped: two places in one image."""
-    points: int
-    rays: dict[int, int]
-    """Number of points by their number of images."""
-    per_image: dict[str, int]
-    parts: tuple[tuple[str, ...], ...]
-    """Images that hang together, the largest part first."""
-    refined: Refined | None
-    loops: Loops | None
-    sigma: float
-    """Median standard deviation of a coordinate, pixels."""
     notes: tuple[str, ...]
+    verified: int = 0
+    tracks: int = 0
+    """Before thinning."""
+    ambiguous: int = 0
+    """Dropped: two places in one image."""
+    points: int = 0
+    rays: Mapping[int, int] = field(default_factory=dict)
+    """Number of points by their number of images."""
+    per_image: Mapping[str, int] = field(default_factory=dict)
+    parts: tuple[tuple[str, ...], ...] = ()
+    """Connected images, the largest part first."""
+    refined: Refined | None = None
+    loops: Loops | None = None
+    sigma: float = float("nan")
+    """Median standard deviation of a coordinate, pixels."""
     tried: tuple[TriedPair, ...] = ()
     """All pairs at all levels."""
     advice: str = ""
@@ -651,18 +617,46 @@ class TieReport:
             "refined": refined and pick(refined, "correlation", "unsettled", "unlike", "uncertain"),
         }
 
+    def summary(self) -> Sequence[str]:
+        """Return counts, the quality of the refinement, and the points of each image."""
+        if not self.per_image:
+            return [f"{len(self.images)} images, {self.pairs or 'not yet known number of'} pairs: {self.chosen}"]
+        kinds = dict.fromkeys((t.scale, t.features) for t in self.tried)
+        scales = [f"1/{1 / scale:.0f}" + (f" ({count})" if k else "") for k, (scale, count) in enumerate(kinds)]
+        rows = {
+            "images": f"{len(self.images)}, features at scale " + ", ".join(scales),
+            "pairs": f"{self.pairs} tried ({self.chosen}), {self.verified} verified",
+            "tracks": f"{self.tracks} found, {self.ambiguous} ambiguous ones dropped",
+            "tie points": f"{self.points}, standard deviation {self.sigma:.2g} px (median)",
+            "  in images": ", ".join(f"{rays}: {count}" for rays, count in self.rays.items()),
+        }
+        if self.refined is not None and self.loops is not None:
+            r, loops = self.refined, self.loops
+            origin = f"from {loops.count} loops" if loops.measured else "assumed, too few loops"
+            fit = f"correlation {r.correlation:.2f} (median), sigma of the fit × {loops.factor:.2f} ({origin})"
+            rows["refinement"] = fit
+            rows["  left out"] = f"{r.unsettled} not found, {r.unlike} unlike, {r.uncertain} uncertain"
+        width = max(map(len, self.per_image))
+        return [
+            *(f"{what:12} {text}" for what, text in rows.items()),
+            f"{'image':{width}}  points",
+            *(f"{name:{width}}  {count:6}" for name, count in self.per_image.items()),
+        ]
+
+    def messages(self) -> Sequence[str]:
+        """Return the notes, and the images that are not connected with the others."""
+        if len(self.parts) < 2:
+            return noted(self.notes)
+        head = f"{len(self.unconnected)} of {len(self.images)} images do not hang together with the others"
+        lines = [f"no overlap: {head}:", *("  " + ", ".join(part) for part in self.parts[1:]), self.advice]
+        return noted([*self.notes, "\n".join(lines)])
+
 
 def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     """Find tie points between the images of a project.
 
     Features, matches and refined places are kept in a file ``NAME.matches`` beside the output: a run that was
     interrupted continues, and another one with the same features begins with what is known.
-
-    Parameters
-    ----------
-    request : TieRequest
-    events : Events
-        Told what is done next, and how far it is.
 
     Raises
     ------
@@ -682,7 +676,8 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     factor = _factor(request, images)
     pairs, chosen = chosen_pairs(images, request.pairs)
     if request.dry_run:
-        return _dry(names, pairs, chosen, factor, notes)
+        count = 0 if pairs is None else len(pairs)
+        return TieReport(None, tuple(names), chosen, factor, count, tuple(notes))
     entry = input_entry(request.project)
     settings, verify = FeatureSettings(request.features, factor), VerifySettings(threshold=2.0 * factor)
     log = ResultLog(output.with_suffix(".matches"), f"{_FORM} {settings} {verify}", lock_of(output))
@@ -716,9 +711,30 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     with together():
         write_image_points(output, points)
         _enter(request.project, project, output)
-        report = _report(names, chosen, levels, len(pairs), verified, tracks, notes)
-        report = replace(report, output=output, refined=refined, loops=loops, sources=tuple(images), found=tracks)
-        report = replace(report, tried=tried, advice=_advice(request, report, tried))
+        rays, number = np.unique(tracks.rays, return_counts=True)
+        per_image = np.bincount(tracks.image, minlength=len(names))
+        report = TieReport(
+            output=output,
+            images=tuple(names),
+            chosen=chosen,
+            factor=levels[0].factor,
+            pairs=len(pairs),
+            notes=tuple(notes),
+            verified=verified,
+            tracks=sum(level.found.tracks.count for level in levels),
+            ambiguous=sum(level.found.ambiguous for level in levels),
+            points=tracks.count,
+            rays={int(k): int(n) for k, n in zip(rays, number)},
+            per_image={name: int(n) for name, n in zip(names, per_image)},
+            parts=tuple(tuple(names[k] for k in part) for part in connected_parts(len(names), tracks)),
+            refined=refined,
+            loops=loops,
+            sigma=float(np.median(tracks.sigma)),
+            tried=tried,
+            sources=tuple(images),
+            found=tracks,
+        )
+        report = replace(report, advice=_advice(request, report, tried))
         _write_pairs(request.pairs_table, tried)
         write_run_record(
             output,
@@ -736,18 +752,10 @@ def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
     """The output, and everything that can be refused before any work."""
     if len(names) < 2:
         raise UsageError(f"{len(names)} image; tie points need two images at least")
-    if request.levels < 1:
-        raise UsageError(f"`levels` {request.levels}; 1 is the least")
-    if request.features < 50 or request.per_image < 1:
-        raise UsageError(
-            f"{request.features} features and {request.per_image} points per image; 50 and 1 are the least"
-        )
     opencv()
-    output = request.table
+    output = request.product
     points = [project.resolve(file) for file in project.observations.image_points]  # an older run's among them
     inputs = [request.project, *(file for file in input_files(project) if file not in points)]
-    if output.suffix.lower() in (".png", ".matches", ".json"):
-        raise UsageError(f"{output}: a table is written; give it a name such as tie_points.csv")
     if request.pairs not in ("auto", "all"):
         inputs.append(Path(request.pairs))
     if not request.dry_run:
@@ -758,8 +766,6 @@ def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
 
 def _factor(request: TieRequest, images: Sequence[TieImage]) -> int:
     if request.scale is not None:
-        if not 0.01 <= request.scale <= 1:
-            raise UsageError(f"scale {request.scale:g}; a number from 0.01 to 1 is needed, such as 0.5")
         return round(1 / request.scale)
     longest = max(max(image.grey.size) for image in images)
     return max(1, -(-longest // _LONGEST))
@@ -869,29 +875,6 @@ def _advice(request: TieRequest, report: TieReport, tried: Sequence[TriedPair]) 
     )
 
 
-def _dry(
-    names: Sequence[str], pairs: list[tuple[int, int]] | None, chosen: str, factor: int, notes: list[str]
-) -> TieReport:
-    return TieReport(
-        output=None,
-        images=tuple(names),
-        chosen=chosen,
-        factor=factor,
-        pairs=0 if pairs is None else len(pairs),
-        verified=0,
-        tracks=0,
-        ambiguous=0,
-        points=0,
-        rays={},
-        per_image={},
-        parts=(),
-        refined=None,
-        loops=None,
-        sigma=float("nan"),
-        notes=tuple(notes),
-    )
-
-
 def _refuse_nothing(
     request: TieRequest, verified: int, tried: int, names: Sequence[str], levels: Sequence[_Level]
 ) -> None:
@@ -984,35 +967,3 @@ def _enter(path: Path, project: Project, output: Path) -> None:
     whole = output.resolve()
     written = whole.relative_to(folder).as_posix() if whole.is_relative_to(folder) else os.fspath(whole)
     edit_project(path, ProjectChanges(tables={"observations": {"image_points": [*listed, written]}}))
-
-
-def _report(
-    names: Sequence[str],
-    chosen: str,
-    levels: Sequence[_Level],
-    pairs: int,
-    verified: int,
-    tracks: Tracks,
-    notes: list[str],
-) -> TieReport:
-    rays, number = np.unique(tracks.rays, return_counts=True)
-    per_image = np.bincount(tracks.image, minlength=len(names))
-    parts = connected_parts(len(names), tracks)
-    return TieReport(
-        output=None,
-        images=tuple(names),
-        chosen=chosen,
-        factor=levels[0].factor,
-        pairs=pairs,
-        verified=verified,
-        tracks=sum(level.found.tracks.count for level in levels),
-        ambiguous=sum(level.found.ambiguous for level in levels),
-        points=tracks.count,
-        rays={int(k): int(n) for k, n in zip(rays, number)},
-        per_image={name: int(n) for name, n in zip(names, per_image)},
-        parts=tuple(tuple(names[k] for k in part) for part in parts),
-        refined=None,
-        loops=None,
-        sigma=float(np.median(tracks.sigma)),
-        notes=tuple(notes),
-    )

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import shortest_path
 
 from photoplan.geometry.grid import Window
 from photoplan.matching.features import Tracks, to_bytes
-from photoplan.products.tie import TieImage
+from photoplan.products.tie import TieImage, TieReport
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SKY, SOFT, figure_of, png, styled
 
 #: Colours of points in two, three, four, and five or more images.
@@ -23,8 +23,11 @@ _SIDE = 700
 
 
 @styled
-def draw_ties(images: Sequence[TieImage], tracks: Tracks) -> bytes:
-    """Network and views, as PNG; images are read again for small copies."""
+def draw_ties(report: TieReport) -> bytes | None:
+    """Draw network and views; images are read again for small copies."""
+    images, tracks = report.sources, report.found
+    if tracks is None:
+        return None
     points = np.bincount(tracks.image, minlength=len(images))
     shown = _spread(points)
     rows = -(-len(shown) // 2)

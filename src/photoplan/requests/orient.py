@@ -1,10 +1,11 @@
-"""Requests of commands that orient images: control from orthophotos."""
+"""Requests of commands that orient images: tie points, control from orthophotos."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from photoplan.request import DRY_RUN, IMAGES, ONE_WORKER, OVERWRITE, PROJECT, Request, opt
+from photoplan.errors import UsageError
+from photoplan.request import DRY_RUN, IMAGES, ONE_WORKER, OVERWRITE, PICTURE, PROJECT, Request, opt
 
 
 class ControlRequest(Request):
@@ -32,3 +33,44 @@ class ControlRequest(Request):
     dry_run: bool = DRY_RUN
     workers: int = ONE_WORKER
     overwrite: bool = OVERWRITE
+
+
+class TieRequest(Request):
+    """Options of tie points between the images of a project."""
+
+    project: Path = PROJECT
+    images: tuple[str, ...] = IMAGES
+    pairs: str = opt("Pairs of images that are compared: auto, all, or a file with two names in each line.", "auto",
+                     metavar="auto|all|FILE")  # fmt: skip
+    scale: float | None = opt("Scale of the images in which features are searched, e.g. 0.5 [by their size].", None)
+    features: int = opt("Features per image.", 4000)
+    levels: int = opt(
+        "Kinds of features that are tried while images stay unconnected: as stated, coarser, then more.", 4, ge=1, le=4
+    )
+    per_image: int = opt("Tie points that an image is to have.", 500)
+    refine: bool = opt("Take features as they are, without least-squares matching.", True, flag="no-refine")
+    use_orientation: bool = opt("Work as if no image had a position.", True, flag="ignore-orientation", off=True)
+    output: Path | None = opt("Tie points to write [tie_points.csv by the project].", None, metavar="CSV", writes=True)
+    picture: bool = PICTURE
+    dry_run: bool = DRY_RUN
+    workers: int = ONE_WORKER
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse numbers with which nothing is found, and names that other files need."""
+        if self.features < 50 or self.per_image < 1:
+            raise UsageError(f"{self.features} features and {self.per_image} points per image; 50 and 1 are the least")
+        if self.scale is not None and not 0.01 <= self.scale <= 1:
+            raise UsageError(f"scale {self.scale:g}; a number from 0.01 to 1 is needed, such as 0.5")
+        if self.product.suffix.lower() in (".png", ".matches", ".json"):
+            raise UsageError(f"{self.product}: a table is written; give it a name such as tie_points.csv")
+
+    @property
+    def product(self) -> Path:
+        """The table of tie points."""
+        return self.output or self.project.resolve().parent / "tie_points.csv"
+
+    @property
+    def pairs_table(self) -> Path:
+        """The table of all pairs beside it."""
+        return self.product.with_name(f"{self.product.stem}_pairs.csv")
