@@ -25,7 +25,8 @@ def opt(help: str, default: Any = ..., **how: Any) -> Any:
     """Declare a field that is an option of the command line; without a default it is required.
 
     Beside limits: `section`, `metavar`, `flag` (its name), `off` (it turns off what the field states), `writes`,
-    `listed` (values with commas), `choices` (words, or a mapping from words to values), `folder`, `project`, `size`.
+    `listed` (values with commas), `choices` (words, or a mapping from words to values), `folder`, `project`, `size`;
+    and `draws` for a dry run that draws what is asked all the same.
     """
     limits = {name: how.pop(name) for name in _LIMITS if name in how}
     if how.pop("infinite", False):

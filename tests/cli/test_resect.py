@@ -17,11 +17,13 @@ from photoplan.cameras.base import project as project_points
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Brown
-from photoplan.cli.resect import command
+from photoplan.cli.main import VERBS
 from photoplan.errors import GeometryError, InputError, TilesFailed, UsageError
 from photoplan.geometry.pose import Pose, rotation_from_angles
 from photoplan.io.project.file import load_project
 from photoplan.project.scene import open_scene
+
+command = VERBS["resect"].command("resect")
 
 SIZE, C = (4000, 3000), 3200.0
 LENS = Brown(k1=-0.05)

@@ -62,7 +62,7 @@ camera = "cam"
 
 def test_what_is_right_is_written(tmp_path: Path) -> None:
     result = resect_project(ResectRequest(made(tmp_path)))
-    assert result.written and not result.failed
+    assert result.written() and not result.failed
     np.testing.assert_allclose(result.images[0].center, CENTER, atol=1.0)
 
 
@@ -79,7 +79,7 @@ def test_impossible_poses_are_refused_and_what_fits_is_named(tmp_path: Path, cha
     path = made(tmp_path, change)
     before = path.read_text()
     result = resect_project(ResectRequest(path))
-    assert not result.written and not result.images
+    assert not result.written() and not result.images
     assert path.read_text() == before
     assert re.search(says, result.failed["a"]), result.failed
     assert fits in result.failed["a"]
@@ -94,7 +94,7 @@ def test_a_reading_that_fits_much_better_is_named_whatever_was_stated(tmp_path: 
 
 def test_where_nothing_fits_this_is_said(tmp_path: Path) -> None:
     result = resect_project(ResectRequest(made(tmp_path, "names")))
-    assert not result.written
+    assert not result.written()
     assert "do not determine" in result.failed["a"]
 
 

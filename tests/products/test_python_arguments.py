@@ -142,17 +142,17 @@ def test_text_is_one_name_and_paths_are_paths(small: Block) -> None:
     request = pp.ResectRequest(str(small.project), images="three", control=small.folder, sigma_image=np.float32(0.5))
     assert (request.project, request.images, request.control) == (small.project, ("three",), (small.folder,))
     assert type(request.sigma_image) is float and pickle.loads(pickle.dumps(request)) == request
-    assert dataclasses.replace(request, images=["a", "b"]).images == ("a", "b")
+    assert request.replace(images=["a", "b"]).images == ("a", "b")
     for call, says in (
         (lambda: pp.resect_project(str(small.project)), "resect_project: request: str.* needed is ResectRequest"),
         (lambda: pp.plan_orthophotos(small.project), "project: PosixPath; needed is Project .*load_project"),
         (lambda: pp.check_project(str(small.project)), "needed is Project"),
         (lambda: pp.execute(project, "x"), "plan: Project; needed is OrthoPlan"),
-        (lambda: pp.ResectRequest(3), "project: int 3; needed is a path"),
+        (lambda: pp.ResectRequest(3), "`project`: int 3; needed is a path"),
         (lambda: pp.ResectRequest(""), "the name is empty"),
         (lambda: pp.ResectRequest("p", sigma_control=(1.0,)), "1 values; needed are 2"),
-        (lambda: pp.ResectRequest("p", sigma_image="1"), "sigma_image: str '1'; needed is a number"),
-        (lambda: pp.ResectRequest("p", critical=float("nan")), r"critical is not a number \(NaN\)"),
+        (lambda: pp.ResectRequest("p", sigma_image="1"), "`sigma_image`: str '1'; needed is a number"),
+        (lambda: pp.ResectRequest("p", critical=float("nan")), r"`critical` is not a number \(NaN\)"),
         (lambda: pp.SampleRequest(np.zeros((3, 3)), "a", "b"), r"`model`: ndarray of shape \(3, 3\); needed is a path"),
     ):
         with pytest.raises(UsageError, match=says):

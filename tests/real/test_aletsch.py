@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photoplan.cli.resect import command
+from photoplan.cli.main import VERBS
 from photoplan.io.project.file import load_project
+
+command = VERBS["resect"].command("resect")
 
 PROJECT = """crs = "EPSG:21781"
 
@@ -75,5 +77,7 @@ def test_points_above_the_camera_need_strict_curvature(facts: dict, tmp_path: Pa
     path = prepared(facts, tmp_path, "correction")
     result = CliRunner().invoke(command, [str(path), "--unknown-camera-constant"])
     assert "not defined for points above the camera; ask for strict" in str(result.exception)
-    plain = CliRunner().invoke(command, [str(prepared(facts, tmp_path, "none")), "--unknown-camera-constant"])
+    plain = CliRunner().invoke(
+        VERBS["resect"].command("resect"), [str(prepared(facts, tmp_path, "none")), "--unknown-camera-constant"]
+    )
     assert plain.exit_code == 0, plain.output

@@ -23,8 +23,29 @@ from photoplan.errors import PhotoplanError, PhotoplanWarning, ResourceError
 VERBS: dict[str, str | Verb] = {
     "init": "Write a project file from the files you have.",
     "convert": "Orientations from one file format to another.",
-    "fiducials": "Find the fiducial marks of film scans.",
-    "interior": "Interior orientation of film scans from their marks.",
+    "fiducials": Verb(
+        "Find the fiducial marks of film scans.",
+        """Find the fiducial marks of scanned film photos, without approximate values.
+
+        IMAGE… are scans, with --camera FILE; or one project file, whose film images are measured and which receives the
+        marks. An image that fails does not stop the others; they are listed at the end (exit code 4).
+        """,
+        "requests.orient:FiducialsRequest",
+        "products.film:locate_fiducials",
+        {"pictures/": "report.fiducials:draw_marks"},
+    ),
+    "interior": Verb(
+        "Interior orientation of film scans from their marks.",
+        """Residuals, sigma0, scales, shear and film shrinkage of the scans in PROJECT.
+
+        An image whose marks are missing, exchanged, mirrored or wrong does not stop the others; they are listed at the
+        end (exit code 4).
+        """,
+        "requests.orient:InteriorRequest",
+        "products.film:interior_orientations",
+        {"report": "report.interior:interior_page", "plot": "report.interior:interior_plot"},
+        record="interior",
+    ),
     "tie": Verb(
         "Find tie points between images.",
         """Find points that several images of PROJECT have in common.
@@ -47,7 +68,17 @@ VERBS: dict[str, str | Verb] = {
         "requests.orient:ControlRequest",
         "products.control:propose_control",
     ),
-    "resect": "Orient single images by control points.",
+    "resect": Verb(
+        "Orient single images by control points.",
+        """Exterior orientation of single images by control points, without initial values.
+
+        Writes center, angles and their standard deviations into PROJECT. An image that fails does not stop the others;
+        they are listed at the end (exit code 4).
+        """,
+        "requests.orient:ResectRequest",
+        "products.film:resect_project",
+        {"report": "report.resect:resect_page"},
+    ),
     "adjust": "Adjust a block of images (bundle adjustment).",
     "check": "Validate a project and print what to expect of it.",
     "budget": "What limits the accuracy of products, cause by cause.",

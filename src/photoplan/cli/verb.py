@@ -86,6 +86,7 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     """Run the operation of a verb, draw what is drawn, and print the result."""
     from photoplan.cli.telling import Telling
     from photoplan.io.store import recording, together
+    from photoplan.request import how_of
 
     dry_run = getattr(request, "dry_run", False)
     talk = talking(quiet)
@@ -99,7 +100,8 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     picture = next((name for name in verb.draw if getattr(request, name, None) is True), None)
     if picture and not dry_run and can_draw(True, talk):
         drawn[request.product.with_suffix(".png")] = picture
-    opened = {} if dry_run else {path: _opened(path, key, request) for path, key in drawn.items()}
+    drawing = not dry_run or how_of(type(request).model_fields["dry_run"]).get("draws")
+    opened = {path: _opened(path, key, request) for path, key in drawn.items()} if drawing else {}
     recorded = recording(verb.record, request, request.files_read()) if verb.record and not dry_run else nullcontext()
     with recorded as record, together() if opened else nullcontext():
         with Telling(quiet) as events:
@@ -124,7 +126,8 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
             more["picture"] = next((path for path in made if path not in more.values()), None)
         show_json(result, **more)
     else:
-        for line in (*files, *result.summary()):
+        # A project that was changed is recorded, and no product.
+        for line in (*(file for file in files if file not in request.files_read()), *result.summary()):
             show(line)
     for message in result.messages():
         if not as_json or message.startswith(("note:", "warning:")):
@@ -202,7 +205,7 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
         return click.Argument([name], type=kind, required=entry.is_required(), **more)
     flag = "--" + str(how.get("flag", name.replace("_", "-")))
     default = None if entry.is_required() else entry.get_default(call_default_factory=True)
-    if hint is bool:
+    if hint is bool and not choices:
         if how.get("off") or flag[2:].startswith("no-"):
             return click.Option([name, flag], is_flag=True, flag_value=False, default=True, help=entry.description)
         both = bool(default) or optional

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,9 +27,12 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Lens
 from photoplan.errors import GeometryError, InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted, raise_failed
 from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.model import FiducialSystem
+from photoplan.io.files import unique_stems
+from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Image, Project, fiducial_fit, interior_of, lens_of
@@ -40,9 +43,8 @@ from photoplan.orientation.bundle.model import AdjustedCamera
 from photoplan.orientation.judgement import fitting, impossible, of_resection
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
 from photoplan.orientation.marks.layout import FiducialResult, MarkLayout, MarksNotFound, SoughtMark
-from photoplan.orientation.marks.locate import LEAST_CORRELATION
 from photoplan.orientation.resection import MeasuredPoints, Resected, ResectSettings, resect
-from photoplan.plain import pick
+from photoplan.plain import pick, shown_metres
 from photoplan.products.adjust.inputs import AdjustInputs, decimals_of, read_inputs, stated_accuracy
 from photoplan.products.adjust.sensors import (
     Calibrated,
@@ -54,6 +56,7 @@ from photoplan.products.adjust.sensors import (
 )
 from photoplan.project.camera_marks import ScanImage, mark_patterns, stated_pixel_mm
 from photoplan.project.cameras import stated_pose
+from photoplan.requests.orient import FiducialsRequest, InteriorRequest, ResectRequest
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +74,15 @@ class ImageFiducials:
     layout: MarkLayout
     """What was sought."""
     found: FiducialResult
+    picture: Path | None
+    """Where it is drawn."""
 
     def json_fields(self) -> dict[str, Any]:
         """Every mark, and the affine transformation."""
         found, fit = self.found, self.found.fit
         residuals = dict(zip(fit.names, found.residuals_um))
         return {
-            **pick(self, "file", "camera", "size", "grey", image="name"),
+            **pick(self, "file", "camera", "size", "grey", "picture", image="name"),
             "pixel_um": 1000 * found.pixel_mm,
             **pick(found.turn, "rotation", "mirrored"),
             **pick(found, "negative", "blur_px", "notes"),
@@ -129,47 +134,44 @@ class UnfoundFiducials:
     """Band that was used; None: luminance."""
     layout: MarkLayout
     sought: tuple[SoughtMark, ...]
+    picture: Path | None
+    """Where it is drawn."""
 
 
 @dataclass(frozen=True, eq=False)
-class FiducialsReport:
+class FiducialsReport(Result):
     """Marks of all images."""
 
     images: tuple[ImageFiducials, ...]
     failed: dict[str, str]
     """Reasons, by image."""
     unfound: tuple[UnfoundFiducials, ...]
-    """Of the failed ones those on which marks were sought and not found, to be looked at."""
-    written: Path | None
+    """Failed images on which marks were searched and not found, to be looked at."""
+    project: Path | None
     """Project file that received the marks."""
 
     def json_fields(self) -> dict[str, Any]:
         """Failures as a list."""
-        failed = [{"image": name, "reason": reason} for name, reason in self.failed.items()]
-        return {**pick(self, "images", project="written"), "failed": failed}
+        return {**pick(self, "images", "project"), "failed": _reasons(self.failed)}
+
+    def summary(self) -> Sequence[str]:
+        """Return the marks of each image."""
+        return [str(image) for image in self.images]
+
+    def messages(self) -> Sequence[str]:
+        """Return the notes on images, the pictures of those that failed, and what was written into the project."""
+        notes = [f"{image.name}: {note}" for image in self.images for note in image.found.notes]
+        notes += [f"{u.name}: where its marks were sought: {u.picture}" for u in self.unfound if u.picture]
+        changed = [f"{self.project}: fiducial marks of {len(self.images)} images written"] if self.project else []
+        return [*noted(notes), *changed]
+
+    def raise_failures(self) -> None:
+        """Name the images that failed."""
+        raise_failed(self.failed, len(self.images))
 
 
-@dataclass(frozen=True)
-class FiducialsRequest:
-    """What is asked."""
-
-    images: tuple[Path, ...]
-    """Scans, or one project file."""
-    camera: Path | None = None
-    """File that describes their camera; a project describes its own."""
-    camera_name: str | None = None
-    """Which of its cameras, where it describes several."""
-    select: tuple[str, ...] = ()
-    """Names or patterns of a project's images; all film images if empty."""
-    scan_resolution: str | None = None
-    """Of the scans, such as ``1200dpi`` or ``21um``; None: as the files state it, else found."""
-    rotation: int | None = None
-    mirrored: bool | None = None
-    negative: bool | None = None
-    band: int | None = None
-    least_correlation: float = LEAST_CORRELATION
-    dry_run: bool = False
-    """Do not write into the project."""
+def _reasons(failed: Mapping[str, str]) -> list[dict[str, str]]:
+    return [{"image": name, "reason": reason} for name, reason in failed.items()]
 
 
 @dataclass(frozen=True)
@@ -179,6 +181,7 @@ class _Job:
     camera_name: str
     mirrored: bool
     layout: MarkLayout
+    picture: Path | None = None
 
 
 def locate_fiducials(request: FiducialsRequest, events: Events = SILENT) -> FiducialsReport:
@@ -191,8 +194,14 @@ def locate_fiducials(request: FiducialsRequest, events: Events = SILENT) -> Fidu
     InputError
         Camera or project cannot be used.
     """
-    project = _project(request)
+    project = None if request.project is None else load_project(request.project)
     jobs = _jobs(request, project)
+    if request.pictures is not None:
+        stems = unique_stems([job.name for job in jobs])
+        places = {name: request.pictures / f"{stem}.fiducials.png" for name, stem in stems.items()}
+        for place in places.values():
+            check_output(place, [*request.images, *(job.file for job in jobs)], overwrite=request.overwrite)
+        jobs = [replace(job, picture=places[job.name]) for job in jobs]
     pixel_mm = sum(parse_pitch(request.scan_resolution)) / 2 if request.scan_resolution else None
     with recording("fiducials", request, [*request.images, request.camera, *(job.file for job in jobs)]) as record:
         results: list[ImageFiducials] = []
@@ -209,37 +218,21 @@ def locate_fiducials(request: FiducialsRequest, events: Events = SILENT) -> Fidu
                 if isinstance(error, MarksNotFound):
                     unfound.append(
                         UnfoundFiducials(
-                            name=job.name, file=job.file, band=request.band, layout=job.layout, sought=error.sought
+                            name=job.name,
+                            file=job.file,
+                            band=request.band,
+                            layout=job.layout,
+                            sought=error.sought,
+                            picture=job.picture,
                         )
                     )
             events.done()
-        written = None
-        if project is not None and results and not request.dry_run:
-            written = request.images[0]
+        written = request.project if results and not request.dry_run else None
+        if project is not None and written is not None:
             edit_project(written, ProjectChanges(images={r.name: _entries(project, r) for r in results}))
         report = FiducialsReport(tuple(results), failed, tuple(unfound), written)
         record([written], report)
     return report
-
-
-def scans_of(request: FiducialsRequest) -> dict[str, Path]:
-    """Files of the images that a request asks for, by the names in its report."""
-    return {job.name: job.file for job in _jobs(request, _project(request))}
-
-
-def _project(request: FiducialsRequest) -> Project | None:
-    """The project that is given in place of images."""
-    if len(request.images) == 1 and request.images[0].suffix.lower() == ".toml":
-        if request.camera is not None or request.camera_name is not None:
-            raise UsageError("a project describes its cameras itself; leave out `camera` and `camera_name`")
-        return load_project(request.images[0])
-    if not request.images:
-        raise UsageError("no image is given; give scans and `camera` FILE, or a project file")
-    if request.select:
-        raise UsageError("`images` chooses among the images of a project; here the images are given themselves")
-    if request.camera is None:
-        raise UsageError("`camera` FILE is needed: it describes the fiducial marks; or give a project file")
-    return None
 
 
 def _jobs(request: FiducialsRequest, project: Project | None) -> list[_Job]:
@@ -247,10 +240,6 @@ def _jobs(request: FiducialsRequest, project: Project | None) -> list[_Job]:
         assert request.camera is not None
         name, system = _film_camera(request.camera, request.camera_name)
         layout = _layout(system, name, request.camera.resolve().parent)
-        files = [str(path) for path in request.images]
-        twice = sorted({f for f in files if files.count(f) > 1})
-        if twice:
-            raise UsageError(f"image {twice[0]} is given twice")
         return [
             _Job(name=path.name, file=path, camera_name=name, mirrored=system.mirrored, layout=layout)
             for path in request.images
@@ -331,6 +320,7 @@ def _locate(request: FiducialsRequest, job: _Job, pixel_mm: float | None, in_pro
         band=request.band,
         layout=job.layout,
         found=found,
+        picture=job.picture,
     )
 
 
@@ -346,21 +336,6 @@ def _entries(project: Project, result: ImageFiducials) -> dict[str, object]:
 
 #: A film that seems to have changed by more was not scanned with the pitch that its file states.
 UNBELIEVABLE = 0.01
-
-
-@dataclass(frozen=True)
-class InteriorRequest:
-    """What is asked."""
-
-    project: Path
-    images: tuple[str, ...] | None = None
-    """Names or patterns; None: all film scans."""
-    model: str | None = None
-    """One of `MODELS`; None: what the camera states."""
-    scan_resolution: str | None = None
-    """Such as ``1200dpi`` or ``21um``; None: as the files state it."""
-    write: bool = False
-    """Whether the model becomes that of the cameras."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,24 +411,43 @@ class ImageInterior:
 
 
 @dataclass(frozen=True, eq=False)
-class InteriorResult:
-    """What came out."""
+class InteriorResult(Result):
+    """Interior orientations of the scans of a project."""
 
+    project: Path
     images: tuple[ImageInterior, ...]
     unmeasured: tuple[str, ...]
     """Film scans whose marks are not measured yet."""
     failed: dict[str, str]
     """Film scans whose marks cannot be right, and why."""
-    written: tuple[str, ...]
+    cameras: tuple[str, ...]
     """Cameras whose model was set in the project file."""
 
     def json_fields(self) -> dict[str, Any]:
         """Failures as a list."""
-        failed = [{"image": name, "reason": reason} for name, reason in self.failed.items()]
-        return {**pick(self, "images", "unmeasured", "written"), "failed": failed}
+        return {**pick(self, "images", "unmeasured", written="cameras"), "failed": _reasons(self.failed)}
+
+    def written(self) -> Sequence[Path]:
+        """Return the project file if it was changed."""
+        return [self.project] if self.cameras else []
+
+    def summary(self) -> Sequence[str]:
+        """Return the figures of each scan."""
+        return [str(image) for image in self.images]
+
+    def messages(self) -> Sequence[str]:
+        """Return the scans without marks, and the cameras whose model was written."""
+        names = ", ".join(self.unmeasured)
+        lines = [f"note: marks not measured in {names}: `photoplan fiducials` finds them"] if names else []
+        model = self.images[0].fit.model if self.images else ""
+        return [*lines, *(f"camera {name!r}: interior = {model!r} written to the project" for name in self.cameras)]
+
+    def raise_failures(self) -> None:
+        """Name the scans that failed."""
+        raise_failed(self.failed, len(self.images))
 
 
-def interior_orientations(request: InteriorRequest) -> InteriorResult:
+def interior_orientations(request: InteriorRequest, events: Events = SILENT) -> InteriorResult:
     """Interior orientation of every film scan of a project whose marks are measured.
 
     Scans with marks that cannot be right are listed in the result, the others are computed all the same; the project
@@ -462,12 +456,10 @@ def interior_orientations(request: InteriorRequest) -> InteriorResult:
     Raises
     ------
     UsageError
-        `write` without a model, or the resolution is not understood.
+        The resolution is not understood.
     InputError
         The project has no film scan, or none with measured marks.
     """
-    if request.write and request.model is None:
-        raise UsageError("`write` sets the model of the cameras; say which with `model`")
     pitch = None if request.scan_resolution is None else parse_pitch(request.scan_resolution)
     project = load_project(request.project)
     scans = _scans(project, request)
@@ -484,12 +476,14 @@ def interior_orientations(request: InteriorRequest) -> InteriorResult:
                 found.append(_interior(project, image, request.model, pitch))
             except InputError as error:
                 failed[image.name] = str(error)
-    written = _write(request, found) if request.write and not failed else ()
-    return InteriorResult(tuple(found), unmeasured, failed, written)
+    cameras = tuple(dict.fromkeys(i.camera for i in found)) if request.write and not failed else ()
+    if cameras:
+        edit_project(request.project, ProjectChanges(cameras={name: {"interior": request.model} for name in cameras}))
+    return InteriorResult(request.project, tuple(found), unmeasured, failed, cameras)
 
 
 def _scans(project: Project, request: InteriorRequest) -> list[Image]:
-    chosen = [project.image(name) for name in project.select(request.images)]
+    chosen = [project.image(name) for name in project.select(request.images or None)]
     scans = [image for image in chosen if project.cameras[image.camera].fiducial_system]
     if not scans:
         raise InputError(
@@ -539,43 +533,13 @@ def _interior(project: Project, image: Image, model: str | None, pitch: tuple[fl
     return replace(plain, pitch=pitch, shrinkage=film_shrinkage(fit.transformation, pitch, fit.covariance))
 
 
-def _write(request: InteriorRequest, found: Sequence[ImageInterior]) -> tuple[str, ...]:
-    cameras = tuple(dict.fromkeys(i.camera for i in found))
-    edit_project(request.project, ProjectChanges(cameras={name: {"interior": request.model} for name in cameras}))
-    return cameras
-
-
 #: Control points from which an image is tried where none is named.
 _LEAST = 3
 
 
-@dataclass(frozen=True)
-class ResectRequest:
-    """What is asked."""
-
-    project: Path
-    images: tuple[str, ...] = ()
-    """Names or patterns; none: all images with three control points or more."""
-    image_points: tuple[Path, ...] = ()
-    """Instead of those that [observations] names."""
-    control: tuple[Path, ...] = ()
-    """Instead of those that [observations] names."""
-    sigma_image: float | None = None
-    """Standard deviation of image coordinates, pixels; None: that of the project."""
-    sigma_control: tuple[float, float] | None = None
-    """Standard deviation of control, horizontal and height, metres; None: that of the project."""
-    free: tuple[str, ...] = ()
-    """Parameters of the camera that are unknowns: c, x0, y0."""
-    unknown_camera_constant: bool = False
-    """The stated camera constant is no start value either."""
-    critical: float = 4.0
-    dry_run: bool = False
-    """Whether the project is left as it is."""
-
-
 @dataclass(frozen=True, eq=False)
-class ResectResult:
-    """What came out."""
+class ResectResult(Result):
+    """Orientations of single images."""
 
     project: Path
     images: tuple[ResectedImage, ...]
@@ -583,15 +547,35 @@ class ResectResult:
     """Images that could not be oriented, with the reason."""
     left_out: tuple[str, ...]
     """Images with fewer than three control points."""
-    written: bool
+    changed: bool
+    """Whether orientations were written into the project."""
     notes: tuple[str, ...]
 
     def json_fields(self) -> dict[str, Any]:
         """Failures as a list."""
-        return {
-            **pick(self, "project", "written", "images", "left_out", "notes"),
-            "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
-        }
+        own = pick(self, "project", "images", "left_out", "notes", written="changed")
+        return {**own, "failed": _reasons(self.failed)}
+
+    def written(self) -> Sequence[Path]:
+        """Return the project file if it was changed."""
+        return [self.project] if self.changed else []
+
+    def summary(self) -> Sequence[str]:
+        """Return the parameters of each image with their standard deviations, and gross errors."""
+        return [line for image in self.images for line in image.lines()]
+
+    def messages(self) -> Sequence[str]:
+        """Return the notes, images with too little control, and what was written into the project."""
+        notes = [*self.notes, *(f"{image.image.name}: {note}" for image in self.images for note in image.notes)]
+        if self.left_out:
+            names = ", ".join(self.left_out[:5]) + (" …" if len(self.left_out) > 5 else "")
+            notes.append(f"{len(self.left_out)} images have fewer than 3 control points: {names}")
+        changed = f"{self.project}: orientation of {len(self.images)} images written"
+        return [*noted(notes), *([changed] if self.changed else [])]
+
+    def raise_failures(self) -> None:
+        """Name the images that could not be oriented."""
+        raise_failed(self.failed, len(self.images), "images could not be oriented")
 
 
 def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectResult:
@@ -604,7 +588,9 @@ def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectRes
     InputError
         Project or measurements cannot be used, or no image has three control points.
     """
-    settings = ResectSettings(request.free, not request.unknown_camera_constant, request.critical)
+    free = tuple(dict.fromkeys(request.free))
+    settings = ResectSettings(free, not request.unknown_camera_constant, request.critical)
+    events.begin("resection", 0, "images")
     project = _overridden(load_project(request.project), request)
     names = project.select(request.images or None)
     inputs = read_inputs(project, names)
@@ -628,7 +614,7 @@ def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectRes
             images=tuple(done),
             failed=failed,
             left_out=left,
-            written=written,
+            changed=written,
             notes=inputs.notes,
         )
         if written:
@@ -680,6 +666,7 @@ Array = NDArray[np.float64]
 
 #: Decimals of angles that are written.
 _ANGLE_DECIMALS = 10
+_DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 _GREEK = {"o": "ω", "p": "φ", "k": "κ"}
 
 
@@ -744,6 +731,28 @@ class ResectedImage:
                 "standard deviation"
             )
         return lines
+
+    def lines(self) -> list[str]:
+        """Return the parameters with their standard deviations, and gross errors."""
+        found = self.found
+        sign, digits = self.angle_sign, _DIGITS[self.angle_unit]
+        head = f"{self.image.name}  {int((~found.rejected).sum())} points · redundancy {found.redundancy} · "
+        head += f"sigma0 {found.sigma0:.3g} · rms {found.rms:.2f} px"
+        if found.redundancy > 0:
+            head += f" · 95 % within {found.reach_95:.1f} times ±"
+        center = zip(("X0", "Y0", "Z0"), self.center, self.sigma_center)
+        rows = [
+            [f"{name} {shown_metres(v, s).removesuffix(' m')} ±{shown_metres(s, s)}" for name, v, s in center],
+            [
+                f"{name} {value:.{digits}f} ±{sigma:.{digits}f}{sign}"
+                for name, value, sigma in zip(self.angle_names, self.angles, self.sigma_angles)
+            ],
+        ]
+        if self.calibrated is not None:
+            c = self.calibrated
+            values = zip(c.parameters, c.after, c.sigma, c.units)
+            rows.append([f"{name} {value:.4f} ±{sigma:.4f} {u}" for name, value, sigma, u in values])
+        return [head, *("  " + "  ".join(row) for row in rows), *(f"  {line}" for line in self.gross_errors)]
 
     def json_fields(self) -> dict[str, Any]:
         """Orientation, quality, and every point."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from photoplan.geometry.grid import Window
 from photoplan.orientation.marks.fiducials import Scan, mark_window
 from photoplan.orientation.marks.layout import FiducialResult, LocatedMark, MarkLayout, MissingMark
 from photoplan.orientation.marks.template import Template, draw
-from photoplan.products.film import ImageFiducials, UnfoundFiducials
+from photoplan.products.film import FiducialsReport, ImageFiducials, UnfoundFiducials
 from photoplan.project.camera_marks import ScanImage
 from photoplan.report.drawing import figure_of, png
 
@@ -24,6 +25,12 @@ _OVERVIEW = 900
 _AROUND = 1.5
 """Half side of what is shown around a place, in sides of the mark."""
 _CROSS, _LOST = "#d81b60", "#b03000"
+
+
+def draw_marks(report: FiducialsReport) -> dict[Path, bytes]:
+    """Draw the marks of all images by the places of their pictures, also where they were searched in vain."""
+    found = {image.picture: marks_picture(image) for image in report.images if image.picture is not None}
+    return found | {image.picture: unfound_picture(image) for image in report.unfound if image.picture is not None}
 
 
 def marks_picture(image: ImageFiducials) -> bytes:

@@ -100,9 +100,16 @@ def _panel(ax: Any, title: str, scans: Sequence[ImageInterior], scale: float, si
         ax.tick_params(labelbottom=False, labelleft=False, length=0)
 
 
-def interior_page(made: InteriorResult, title: str) -> str:
-    """The report as one HTML document."""
+def interior_plot(made: InteriorResult) -> bytes | None:
+    """Draw the residual vectors of all scans, if there are any."""
+    return draw_residuals(made.images) if made.images else None
+
+
+def interior_page(made: InteriorResult) -> str | None:
+    """Return the report as one HTML document."""
     scans, refused = made.images, made.failed
+    if not scans:
+        return None
     every = np.concatenate([scan.residuals_um for scan in scans])
     sigmas = [scan.sigma0_um for scan in scans if math.isfinite(scan.sigma0_um)]
     parts = [
@@ -123,6 +130,7 @@ def interior_page(made: InteriorResult, title: str) -> str:
     )
     drawing = figure(draw_residuals(scans), "Residual vectors", caption)
     parts.append(section("Residuals", [drawing, _mark_table(scans)]))
+    title = f"Interior orientation · {made.project.resolve().parent.name}"
     return page(title, "Transformation from calibrated fiducial marks to the scans", parts)
 
 

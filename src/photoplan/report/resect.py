@@ -60,8 +60,10 @@ def _key(axes: Any, size: tuple[int, int], scale: float, typical: float) -> None
     axes.annotate(label, (x, y), (0, 4), textcoords="offset points", fontsize=8, color=SOFT, bbox=box)
 
 
-def resect_page(made: ResectResult) -> str:
-    """The report as one HTML document."""
+def resect_page(made: ResectResult) -> str | None:
+    """Return the report as one HTML document."""
+    if not made.images:
+        return None
     found = [image.found for image in made.images]
     wrong = sum(int(f.rejected.sum()) for f in found)
     used = sum(int((~f.rejected).sum()) for f in found)

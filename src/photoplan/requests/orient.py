@@ -1,11 +1,83 @@
-"""Requests of commands that orient images: tie points, control from orthophotos."""
+"""Requests of commands that orient images: fiducial marks, tie points, control from orthophotos, resection."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from photoplan.errors import UsageError
-from photoplan.request import DRY_RUN, IMAGES, ONE_WORKER, OVERWRITE, PICTURE, PROJECT, Request, opt
+from photoplan.request import DRY_RUN, IMAGES, ONE_WORKER, OVERWRITE, PICTURE, PROJECT, Request, arg, opt
+
+_AUTO = {"auto": None, "yes": True, "no": False}
+#: A dry run that computes and draws all the same.
+_KEEP_PROJECT = opt("Do not write into the project.", False, section="run", draws=True)
+
+
+class FiducialsRequest(Request):
+    """Options of the search for fiducial marks."""
+
+    images: tuple[Path, ...] = arg("Scans, or one project file.", metavar="IMAGE…")
+    camera: Path | None = opt("File that describes the camera and its marks; a project describes its own.", None,
+                              metavar="FILE", section="input")  # fmt: skip
+    camera_name: str | None = opt("Camera of a file that describes several.", None, metavar="NAME", section="input")
+    select: tuple[str, ...] = opt("Images or patterns of a project; may be repeated [all film].", (), listed=True,
+                                  flag="images", metavar="NAME,…", section="input")  # fmt: skip
+    scan_resolution: str | None = opt("Resolution, such as 1200dpi or 21um [what the files state, else found].", None,
+                                      metavar="DPI|UM", section="input")  # fmt: skip
+    rotation: int | None = opt(
+        "Angle by which the film was turned before it was scanned, counter-clockwise, degrees.",
+        None,
+        choices={"auto": None, "0": 0, "90": 90, "180": 180, "270": 270},
+    )
+    mirrored: bool | None = opt("Left and right are exchanged in the scan.", None, choices=_AUTO)
+    negative: bool | None = opt("Dark and bright are exchanged against the description.", None, choices=_AUTO)
+    band: int | None = opt("Band to use [luminance of the first three].", None, ge=1, metavar="N")
+    least_correlation: float = opt("Smallest correlation of a mark.", 0.6, ge=0.3, le=0.99, metavar="R")
+    pictures: Path | None = opt("Write a picture of the marks of each image.", None, folder=True, metavar="FOLDER",
+                                writes=True)  # fmt: skip
+    dry_run: bool = _KEEP_PROJECT
+    overwrite: bool = OVERWRITE
+
+    @property
+    def project(self) -> Path | None:
+        """The project that is given in place of scans."""
+        return self.images[0] if len(self.images) == 1 and self.images[0].suffix.lower() == ".toml" else None
+
+    def check(self) -> None:
+        """Refuse options of scans with a project, and the other way round."""
+        if self.project is not None:
+            if self.camera is not None or self.camera_name is not None:
+                raise UsageError("a project describes its cameras itself; leave out `camera` and `camera_name`")
+        elif not self.images:
+            raise UsageError("no image is given; give scans and `camera` FILE, or a project file")
+        elif self.select:
+            raise UsageError("`select` chooses among the images of a project; here the images are given themselves")
+        elif self.camera is None:
+            raise UsageError("`camera` FILE is needed: it describes the fiducial marks; or give a project file")
+        if twice := sorted({str(f) for f in self.images if self.images.count(f) > 1}):
+            raise UsageError(f"image {twice[0]} is given twice")
+
+
+class InteriorRequest(Request):
+    """Options of the interior orientation of film scans."""
+
+    project: Path = PROJECT
+    images: tuple[str, ...] = opt("Images or patterns; may be repeated [all film].", (), listed=True, metavar="NAME,…",
+                                  section="input")  # fmt: skip
+    model: Literal["similarity", "affine", "bilinear"] | None = opt(
+        "Transformation from marks to scan [what the camera states].", None
+    )
+    scan_resolution: str | None = opt("Resolution, such as 1200dpi or 21um [what the files state].", None,
+                                      metavar="DPI|UM", section="input")  # fmt: skip
+    report: Path | None = opt("Write figures and plots as a page.", None, metavar="HTML", writes=True)
+    plot: Path | None = opt("Write residual vectors as a picture.", None, metavar="PNG", writes=True)
+    write: bool = opt("Make the model that of the cameras in the project file.", False, section="result")
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse to write no model."""
+        if self.write and self.model is None:
+            raise UsageError("`write` sets the model of the cameras; say which with `model`")
 
 
 class ControlRequest(Request):
@@ -74,3 +146,35 @@ class TieRequest(Request):
     def pairs_table(self) -> Path:
         """The table of all pairs beside it."""
         return self.product.with_name(f"{self.product.stem}_pairs.csv")
+
+
+class ResectRequest(Request):
+    """Options of the resection of single images by control points."""
+
+    project: Path = PROJECT
+    images: tuple[str, ...] = opt("Images or patterns; may be repeated [all with 3 control points].", (), listed=True,
+                                  metavar="NAME,…", section="input")  # fmt: skip
+    image_points: tuple[Path, ...] = opt("Image points instead of the project's; may be repeated.", (), metavar="FILE",
+                                         section="input")  # fmt: skip
+    control: tuple[Path, ...] = opt("Control instead of the project's; may be repeated.", (), metavar="FILE",
+                                    section="input")  # fmt: skip
+    sigma_image: float | None = opt("Standard deviation of image points, pixels [the project's].", None, gt=0)
+    sigma_control: tuple[float, float] | None = opt(
+        "Standard deviations of control, horizontal and height, metres [the project's].", None, metavar="XY Z"
+    )
+    free: tuple[str, ...] = opt(
+        "Parameters of the camera that are unknowns, also k2, k3, p1, p2, b1, b2; for one image.",
+        (),
+        listed=True,
+        metavar="c,x0,y0,k1",
+    )
+    unknown_camera_constant: bool = opt("The camera constant is not even approximately known; for one image.", False)
+    critical: float = opt("Normalised residual from which a point is a gross error.", 4.0, ge=2, le=20)
+    report: Path | None = opt("Write residuals with pictures as a page.", None, metavar="HTML", writes=True)
+    dry_run: bool = _KEEP_PROJECT
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse negative standard deviations."""
+        if min(self.sigma_control or (0.0,)) < 0:
+            raise UsageError(f"`sigma_control` {self.sigma_control}: numbers of at least 0 are needed, in metres")
