@@ -37,6 +37,10 @@ class Verb:
     `Request.drawn`. That of a folder, such as ``pictures/``, returns pictures by place; `make` has checked places."""
     record: str = ""
     """Kind of the run record, for operations that write none themselves."""
+    figures_first: bool = False
+    """Figures are printed before the files, and these in the order of the options."""
+    files: str = ""
+    """Key of the JSON that lists all files, if there is one instead of a key for each drawing."""
 
     def command(self, name: str) -> click.Command:
         """Return the click command."""
@@ -114,7 +118,12 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
         files = [*result.written(), *made]
         if record is not None:
             record(files, result)
-    if as_json:
+    if verb.figures_first:
+        order = [path for paths in request.files_written().values() for path in paths]
+        files.sort(key=lambda path: order.index(path) if path in order else len(order))
+    if as_json and verb.files:
+        show_json(result, **{verb.files: files})
+    elif as_json:
         more: dict[str, Any] = {
             name: path if path in made else None
             for name in type(request).model_fields
@@ -127,7 +136,8 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
         show_json(result, **more)
     else:
         # A project that was changed is recorded, and no product.
-        for line in (*(file for file in files if file not in request.files_read()), *result.summary()):
+        shown = [file for file in files if file not in request.files_read()]
+        for line in (*result.summary(), *shown) if verb.figures_first else (*shown, *result.summary()):
             show(line)
     for message in result.messages():
         if not as_json or message.startswith(("note:", "warning:")):
