@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.products.mtf.edges import LUMINANCE, LightImage, MtfRequest, measure_mtf
+from photoplan.products.mtf.edges import LUMINANCE, LightImage, measure_edges
 from photoplan.products.mtf.result import MeasuredEdge
 from photoplan.products.restore import DesignRequest, RestoreRequest, design_restoration, restore_images
 from photoplan.project.steps import linearisation_of
 from photoplan.quality.edges.response import EdgeMeasurement, measure_edge
 from photoplan.quality.restoration.design import DesignOptions
+from photoplan.requests.quality import MtfRequest
 
 LIGHT = "srgb"
 FREQUENCIES = np.linspace(0.0, 0.5, 51)
@@ -99,7 +100,7 @@ def restore_chart(chart: Path, folder: Path, method: Literal["exact", "regularis
         RestoreRequest((right,), found.filter, folder / method, linearisation=LIGHT, overwrite=True)
     )
     restored = report.images[0].path
-    measured = measure_mtf(MtfRequest((right,), linearisation=LIGHT, least_snr=20.0))
+    measured = measure_edges(MtfRequest((right,), linearisation=LIGHT, least_snr=20.0))
     pairs = []
     for edge in measured.images[0].edges:
         if edge.aligned:  # lines between the grey patches: neither slanted nor plain edges

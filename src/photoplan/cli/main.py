@@ -133,10 +133,32 @@ VERBS: dict[str, str | Verb] = {
         "requests.measure:MonoplotRequest",
         "products.monoplot:monoplot_file",
     ),
-    "mtf": "Measure spread function and MTF from edges and patterns.",
+    "mtf": Verb(
+        "Measure spread function and MTF from edges and patterns.",
+        """Measure sharpness: edges are found, or given by --roi, and their spread function and MTF measured.
+
+        With --pattern a test pattern is measured instead: bars (a window for each frequency group), a Siemens star, or
+        a USAF-1951 target. If an image fails, the others are still measured, and it is listed at the end (exit code 4).
+        Edges that are saturated, noisy, or beside texture give no figure.
+        """,
+        "requests.quality:MtfRequest",
+        "products.mtf.patterns:measure_mtf",
+        {"report": "report.mtf:mtf_page"},
+        record="mtf",
+        figures_first=True,
+    ),
     "restore": "Restore images with a filter, given or measured.",
     "characterise": "Know a camera from image series.",
-    "sensor": "Resolution, bandwidth and noise of a sensor.",
+    "sensor": Verb(
+        "Resolution, bandwidth and noise of a sensor.",
+        "Print resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes.",
+        "requests.quality:SensorRequest",
+        "products.sensor:describe_sensor",
+        {"report": "report.sensor:sensor_page"},
+        record="sensor",
+        figures_first=True,
+        files="written",
+    ),
     "simulate": "Form an image of a scene with blur, noise, jitter …",
     "info": "Show what a raster, project, plan or run record holds.",
     "demo": "Make the orthophotos of the included real block.",

@@ -39,7 +39,7 @@ from photoplan.io.store import (
 from photoplan.plain import pick
 from photoplan.plan.footprint import Tile, Tiles
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures, save_chromatic
-from photoplan.products.mtf.edges import LightImage, MtfRequest, measure_mtf
+from photoplan.products.mtf.edges import LightImage, measure_edges
 from photoplan.products.mtf.result import ImageMtf, MtfReport
 from photoplan.project.align import AlignStep
 from photoplan.project.steps import (
@@ -75,6 +75,7 @@ from photoplan.quality.restoration.design import (
 )
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.scene import SceneStatistics, block_spectra, scenes_of
+from photoplan.requests.quality import MtfRequest
 
 #: Windows of an image in which its contrast is looked for, in each direction, and their side.
 _WINDOWS = 5
@@ -187,7 +188,7 @@ def design_restoration(request: DesignRequest, events: Events = SILENT) -> Measu
         least_length=request.least_length,
         grid=1,
     )
-    mtf = measure_mtf(asked, events)
+    mtf = measure_edges(asked, events)
     if not mtf.images:
         raise InputError("no image can be measured: " + "; ".join(mtf.failed.values()))
     size = _common_size(mtf.images)

@@ -1,13 +1,15 @@
-"""`photoplan sensor`: figures of a sensor from its description, as values and table."""
+"""Figures of a sensor from its description, as values and as a table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import degrees, radians
 from pathlib import Path
 
 from photoplan.errors import InputError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.io.product import check_output
 from photoplan.io.quality_files import (
     ChargeTransfer,
@@ -24,23 +26,11 @@ from photoplan.io.tables import write_table
 from photoplan.plain import pick
 from photoplan.quality import sensor
 from photoplan.quality.sensor import NoiseBudget, VideoNorm
+from photoplan.requests.quality import SensorRequest
 
 
 @dataclass(frozen=True)
-class SensorRequest:
-    """What is asked."""
-
-    file: Path
-    """The description."""
-    csv: Path | None = None
-    """Table to write."""
-    overwrite: bool = False
-    dry_run: bool = False
-    """Compute, write nothing."""
-
-
-@dataclass(frozen=True)
-class SensorReport:
+class SensorReport(Result):
     """Figures of a sensor."""
 
     described: SensorDescription
@@ -49,12 +39,12 @@ class SensorReport:
     """Table that was written."""
 
     def json_fields(self) -> dict[str, object]:
-        """Without the description."""
+        """Return the name and the figures."""
         return {"name": self.described.name, "figures": self.figures}
 
-    def __str__(self) -> str:
-        lines = [self.described.name]
-        section = ""
+    def summary(self) -> list[str]:
+        """Return the figures by section."""
+        lines, section = [self.described.name], ""
         wide = max(len(figure.meaning) for figure in self.figures)
         for figure in self.figures:
             if figure.section != section:
@@ -63,18 +53,18 @@ class SensorReport:
             value = f"{short_number(figure.value)} {figure.unit}".rstrip()
             stated = "" if figure.stated is None else f"  (stated: {short_number(figure.stated)})"
             lines.append(f"  {figure.meaning:<{wide}}  {value:<18}  {figure.source}{stated}")
-        return "\n".join(lines)
+        return lines
 
 
 def short_number(value: float) -> str:
-    """A figure with four digits, without an exponent where that is short."""
+    """Format a number with four digits, without an exponent if that is short."""
     if value == 0.0 or 1e-4 <= abs(value) < 1e4:
         return f"{value:.4g}"
     return f"{value:,.0f}".replace(",", " ") if 1e4 <= abs(value) < 1e9 else f"{value:.3e}"
 
 
-def describe_sensor(request: SensorRequest) -> SensorReport:
-    """Compute the figures of a description and write what is asked.
+def describe_sensor(request: SensorRequest, events: Events = SILENT) -> SensorReport:
+    """Compute the figures that a description determines, and write them as a table if `csv` is set.
 
     Raises
     ------
@@ -87,6 +77,9 @@ def describe_sensor(request: SensorRequest) -> SensorReport:
         check_output(request.csv, [request.file], overwrite=request.overwrite)
     described = read_sensor(request.file)
     figures = sensor_figures(described, str(request.file))
+    for figure in figures:
+        if figure.stated is not None and abs(figure.value - figure.stated) > 0.01 * abs(figure.stated):
+            events.talk(f"{figure.name}: {figure.value:.4g} by {figure.source}; {figure.stated:g} is stated")
     written = None if request.dry_run else request.csv
     if written is not None:
         head = ("section", "name", "value", "unit", "stated", "meaning", "source")
@@ -147,18 +140,7 @@ def sensor_figures(described: SensorDescription, file: str) -> tuple[SensorFigur
                 f"{file}: stated.{name}: no such figure follows from the description; those that do are "
                 f"{', '.join(sorted(names)) or 'none'}"
             )
-    return tuple(
-        SensorFigure(
-            section=f.section,
-            name=f.name,
-            meaning=f.meaning,
-            value=f.value,
-            unit=f.unit,
-            source=f.source,
-            stated=described.stated.get(f.name),
-        )
-        for f in found
-    )
+    return tuple(replace(figure, stated=described.stated.get(figure.name)) for figure in found)
 
 
 def _viewing(table: Viewing) -> Found:

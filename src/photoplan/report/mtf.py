@@ -48,8 +48,12 @@ _EDGE_HEAD = ("no.", "channel", "column", "row", "direction", "angle °", "lengt
               "95 % interval", "FWHM px", "over %", "under %")  # fmt: skip
 
 
-def mtf_page(made: MtfReport) -> str:
-    """The report as one HTML document; images are opened again for small copies."""
+def mtf_page(made: MtfReport | PatternReport) -> str | None:
+    """Return the report as one HTML document, if an image was measured; images are opened again for small copies."""
+    if not made.images:
+        return None
+    if isinstance(made, PatternReport):
+        return _pattern_page(made)
     parts = [_image(image, made.pixel_um, k < _PLOTTED) for k, image in enumerate(made.images)]
     if made.failed:
         rows = [[Cell(name), Cell(reason)] for name, reason in made.failed.items()]
@@ -419,8 +423,7 @@ def draw_picture(result: PatternResult, light: NDArray[np.float32]) -> bytes:
         return png(fig)
 
 
-def pattern_page(made: PatternReport) -> str:
-    """The report as one HTML document; images are opened again for the pictures."""
+def _pattern_page(made: PatternReport) -> str:
     parts = []
     for result in (result for image in made.images for result in image.results):
         found = [f"<p>{text(result.lines()[0])}</p>", _table(result)]
@@ -436,7 +439,7 @@ def pattern_page(made: PatternReport) -> str:
             light = _light(result, made.linearisation)
             found.append(figure(draw_picture(result, light), "Pattern", "What was found, marked at its place."))
         parts.append(section(result.name, found))
-    kind = made.linearisation.describe() if made.images else ""
+    kind = made.linearisation.describe()
     return page("Test patterns", f"Modulation and contrast transfer of images; linearisation: {kind}", parts)
 
 

@@ -37,6 +37,7 @@ from photoplan.quality.edges.groups import (
 )
 from photoplan.quality.edges.response import EdgeMeasurement, EdgeSettings, EdgeSpread, measure_edge, spread_of_edge
 from photoplan.quality.linearise import Linearisation, piled_ends
+from photoplan.requests.quality import MtfRequest
 
 #: Said where nobody states how 8 bits are encoded.
 ENCODED = (
@@ -45,17 +46,15 @@ ENCODED = (
 )
 
 
-def check_files(images: Sequence[Path], tables: Sequence[Path | str | None], csv: Path | None, overwrite: bool) -> None:
+def check_files(request: MtfRequest) -> None:
     """Refuse images, inputs and outputs that cannot be meant together."""
-    if not images:
+    if not request.images:
         raise UsageError("no image is given; give one or more images")
-    files = [str(path) for path in images]
-    twice = sorted({f for f in files if files.count(f) > 1})
+    twice = sorted(str(path) for path in set(request.images) if request.images.count(path) > 1)
     if twice:
         raise UsageError(f"image {twice[0]} is given twice")
-    inputs = [*images, *(Path(table) for table in tables if table not in (None, "linear", "srgb"))]
-    if csv is not None:
-        check_output(csv, inputs, overwrite=overwrite)
+    if request.csv is not None:
+        check_output(request.csv, request.files_read(), overwrite=request.overwrite)
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
@@ -716,59 +715,9 @@ def _bent(error: InputError) -> bool:
     return str(error).startswith("bent")
 
 
-#: Cells of the field in each direction that a report can show.
-MOST_CELLS = 50
-MOST_EDGES = 5000
-
-
-@dataclass(frozen=True)
-class MtfRequest:
-    """What is asked."""
-
-    images: tuple[Path, ...]
-    rois: tuple[tuple[int, int, int, int], ...] = ()
-    """Column, row, width and height of windows with one edge each; none: edges are sought in the whole image."""
-    linearisation: str | None = None
-    """``linear``, ``srgb``, or the name of a table; None: linear, with a warning where that is unlikely."""
-    band: str | None = None
-    """Number of a band, or ``all``: luminance and every band; None: luminance, or the only band."""
-    pixel_um: float | None = None
-    """Distance of pixels on the sensor, micrometres."""
-    lab: Path | None = None
-    """MTF values of a laboratory."""
-    flight: Literal["x", "y"] | None = None
-    """Whether the flight direction is along the rows (x) or the columns (y) of the images."""
-    grid: int = 3
-    """Cells of the field in each direction."""
-    most_edges: int = 60
-    """Edges of an image that are measured."""
-    least_length: float | None = None
-    """Pixels; None: 20, in given windows 12."""
-    least_snr: float = 8.0
-    """Contrast over noise."""
-    half_width: int = 20
-    """Pixels of an edge reach at most so far to both sides."""
-    csv: Path | None = None
-    """A row for each edge."""
-    overwrite: bool = False
-
-
-def measure_mtf(request: MtfRequest, events: Events = SILENT) -> MtfReport:
-    """Measure the edges of all images; one that fails does not stop the others.
-
-    Returns
-    -------
-    MtfReport
-        Each edge with its profile: positions, values and standard deviations, by direction, channel and place.
-
-    Raises
-    ------
-    UsageError
-        Options contradict each other, or an output exists.
-    InputError
-        The linearisation table or the laboratory values cannot be used.
-    """
-    _check(request)
+def measure_edges(request: MtfRequest, events: Events = SILENT) -> MtfReport:
+    """Measure the edges of all images; one that fails does not stop the others."""
+    check_files(request)
     linearisation = linearisation_of(request.linearisation or "linear")
     lab = None if request.lab is None else read_mtf_table(request.lab)
     measuring = Measuring(
@@ -849,17 +798,3 @@ def _opened(
         except PhotoplanError as error:
             failed[names[path]] = str(error)
     return opened, failed
-
-
-def _check(request: MtfRequest) -> None:
-    """Refuse what cannot be meant before any work."""
-    if not 1 <= request.grid <= MOST_CELLS:
-        raise UsageError(f"`grid` {request.grid}; 1 to {MOST_CELLS} cells are allowed")
-    if not 1 <= request.most_edges <= MOST_EDGES:
-        raise UsageError(f"`most_edges` {request.most_edges}; 1 to {MOST_EDGES} are allowed")
-    if not 6 <= request.half_width <= 60:
-        raise UsageError(f"`half_width` {request.half_width}; 6 to 60 px are allowed")
-    if request.pixel_um is not None and not 0.01 <= request.pixel_um <= 1e4:
-        raise UsageError(f"`pixel_size` {request.pixel_um:g}; 0.01 to 10000 micrometres are allowed")
-    tables = (request.linearisation, request.lab)
-    check_files(request.images, tables, request.csv, request.overwrite)

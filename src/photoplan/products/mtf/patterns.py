@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted, raise_failed
 from photoplan.geometry.grid import Window
 from photoplan.io.tables import write_table
 from photoplan.plain import pick
-from photoplan.products.mtf.edges import ENCODED, LUMINANCE, LightImage, check_files, unique_names
+from photoplan.products.mtf.edges import ENCODED, LUMINANCE, LightImage, check_files, measure_edges, unique_names
+from photoplan.products.mtf.result import MtfReport
 from photoplan.project.steps import linearisation_of
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.patterns.bars import BarCurve, bar_curve, clipped_pixels, coltman_mtf, measure_bars
 from photoplan.quality.patterns.siemens import StarMtf, StarRules, measure_star
 from photoplan.quality.patterns.usaf import UsafBars, UsafResult, UsafRules, measure_usaf
+from photoplan.requests.quality import MtfRequest
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +237,7 @@ class ImagePattern:
 
 
 @dataclass(frozen=True, eq=False)
-class PatternReport:
+class PatternReport(Result):
     """What became of all images."""
 
     pattern: str
@@ -245,12 +249,24 @@ class PatternReport:
     csv: Path | None
 
     def json_fields(self) -> dict[str, Any]:
-        """The linearisation in words."""
+        """Return the images with their patterns, and the linearisation in words."""
         return {
             **pick(self, "pattern", "images", "csv", pixel_size_um="pixel_um"),
             "linearisation": self.linearisation.describe(),
             "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
         }
+
+    def summary(self) -> list[str]:
+        """Return the figures of each image."""
+        return [str(image) for image in self.images]
+
+    def messages(self) -> list[str]:
+        """Return the notes of each image."""
+        return noted(f"{image.name}: {note}" for image in self.images for note in image.notes)
+
+    def raise_failures(self) -> None:
+        """Name the images that failed."""
+        raise_failed(self.failed, len(self.images))
 
     @property
     def csv_rows(self) -> tuple[Sequence[str], list[list[object]]]:
@@ -276,43 +292,24 @@ Roi = tuple[int, int, int, int]
 MOST_PIXELS = 1 << 26
 
 
-@dataclass(frozen=True)
-class PatternRequest:
-    """What is asked."""
+def measure_mtf(request: MtfRequest, events: Events = SILENT) -> MtfReport | PatternReport:
+    """Measure edges or, if `pattern` is set, patterns of all images; one that fails does not stop the others.
 
-    images: tuple[Path, ...]
-    pattern: Literal["bars", "star", "usaf"]
-    rois: tuple[Roi, ...] = ()
-    """Column, row, width, height: frequency groups of bars, or stars, or targets; none: the whole image."""
-    linearisation: str | None = None
-    """``linear``, ``srgb``, or the name of a table; None: linear, with a warning where that is unlikely."""
-    band: str | None = None
-    """Number of a band, or ``all``; None: luminance, or the only band."""
-    pixel_um: float | None = None
-    """Distance of pixels, micrometres: on the sensor; of USAF targets on the target."""
-    sectors: int | None = None
-    """Bright sectors of stars; None: counted."""
-    group: int | None = None
-    """Number of the largest group of USAF targets in the picture."""
-    levels: tuple[float, float] | None = None
-    """Grey values of wide dark and bright areas, for bars and stars; None: found in the pattern."""
-    coltman: bool = False
-    """Convert the contrast transfer of bars into an MTF by Coltman's series too."""
-    csv: Path | None = None
-    overwrite: bool = False
-
-
-def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lambda text: None) -> PatternReport:
-    """Measure the patterns of all images; one that fails does not stop the others.
+    Returns
+    -------
+    MtfReport or PatternReport
+        Positions, values and standard deviations of each edge, by direction, channel and place; or of each pattern.
 
     Raises
     ------
     UsageError
         Options contradict each other, an output exists, or a window leaves an image.
     InputError
-        The linearisation table cannot be used.
+        The linearisation table or the laboratory values cannot be used.
     """
-    _check(request)
+    if request.pattern is None:
+        return measure_edges(request, events)
+    check_files(request)
     linearisation = linearisation_of(request.linearisation or "linear")
     results: list[ImagePattern] = []
     failed: dict[str, str] = {}
@@ -329,7 +326,7 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
         except PhotoplanError as error:
             failed[names[path]] = str(error)
     if encoded:
-        talk(f"note: {ENCODED}")
+        events.talk(f"note: {ENCODED}")
     done = bool(results)
     made = PatternReport(
         pattern=request.pattern,
@@ -342,21 +339,6 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
     if made.csv is not None:
         write_table(made.csv, *made.csv_rows)
     return made
-
-
-def _check(request: PatternRequest) -> None:
-    """Refuse what cannot be meant before any work."""
-    if request.sectors is not None and request.pattern != "star":
-        raise UsageError(f"`sectors` goes with `pattern` star, not {request.pattern}")
-    if request.group is not None and request.pattern != "usaf":
-        raise UsageError(f"`group` goes with `pattern` usaf, not {request.pattern}")
-    if request.coltman and request.pattern != "bars":
-        raise UsageError(f"`coltman` goes with `pattern` bars, not {request.pattern}")
-    if request.levels is not None and request.pattern == "usaf":
-        raise UsageError("`levels` goes with `pattern` bars or star; a USAF target shows its levels itself")
-    if request.pixel_um is not None and not 1e-3 <= request.pixel_um <= 1e6:
-        raise UsageError(f"`pixel_size` {request.pixel_um:g}; 0.001 to 1000000 micrometres are allowed")
-    check_files(request.images, (request.linearisation,), request.csv, request.overwrite)
 
 
 def _windows(image: LightImage, rois: tuple[Roi, ...]) -> list[Window]:
@@ -392,7 +374,7 @@ def _read(image: LightImage, window: Window, channel: int) -> tuple[Array, NDArr
     return light, clipped
 
 
-def _measure(name: str, image: LightImage, request: PatternRequest) -> ImagePattern:
+def _measure(name: str, image: LightImage, request: MtfRequest) -> ImagePattern:
     """The patterns of an image in every channel that is asked for."""
     path, results = image.reader.path, list[PatternResult]()
     windows = _windows(image, request.rois)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.findings import Result, noted, raise_failed
 from photoplan.plain import pick
 from photoplan.quality.edges.find import REASONS
 from photoplan.quality.edges.groups import CombinedValue, Enhancement, GaussianFit
@@ -247,7 +248,7 @@ def rejected_words(rejected: dict[str, int]) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class MtfReport:
+class MtfReport(Result):
     """What became of all images."""
 
     images: tuple[ImageMtf, ...]
@@ -270,6 +271,24 @@ class MtfReport:
             "summary": self._summary(self.groups),
             "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
         }
+
+    def summary(self) -> list[str]:
+        """Return the means of each image, and of all together."""
+        lines = [str(image) for image in self.images]
+        if len(self.images) > 1:
+            lines.append(f"all {len(self.images)} images\n{group_lines(self.groups)}")
+        return lines
+
+    def messages(self) -> list[str]:
+        """Return the notes of each image, and of all together."""
+        notes = [f"{image.name}: {note}" for image in self.images for note in image.notes]
+        if len(self.images) > 1 and self.enhancement is not None and self.enhancement.enhanced:
+            notes.append(f"all images: {self.enhancement.warning}")
+        return noted(notes)
+
+    def raise_failures(self) -> None:
+        """Name the images that failed."""
+        raise_failed(self.failed, len(self.images))
 
     def _summary(self, groups: Sequence[EdgeGroup]) -> list[dict[str, Any]]:
         if self.pixel_um is None:

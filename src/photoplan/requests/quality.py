@@ -1,0 +1,79 @@
+"""Requests of commands about image quality: sensors, sharpness, restoration, cameras, simulated images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from photoplan.errors import UsageError
+from photoplan.request import DRY_RUN, OVERWRITE, Request, arg, opt
+
+REPORT: Any = opt("Report with plots to write.", None, metavar="HTML", writes=True)
+
+
+class SensorRequest(Request):
+    """Options of the figures of a sensor."""
+
+    file: Path = arg("Description of the sensor (TOML).")
+    report: Path | None = REPORT
+    csv: Path | None = opt("Table of the figures to write.", None, metavar="CSV", writes=True)
+    dry_run: bool = DRY_RUN
+    overwrite: bool = OVERWRITE
+
+
+class MtfRequest(Request):
+    """Options of the measurement of sharpness, at edges or in test patterns."""
+
+    images: tuple[Path, ...] = arg("Images.")
+    rois: tuple[tuple[int, int, int, int], ...] = opt(
+        "Window with one edge or pattern; may be repeated [edges are sought in the whole image].", (), flag="roi",
+        metavar="COL ROW WIDTH HEIGHT", section="input",
+    )  # fmt: skip
+    pattern: Literal["bars", "star", "usaf"] | None = opt("Test pattern that is measured.", None)
+    sectors: int | None = opt("Number of bright sectors of a star [counted].", None, ge=4, le=360)
+    group: int | None = opt("Largest group of a USAF target in the image.", None, ge=-6, le=12)
+    levels: tuple[float, float] | None = opt(
+        "Grey values of wide dark and bright areas beside bars or a star [found].", None, metavar="LOW HIGH"
+    )
+    coltman: bool = opt("Compute the MTF of bars also by Coltman's series.", False)
+    linearisation: str | None = opt("Conversion of grey values into light [linear].", None,
+                                    metavar="linear|srgb|TABLE", section="input")  # fmt: skip
+    band: str | None = opt("Band, or luminance and every band [luminance, or the only band].", None, metavar="N|all",
+                           section="input")  # fmt: skip
+    pixel_um: float | None = opt("Pixel size on the sensor, µm, for cycles/mm; for USAF targets on the target.", None,
+                                 flag="pixel-size", metavar="UM", section="input")  # fmt: skip
+    lab: Path | None = opt("MTF values of a laboratory to compare.", None, metavar="FILE", section="input")
+    flight: Literal["x", "y"] | None = opt("Flight direction along rows (x) or columns (y).", None, section="input")
+    grid: int = opt("Number of cells of the field, each way.", 3, ge=1, le=50)
+    most_edges: int = opt("Number of edges that are measured in an image.", 60, ge=1, le=5000)
+    least_length: float | None = opt("Shortest edge, pixels [20; with `roi` 12].", None, ge=8, le=10_000)
+    half_width: int = opt("Largest distance from the edge that is used, pixels.", 20, ge=6, le=60)
+    least_snr: float = opt("Smallest contrast of an edge over its noise.", 8.0, ge=3, le=1e6)
+    csv: Path | None = opt("Table to write, with a row for each edge or point of a curve.", None, metavar="CSV",
+                           writes=True)  # fmt: skip
+    report: Path | None = REPORT
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse options of another pattern than the one that is measured."""
+        of_edges = ("lab", "flight", "grid", "most_edges", "least_length", "half_width", "least_snr")
+        patterns = {"sectors": ("star",), "group": ("usaf",), "levels": ("bars", "star"), "coltman": ("bars",)}
+        for name in (*of_edges, *patterns):
+            if getattr(self, name) == type(self).model_fields[name].default:
+                continue
+            if name in of_edges and self.pattern is not None:
+                raise UsageError(f"`{name}` is for edges, not for `pattern` {self.pattern}")
+            if name in patterns and self.pattern not in patterns[name]:
+                raise UsageError(f"`{name}` goes with `pattern` {' or '.join(patterns[name])}")
+        low, high = (0.01, 1e4) if self.pattern is None else (1e-3, 1e6)
+        if self.pixel_um is not None and not low <= self.pixel_um <= high:
+            raise UsageError(f"`pixel_size` {self.pixel_um:g} must be from {low:g} to {high:.0f} micrometres")
+
+    def files_read(self) -> list[Path]:
+        """Return images and tables."""
+        return [*super().files_read(), *table_of(self.linearisation)]
+
+
+def table_of(linearisation: str | None) -> list[Path]:
+    """Return the file of a linearisation, if it has one."""
+    return [] if linearisation in (None, "linear", "srgb") else [Path(str(linearisation))]
