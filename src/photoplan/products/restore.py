@@ -181,7 +181,7 @@ def design_restoration(request: DesignRequest, events: Events = SILENT) -> Measu
     """
     band = "all" if request.per_band else None
     asked = MtfRequest(
-        request.images,
+        images=request.images,
         linearisation=request.linearisation,
         band=band,
         most_edges=request.most_edges,
