@@ -60,8 +60,8 @@ def test_true_orientations_come_back(tmp_path: Path, curvature: str, refraction:
     centers, rotations = found(made)
     np.testing.assert_allclose(centers, made.centers, atol=2e-4)
     np.testing.assert_allclose(rotations, made.rotations, atol=2e-7)
-    assert report.figures.sigma0 < 1e-3
-    assert report.figures.rejected == 0
+    assert report.sigma0 < 1e-3
+    assert report.rejected == 0
     assert report.orientations == 8
 
 
@@ -80,7 +80,7 @@ def test_without_any_orientation_to_start_from(tmp_path: Path) -> None:
     centers, rotations = found(made)
     np.testing.assert_allclose(centers, made.centers, atol=2e-4)
     np.testing.assert_allclose(rotations, made.rotations, atol=2e-7)
-    assert any("8 images were oriented from control and tie points" in note for note in report.figures.notes)
+    assert any("8 images were oriented from control and tie points" in note for note in report.notes)
 
 
 METRIC = {"type": "frame", "size": [4000, 3000], "camera_constant_mm": 43.2, "pixel_size_um": [12.0, 12.1]}
@@ -127,7 +127,7 @@ def test_calibrated_cameras_come_back_by_the_projects_own_entries(
     changed = load_project(made.path)
     assert np.abs(misses(made, changed, make)).max() < 2e-3
     assert changed.cameras["cam"] != before
-    calibrated = report.figures.cameras[0]
+    calibrated = report.cameras[0]
     assert calibrated.parameters == tuple(free.split(","))
     after = changed.cameras["cam"].model_dump()
     for name, value in zip(calibrated.parameters, calibrated.after):
@@ -188,7 +188,7 @@ def test_height_and_horizontal_control(tmp_path: Path) -> None:
     centers, rotations = found(made)
     np.testing.assert_allclose(centers, made.centers, atol=5e-4)
     np.testing.assert_allclose(rotations, made.rotations, atol=5e-7)
-    ground = {g.name: g for g in report.figures.ground}
+    ground = {g.name: g for g in report.ground}
     assert np.isnan(ground["G2"].residual[:2]).all()
     assert np.isnan(ground["G3"].residual[2])
     np.testing.assert_allclose(ground["G2"].residual[2], 0.0, atol=1e-3)
@@ -203,7 +203,7 @@ def test_images_that_drop_out_do_not_shift_the_others(tmp_path: Path) -> None:
     report = exactly(made)
     assert report.orientations == 7
     assert load_project(made.path).image("a1") == before.model_copy(update={"approximate": True})
-    assert "a1" in dict(report.figures.left_out)
+    assert "a1" in dict(report.left_out)
     centers, rotations = found(made)
     np.testing.assert_allclose(centers[1:], made.centers[1:], atol=2e-4)
     np.testing.assert_allclose(rotations[1:], made.rotations[1:], atol=2e-7)
@@ -243,8 +243,8 @@ def test_check_points_positions_and_files(tmp_path: Path) -> None:
     """Everything that is written: project with comments, GeoPackage, residuals, JSON without NaN."""
     made = write_project(tmp_path, Make(pixel_noise=0.3, check=4, positions=True))
     report = adjusted(made)
-    facts = report.figures
-    assert [path.name for path in report.written] == list(OUTPUTS)
+    facts = report
+    assert [path.name for path in report.files] == list(OUTPUTS)
     assert facts.check is not None
     assert facts.check.horizontal == 4
     assert "4 check points; the standard asks for at least 30" in facts.check.warnings[0]
@@ -281,18 +281,18 @@ def test_fault_17_gross_errors_are_named(tmp_path: Path) -> None:
     point, image, x, y = rows[at].split(",")
     rows[at] = f"{point},{image},{x},{float(y) + 40}"
     (tmp_path / "points.csv").write_text("\n".join(rows))
-    gross = adjusted(made).figures.gross
+    gross = adjusted(made).gross
     assert gross[0].what == f"point {point!r} in image {image.removesuffix('.tif')!r}"
     # Computed minus measured: rows were made too large.
     np.testing.assert_allclose(float(gross[0].residual.split()[1]), -40.0, atol=4.0)
     kept = adjusted(made, robust=False, variance_components=False, overwrite=True)
-    assert kept.figures.gross == ()
-    assert kept.figures.sigma0 > 2
+    assert kept.gross == ()
+    assert kept.sigma0 > 2
 
 
 def test_stated_accuracies_that_the_observations_contradict(tmp_path: Path) -> None:
     made = write_project(tmp_path, Make(pixel_noise=0.3, sigma_image=1.2))
-    notes = adjusted(made, dry_run=True).figures.notes
+    notes = adjusted(made, dry_run=True).notes
     said = next(note for note in notes if "image points, camera cam: the stated standard deviation is" in note)
     found = re.search(r"is (.*) times too large; (.*) px would fit", said)
     assert found
@@ -303,7 +303,7 @@ def test_fault_17_a_wrong_control_point_is_named(tmp_path: Path) -> None:
     made = write_project(tmp_path, Make(pixel_noise=0.3))
     XYZ = made.points["G5"]
     edit(tmp_path / "control.csv", f"{XYZ[2]:.6f}", f"{XYZ[2] + 5:.6f}")
-    gross = adjusted(made).figures.gross
+    gross = adjusted(made).gross
     assert gross[0].what == "control point 'G5', Z"
 
 
@@ -312,7 +312,7 @@ def test_control_of_which_half_contradicts_the_rest_is_said(tmp_path: Path) -> N
     made = write_project(tmp_path, Make(pixel_noise=0.3))
     for name, off in {"G1": 20, "G3": -30, "G5": 45, "G7": -60, "G9": 80}.items():
         edit(tmp_path / "control.csv", f"{made.points[name][2]:.6f}", f"{made.points[name][2] + off:.6f}")
-    facts = adjusted(made, dry_run=True).figures
+    facts = adjusted(made, dry_run=True)
     lost = sum(what.what.endswith(", Z") for what in facts.gross)
     assert lost >= 5
     assert any(f"{lost} of 9 control heights are taken out as gross errors: nothing tells" in n for n in facts.notes)
@@ -357,8 +357,8 @@ def test_names_that_do_not_fit(tmp_path: Path) -> None:
         exactly(made)
     (tmp_path / "points.csv").write_text(rows + "T1,other.tif,1,2\n")
     report = exactly(made, dry_run=True)
-    assert "1 images of the measurements are not in the project: other.tif" in report.figures.notes
-    assert report.written == ()
+    assert "1 images of the measurements are not in the project: other.tif" in report.notes
+    assert report.files == ()
     assert not (tmp_path / "adjustment").exists()
 
 
@@ -406,12 +406,12 @@ def test_shift_of_strips_and_boresight(tmp_path: Path, curvature: str) -> None:
     make = Make(curvature=curvature, positions=True, shift=shift, boresight_deg=boresight, unit="gon", rotation="kpo")
     made = write_project(tmp_path, make)
     report = exactly(made)
-    for strip in report.figures.strips:
+    for strip in report.strips:
         np.testing.assert_allclose(strip.shift, shift[strip.name], atol=2e-3)
         np.testing.assert_allclose(strip.rms, 0.0, atol=2e-3)
-    assert report.figures.boresight is not None
+    assert report.boresight is not None
     # A small rotation's vector and its angles agree to second order.
-    np.testing.assert_allclose(report.figures.boresight[0], np.array(boresight) / 0.9, atol=1e-3)
+    np.testing.assert_allclose(report.boresight[0], np.array(boresight) / 0.9, atol=1e-3)
     np.testing.assert_allclose(found(made)[0], made.centers, atol=5e-4)
 
 
@@ -419,24 +419,24 @@ def test_the_lever_arm_is_found_in_camera_axes(tmp_path: Path) -> None:
     lever = (0.5, -0.3, 1.2)
     made = write_project(tmp_path, Make(positions=True, lever=lever))
     report = exactly(made)
-    assert report.figures.lever_arm is not None
+    assert report.lever_arm is not None
     # The prior pulls a little, and the map's scale is that of lengths on the ground, not of the arm.
-    np.testing.assert_allclose(report.figures.lever_arm[0], lever, atol=5e-3)
+    np.testing.assert_allclose(report.lever_arm[0], lever, atol=5e-3)
 
 
 def test_the_stated_calibration_is_used(tmp_path: Path) -> None:
     made = write_project(tmp_path, Make(stated={"focal_px": 3597.0}))
     edit(made.path, "[adjustment]", '[adjustment]\ncalibrate = { cam = ["c"] }')
     report = exactly(made)
-    assert report.figures.cameras[0].parameters == ("c",)
-    np.testing.assert_allclose(report.figures.cameras[0].after, 3600.0, atol=1e-3)
+    assert report.cameras[0].parameters == ("c",)
+    np.testing.assert_allclose(report.cameras[0].after, 3600.0, atol=1e-3)
 
 
 @pytest.mark.parametrize("where", ["project", pytest.param("option", marks=pytest.mark.slow)])
 def test_what_is_known_of_a_camera_beforehand_counts(tmp_path: Path, where: str) -> None:
     """Known to a millionth of a pixel a wrong camera constant stays; hardly known it becomes what it is without."""
     plain = write_project(tmp_path, Make(stated={"focal_px": 3597.0}))
-    free = adjusted(plain, robust=False, variance_components=False, calibrate=("c",)).figures.cameras[0].after[0]
+    free = adjusted(plain, robust=False, variance_components=False, calibrate=("c",)).cameras[0].after[0]
     assert abs(free - 3597.0) > 0.5
     for sigma, expected in ((1e-6, 3597.0), (1e5, free)):
         folder = tmp_path / str(sigma)
@@ -449,7 +449,7 @@ def test_what_is_known_of_a_camera_beforehand_counts(tmp_path: Path, where: str)
         else:
             options["calibrate"] = (f"cam=c:{sigma}",)
         report = adjusted(made, robust=False, variance_components=False, **options)
-        np.testing.assert_allclose(report.figures.cameras[0].after, expected, atol=1e-3)
+        np.testing.assert_allclose(report.cameras[0].after, expected, atol=1e-3)
 
 
 def test_a_standard_deviation_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -149,7 +149,7 @@ def test_boresight_and_clock_of_a_strip_are_found_and_used(tmp_path: Path) -> No
     assert difference(path, cameras) > 3.0
     report = adjust_project(AdjustRequest(path))
     assert difference(path, cameras) < 0.1
-    found = {p.name: p.value for p in report.figures.corrections[0].parameters}
+    found = {p.name: p.value for p in report.corrections[0].parameters}
     # Against the axes of the camera: what the file states is turned back.
     assert found["boresight x"] == pytest.approx(-0.03, abs=2e-3)
     assert found["boresight z"] == pytest.approx(-0.05, abs=5e-3)
@@ -168,7 +168,7 @@ def test_a_late_clock_of_a_turbulent_strip_is_found(tmp_path: Path, splines: str
     strip = ShakenStrip(lines=9000, waves=0.002, vibration=(2.0, 0.8, 0.5), events=(10.0, 6.0, 4.0))
     path, cameras = flown(tmp_path, splines, count=60, strip=strip)
     report = adjust_project(AdjustRequest(path))
-    found = {p.name: (p.value, p.sigma) for p in report.figures.corrections[0].parameters}
+    found = {p.name: (p.value, p.sigma) for p in report.corrections[0].parameters}
     assert found["time offset"][0] == pytest.approx(-0.004, abs=5e-5)
     opened = load_project(path).model_copy(update={"terrain": StatedTerrain(height=200.0, height_system="ellipsoidal")})
     for name, true in cameras.items():
@@ -185,10 +185,10 @@ def test_splines_of_a_strip_are_written_and_read(tmp_path: Path) -> None:
     path, cameras = flown(tmp_path, ", knots = 4.0, attitude = 0.01, position = 0.1, smooth_attitude = 0.005", 60)
     report = adjust_project(AdjustRequest(path))
     assert difference(path, cameras) < 0.15
-    times, values = report.figures.corrections[0].over_time or (np.empty(0), np.empty(0))
+    times, values = report.corrections[0].over_time or (np.empty(0), np.empty(0))
     assert len(times) == len(values) > 4
     # Angles as they are drawn: a flight to the east, rolled and pitched by waves of 0.23 degrees.
-    seconds, angles = report.figures.corrections[0].angles or (np.empty(0), np.empty((0, 3)))
+    seconds, angles = report.corrections[0].angles or (np.empty(0), np.empty((0, 3)))
     assert len(seconds) == len(angles) > 100 and (np.diff(seconds) > 0).all()
     assert 0.1 < np.degrees(np.abs(angles[:, :2])).max() < 0.4 and np.degrees(np.abs(angles[:, 2])).max() < 0.4
     assert load_project(path).any_image("forward").geometry_files(lambda name: tmp_path / name)[-1].exists()

@@ -35,10 +35,10 @@ def test_bad_starts_fall_back_to_none(tmp_path: Path, kind: str) -> None:
     report = adjust_project(AdjustRequest(made.path, overwrite=True))
     for name in made.names:
         np.testing.assert_allclose(load_project(made.path).image(name).pose_numbers[0], good[name], rtol=0, atol=0.01)
-    assert report.figures.sigma0 == pytest.approx(1.0, abs=0.2)
-    print(report.figures.notes)
+    assert report.sigma0 == pytest.approx(1.0, abs=0.2)
+    print(report.notes)
     if kind.startswith("kappa"):
-        assert any("the stated orientations were no start" in note for note in report.figures.notes)
+        assert any("the stated orientations were no start" in note for note in report.notes)
 
 
 def test_iterations_are_an_option(tmp_path: Path) -> None:
@@ -52,15 +52,15 @@ def test_iterations_are_an_option(tmp_path: Path) -> None:
 def test_a_point_outside_or_measured_twice_does_not_stop_a_block(tmp_path: Path) -> None:
     made = write_project(tmp_path, Make(pixel_noise=0.3, curvature="none"))
     rows = (tmp_path / "points.csv").read_text().splitlines()
-    before = adjust_project(AdjustRequest(made.path, dry_run=True)).figures.measurements
+    before = adjust_project(AdjustRequest(made.path, dry_run=True)).measurements
     point, image, x, y = rows[40].split(",")
     (tmp_path / "points.csv").write_text("\n".join([*rows, f"{point},{image},{float(x) + 9},{y}"]) + "\n")
-    figures = adjust_project(AdjustRequest(made.path, dry_run=True)).figures
+    figures = adjust_project(AdjustRequest(made.path, dry_run=True))
     assert figures.measurements == before - 1
     assert any(f"{point!r} is measured in image {image!r} in line 41 already" in note for note in figures.notes)
     rows[40] = f"{point},{image},-45.5,{y}"
     (tmp_path / "points.csv").write_text("\n".join(rows) + "\n")
-    figures = adjust_project(AdjustRequest(made.path, dry_run=True)).figures
+    figures = adjust_project(AdjustRequest(made.path, dry_run=True))
     assert figures.measurements == before - 1
     assert any("column -45.5" in note and "1 such measurements take no part" in note for note in figures.notes)
 

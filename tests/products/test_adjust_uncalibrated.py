@@ -68,10 +68,10 @@ def _adjusted(path: Path, *, robust: bool) -> AdjustReport:
 
 def test_images_that_only_the_calibrated_lens_fits_take_part(tmp_path: Path) -> None:
     found = _adjusted(board(tmp_path), robust=False)
-    assert len(found.figures.images) == IMAGES
-    assert found.figures.left_out == ()
-    assert 0.9 < found.figures.sigma0 < 1.1
-    np.testing.assert_allclose(found.figures.cameras[0].after[0], FOCAL, atol=4 * found.figures.cameras[0].sigma[0])
+    assert len(found.images) == IMAGES
+    assert found.left_out == ()
+    assert 0.9 < found.sigma0 < 1.1
+    np.testing.assert_allclose(found.cameras[0].after[0], FOCAL, atol=4 * found.cameras[0].sigma[0])
 
 
 def test_without_calibration_the_reason_is_the_right_one(tmp_path: Path) -> None:
@@ -84,6 +84,6 @@ def test_without_calibration_the_reason_is_the_right_one(tmp_path: Path) -> None
 def test_where_nothing_tells_which_control_is_wrong_all_of_it_stays(tmp_path: Path) -> None:
     """Four fixed corners, one of them raised by 5 mm: every three of them agree."""
     found = _adjusted(board(tmp_path, raised=0.005), robust=True)
-    notes = " ".join(found.figures.notes)
+    notes = " ".join(found.notes)
     assert "control points contradict each other, and nothing tells which is wrong" in notes
-    assert not any(any(point.rejected) for point in found.figures.ground)
+    assert not any(any(point.rejected) for point in found.ground)

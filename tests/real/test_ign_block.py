@@ -30,7 +30,7 @@ def block(shared: Path) -> tuple[dict, Path, int, Published]:
         assert said.code == 0, said.err
         (folder / "peak.txt").write_text(str(peak))
 
-    folder = kept("ign-block", make, ["photoplan.cli.adjust"], [data])
+    folder = kept("ign-block", make, ["photoplan.products.adjust.run"], [data])
     report = json.loads((folder / "adjustment" / "report.json").read_text())
     return report, folder / "project.toml", int((folder / "peak.txt").read_text()), published(data)
 

@@ -37,7 +37,7 @@ def test_quickbird_by_its_control(shared: Path, tmp_path: Path) -> None:
     entry = tomllib.loads(project.read_text())["images"][0]
     assert np.hypot(*entry["shift"]) == pytest.approx(3.64, abs=0.05)
     assert np.sqrt(entry["covariance"][0]) < 0.1
-    image = report.figures.corrections[0]
+    image = report.corrections[0]
     assert image.measurements == 5 and np.hypot(*image.mean) < 0.01
     assert report.data["gross_errors"] == []
     lines = (tmp_path / "adjustment/image_points.csv").read_text().splitlines()

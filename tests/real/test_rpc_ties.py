@@ -35,7 +35,7 @@ def brought_together(shared: Path, folder: Path) -> Path:
     report = find_ties(TieRequest(path))
     assert report.points > 400 and report.sigma < 0.1
     first = adjust_project(AdjustRequest(path))
-    assert first.figures.rms_pixels < 0.05 and first.figures.rejected < 10
+    assert first.rms_pixels < 0.05 and first.rejected < 10
     assert "position of the block in Z" in first.data["determined_by_priors_alone"]
     with rasterio.open(data / "s2p_dsm.tif") as file:
         Z, T = file.read(1), file.transform

@@ -12,7 +12,7 @@ import pytest
 from photoplan.orientation.bundle.model import Group
 from photoplan.orientation.intersection import check_accuracy
 from photoplan.products.adjust.findings import (
-    AdjustFigures,
+    AdjustReport,
     CorrectionFigures,
     GroundFigures,
     ImageFigures,
@@ -47,7 +47,7 @@ class Page(HTMLParser):
         self.words.append(data)
 
 
-def facts(name: str = "p") -> AdjustFigures:
+def facts(name: str = "p") -> AdjustReport:
     """A made-up block: twelve images in two strips, nine ground points of which four are checked."""
     random = np.random.default_rng(1)
     images = tuple(
@@ -80,7 +80,7 @@ def facts(name: str = "p") -> AdjustFigures:
         for k in range(9)
     )
     check = [g for g in ground if g.check]
-    return AdjustFigures(
+    return AdjustReport(
         title=f"Block {name}",
         crs="EPSG:25832",
         sigma0=1.02,

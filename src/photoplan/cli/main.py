@@ -79,7 +79,20 @@ VERBS: dict[str, str | Verb] = {
         "products.film:resect_project",
         {"report": "report.resect:resect_page"},
     ),
-    "adjust": "Adjust a block of images (bundle adjustment).",
+    "adjust": Verb(
+        "Adjust a block of images (bundle adjustment).",
+        """Orientations, points and cameras from all measurements of a project at once.
+
+        Measurements are the files that [observations] names. Orientations and calibrated cameras are written into the
+        project file (the one before is kept as *.previous.toml), a report and the points into the output folder.
+
+        Images that cannot be oriented do not stop the others; they are listed at the end (exit code 4), and products
+        leave them out.
+        """,
+        "requests.orient:AdjustRequest",
+        "products.adjust.run:adjust_project",
+        {"report": "report.adjust:adjust_page"},
+    ),
     "check": "Validate a project and print what to expect of it.",
     "budget": "What limits the accuracy of products, cause by cause.",
     "balance": "Even colours: tables by which images agree where they overlap.",

@@ -115,7 +115,8 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
             if file is not None and (content := load(verb.draw[drawn[path]])(result)) is not None:
                 each = content if isinstance(content, Mapping) else {path: content}
                 made += [replace(file, path=place).write(one) for place, one in each.items()]
-        files = [*result.written(), *made]
+        first = [path for path in made if path in request.drawn.values()]
+        files = [*first, *result.written(), *(path for path in made if path not in first)]
         if record is not None:
             record(files, result)
     if verb.figures_first:

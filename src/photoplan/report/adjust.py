@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photoplan.orientation.intersection import CheckAccuracy
 from photoplan.plain import two_figures
 from photoplan.products.adjust.findings import (
-    AdjustFigures,
+    AdjustReport,
     Calibrated,
     CorrectionFigures,
     GroundFigures,
@@ -48,7 +48,7 @@ _STRIPS = (BLUE, GREEN, PURPLE, SKY, "#7a5c00", INK)
 
 
 @styled
-def draw_network(facts: AdjustFigures) -> bytes:
+def draw_network(facts: AdjustReport) -> bytes:
     """Image centres by strip, tie points, control and check points."""
     fig, axes = _map(facts)
     step = max(1, -(-len(facts.tie_XY) // _DOTS))
@@ -75,7 +75,7 @@ def draw_network(facts: AdjustFigures) -> bytes:
 
 
 @styled
-def draw_control(facts: AdjustFigures, check: bool) -> tuple[bytes, str]:
+def draw_control(facts: AdjustReport, check: bool) -> tuple[bytes, str]:
     """Residual vectors of control or check points with the 95 % ellipses of the adjusted points, and the scale.
 
     What was taken out has no arrow: its residual would set the scale, and the others could not be seen.
@@ -114,7 +114,7 @@ def draw_control(facts: AdjustFigures, check: bool) -> tuple[bytes, str]:
 
 
 @styled
-def draw_sigmas(facts: AdjustFigures) -> bytes:
+def draw_sigmas(facts: AdjustReport) -> bytes:
     """Standard deviations of the projection centres: in the horizontal, and of the height."""
     fig = figure_of(_WIDTH, _height(facts, half=True) + 0.9)
     panels = fig.subplots(1, 2, sharex=True, sharey=True)
@@ -205,7 +205,7 @@ def _ellipse(axes: Any, at: tuple[float, float], covariance: NDArray[np.float64]
     axes.add_patch(patch)
 
 
-def _bounds(facts: AdjustFigures) -> tuple[float, float, float, float]:
+def _bounds(facts: AdjustReport) -> tuple[float, float, float, float]:
     XY = [np.array([image.center[:2] for image in facts.images]).reshape(-1, 2), facts.tie_XY]
     XY.append(np.array([g.XYZ[:2] for g in facts.ground]).reshape(-1, 2))
     every = np.concatenate(XY)
@@ -215,19 +215,19 @@ def _bounds(facts: AdjustFigures) -> tuple[float, float, float, float]:
     return float(low[0]) - margin, float(low[1]) - margin, float(high[0]) + margin, float(high[1]) + margin
 
 
-def _height(facts: AdjustFigures, half: bool = False) -> float:
+def _height(facts: AdjustReport, half: bool = False) -> float:
     left, bottom, right, top = _bounds(facts)
     width = 3.0 if half else 6.2
     return float(np.clip(width * (top - bottom) / (right - left), 1.6 if half else 2.2, 4.2 if half else 6.4))
 
 
-def _map(facts: AdjustFigures) -> tuple[Any, Any]:
+def _map(facts: AdjustReport) -> tuple[Any, Any]:
     fig, axes = axes_of(_WIDTH, _height(facts) + 0.8)
     _frame(axes, facts)
     return fig, axes
 
 
-def _frame(axes: Any, facts: AdjustFigures) -> None:
+def _frame(axes: Any, facts: AdjustReport) -> None:
     left, bottom, right, top = _bounds(facts)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="X m", ylabel="Y m")
     axes.grid(False)
@@ -367,7 +367,7 @@ def camera_parts(camera: Calibrated) -> list[str]:
     return parts
 
 
-def position_parts(facts: AdjustFigures) -> list[str]:
+def position_parts(facts: AdjustReport) -> list[str]:
     """Residuals of observed positions by strip; drift, lever arm, boresight."""
     rows: list[Row] = []
     for s in facts.strips[:MOST_ROWS]:
@@ -397,7 +397,7 @@ def position_parts(facts: AdjustFigures) -> list[str]:
     return parts
 
 
-def image_parts(facts: AdjustFigures) -> list[str]:
+def image_parts(facts: AdjustReport) -> list[str]:
     """Residuals and standard deviations image by image."""
     order = sorted(facts.images, key=lambda i: -_or_zero(float(np.hypot(*i.rms))))
     rows: list[Row] = []
@@ -438,7 +438,7 @@ def image_parts(facts: AdjustFigures) -> list[str]:
     ]
 
 
-def left_out_parts(facts: AdjustFigures) -> list[str]:
+def left_out_parts(facts: AdjustReport) -> list[str]:
     """What could not take part, by reason."""
     reasons: dict[str, list[str]] = {}
     for name, reason in facts.left_out:
@@ -577,7 +577,7 @@ def _over_time(image: CorrectionFigures) -> bytes:
     return png(fig)
 
 
-def adjust_page(facts: AdjustFigures) -> str:
+def adjust_page(facts: AdjustReport) -> str:
     """The report as one HTML document without links to anything outside it.
 
     Names and texts are escaped; what they contain is shown and never obeyed.
@@ -608,7 +608,7 @@ def adjust_page(facts: AdjustFigures) -> str:
     return page(facts.title, facts.crs, parts)
 
 
-def _headline(facts: AdjustFigures) -> list[tuple[str, str, str]]:
+def _headline(facts: AdjustReport) -> list[tuple[str, str, str]]:
     control = [g for g in facts.ground if not g.check]
     sigma = np.array([image.sigma_center for image in facts.images])
     mean = np.sqrt(np.mean(sigma**2, axis=0)) if len(sigma) else np.full(3, np.nan)
@@ -652,7 +652,7 @@ def _headline(facts: AdjustFigures) -> list[tuple[str, str, str]]:
     return boxes
 
 
-def _network(facts: AdjustFigures) -> list[str]:
+def _network(facts: AdjustReport) -> list[str]:
     control = [g for g in facts.ground if not g.check]
     check = len(facts.ground) - len(control)
     return [
@@ -673,7 +673,7 @@ def _network(facts: AdjustFigures) -> list[str]:
     ]
 
 
-def _groups(facts: AdjustFigures) -> list[str]:
+def _groups(facts: AdjustReport) -> list[str]:
     rows: list[Row] = []
     for g in facts.groups:
         share = g.redundancy / g.count if g.count else np.nan
@@ -708,7 +708,7 @@ def _groups(facts: AdjustFigures) -> list[str]:
     ]
 
 
-def _gross(facts: AdjustFigures) -> list[str]:
+def _gross(facts: AdjustReport) -> list[str]:
     parts: list[str] = []
     if facts.gross:
         parts.append(
@@ -726,7 +726,7 @@ def _gross(facts: AdjustFigures) -> list[str]:
     return parts
 
 
-def _control(facts: AdjustFigures) -> list[str]:
+def _control(facts: AdjustReport) -> list[str]:
     picture, scale = draw_control(facts, check=False)
     out = any(any(g.rejected) for g in facts.ground if not g.check)
     return [
@@ -740,7 +740,7 @@ def _control(facts: AdjustFigures) -> list[str]:
     ]
 
 
-def _check(facts: AdjustFigures, check: CheckAccuracy) -> list[str]:
+def _check(facts: AdjustReport, check: CheckAccuracy) -> list[str]:
     rows: list[Row] = []
     for name, k in (("X", 0), ("Y", 1), ("Z", 2)):
         count = check.vertical if k == 2 else check.horizontal
@@ -770,7 +770,7 @@ def _check(facts: AdjustFigures, check: CheckAccuracy) -> list[str]:
     ]
 
 
-def _fields(facts: AdjustFigures) -> list[str]:
+def _fields(facts: AdjustReport) -> list[str]:
     parts = [
         paragraph(
             "Mean residuals (computed minus measured) of all images in cells of the image format. A pattern that hangs "
@@ -792,7 +792,7 @@ def _fields(facts: AdjustFigures) -> list[str]:
     return parts
 
 
-def _record(facts: AdjustFigures) -> list[str]:
+def _record(facts: AdjustReport) -> list[str]:
     return [
         table(["input", ""], [list(row) for row in facts.inputs]),
         table(["setting", "value"], [list(row) for row in facts.settings]),

@@ -1,7 +1,9 @@
-"""Requests of commands that orient images: fiducial marks, tie points, control from orthophotos, resection."""
+"""Requests of commands that orient images: fiducial marks, tie points, control from orthophotos, resection,
+adjustment."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -178,3 +180,44 @@ class ResectRequest(Request):
         """Refuse negative standard deviations."""
         if min(self.sigma_control or (0.0,)) < 0:
             raise UsageError(f"`sigma_control` {self.sigma_control}: numbers of at least 0 are needed, in metres")
+
+
+class AdjustRequest(Request):
+    """Options of the bundle adjustment of a project."""
+
+    project: Path = PROJECT
+    calibrate: tuple[str, ...] = opt(
+        "Camera parameters that are unknowns, with their a priori standard deviations; may be repeated [as stated].",
+        (),
+        metavar="CAMERA=c:SIGMA,x0,…",
+    )
+    datum: Literal["observations", "orientations"] | None = opt(
+        "Datum of the block: control and observed positions, or the orientations in PROJECT [as stated].", None
+    )
+    images: tuple[str, ...] = IMAGES
+    robust: bool = opt("Search no gross errors.", True, flag="no-robust")
+    critical: float = opt("Normalised residual of a gross error.", 4.0)
+    variance_components: bool = opt(
+        "Weight groups as stated, not as their residuals show.", True, flag="no-variance-components"
+    )
+    correlation: bool = opt("Take errors of neighbouring image points as independent.", True, flag="no-correlation")
+    iterations: int = opt("Largest number of iterations of each solution.", 40, ge=1)
+    output: Path | None = opt("Folder of the report [PROJECT/adjustment].", None, folder=True, metavar="FOLDER",
+                              section="result")  # fmt: skip
+    dry_run: bool = opt("Adjust and print the figures; write nothing.", False, section="run")
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse a critical value that rejects everything."""
+        if not self.critical > 0:
+            raise UsageError(f"`critical` {self.critical:g}; a positive number of standard deviations is needed")
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the report."""
+        return self.output if self.output is not None else self.project.resolve().parent / "adjustment"
+
+    @property
+    def drawn(self) -> Mapping[str, Path]:
+        """The page of the report."""
+        return {"report": self.folder / "report.html"}

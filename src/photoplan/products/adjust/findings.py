@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.errors import ImagesLeftOut
+from photoplan.findings import Result, noted
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.frames import Triple, triple
 from photoplan.geometry.heights import height_label
@@ -137,8 +141,8 @@ class ResidualField:
 
 
 @dataclass(frozen=True, eq=False)
-class AdjustFigures:
-    """All figures of a block."""
+class AdjustReport(Result):
+    """Figures of an adjusted block, and what was written."""
 
     title: str
     crs: str
@@ -183,6 +187,83 @@ class AdjustFigures:
     notes: tuple[str, ...]
     inputs: tuple[tuple[str, str], ...]
     settings: tuple[tuple[str, str], ...]
+    not_oriented: tuple[tuple[str, str], ...] = ()
+    """Images that were asked for and could not be oriented: name and reason."""
+    data: dict[str, Any] = field(default_factory=dict)
+    """Values of ``report.json``."""
+    files: tuple[Path, ...] = ()
+    """Empty after a dry run."""
+    orientations: int = 0
+    """Images whose orientation was written into the project."""
+
+    def json_fields(self) -> dict[str, Any]:
+        """Values of ``report.json``, with the files."""
+        return {"files": self.files, **self.data}
+
+    def written(self) -> Sequence[Path]:
+        """Return the files of the report."""
+        return self.files
+
+    def summary(self) -> Sequence[str]:
+        """Return the figures of the block, of its groups, cameras and corrections, and of check points."""
+        lines = [
+            f"sigma0 {self.sigma0:.3f} · image residuals {self.rms_pixels:.3f} px rms · redundancy {self.redundancy} · "
+            f"{self.unknowns} unknowns · {self.iterations} iterations · {self.seconds:.1f} s",
+            f"{len(self.images) + len(self.corrections)} images, {self.points} points adjusted · "
+            f"{self.rejected} gross errors taken out",
+        ]
+        width = max((len(g.name) for g in self.groups), default=0)
+        for g in self.groups:
+            ratio = f"as stated (redundancy {g.redundancy:.1f}: not estimated)"
+            if np.isfinite(g.factor):
+                ratio = f"found/stated {g.factor:.2f}"
+            lines.append(f"  {g.name:<{width}}  {g.count:>7}  rms {g.rms:>9.4g} {g.unit:<3}  {ratio}")
+        for camera in self.cameras:
+            columns = zip(camera.parameters, camera.units, camera.before, camera.after, camera.sigma)
+            for name, unit, before, after, sigma in columns:
+                value = f"{after:.8g} {unit}".rstrip()
+                lines.append(f"  camera {camera.name}: {name} {value} ± {sigma:.2g} (change {after - before:+.3g})")
+        for image in self.corrections:
+            found = ", ".join(f"{p.name} {p.value:+.4g} ± {p.sigma:.2g} {p.unit}" for p in image.parameters)
+            lines.append(f"  {image.name}: {found or 'nothing of it was unknown'}")
+        if self.check is not None:
+            c = self.check
+            rmse = f"RMSE_H {shown_metres(c.rmse_h, c.rmse_h)}, RMSE_V {shown_metres(c.rmse_v, c.rmse_v)}"
+            lines.append(f"check points: {rmse}, {max(c.horizontal, c.vertical)} points (ASPRS 2023)")
+            lines += [f"  warning: {text}" for text in c.warnings]
+        return lines
+
+    def messages(self) -> Sequence[str]:
+        """Return gross errors and notes, reasons for which measurements are left out, and what was written."""
+        notes = [
+            f"gross error: {m.what}: {m.residual}"
+            + (f", {abs(m.normalised):.1f} sigma" if np.isfinite(m.normalised) else "")
+            for m in self.gross[:_SHOWN]
+        ]
+        if len(self.gross) > _SHOWN:
+            notes.append(f"and {len(self.gross) - _SHOWN} more gross errors; all are in report.json")
+        reasons = Counter(reason for _, reason in self.left_out)
+        lines = [f"left out: {count} × {reason}" for reason, count in reasons.items()]
+        if self.orientations:
+            lines.append(f"orientations of {self.orientations} images written into the project")
+        return [*noted([*notes, *self.notes]), *lines]
+
+    def raise_failures(self) -> None:
+        """Name the images that are not oriented, by reason, and what may help."""
+        if not self.not_oriented:
+            return
+        names: dict[str, list[str]] = {}
+        for name, reason in self.not_oriented:
+            names.setdefault(reason, []).append(name)
+        count = len(self.images) + len(self.not_oriented)
+        others = "written, and products leave these out:" if self.files else "determined:"
+        lines = [f"{len(self.not_oriented)} of {count} images could not be oriented; those of the others are {others}"]
+        lines += [f"  {', '.join(images)}: {reason}" for reason, images in names.items()]
+        lines.append(
+            "more tie points may connect them: `photoplan tie `overwrite`` with other `pairs`, `scale` or `features`; "
+            "or control points in them"
+        )
+        raise ImagesLeftOut("\n".join(lines))
 
 
 #: Measurements in a cell on average, and cells along the longer side at least and at most.
@@ -265,7 +346,7 @@ def _frame(result: MapResult, name: str) -> tuple[float, float, float, float]:
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
-def point_layers(result: MapResult, facts: AdjustFigures) -> list[PointLayer]:
+def point_layers(result: MapResult, facts: AdjustReport) -> list[PointLayer]:
     """Layers of the GeoPackage: adjusted points, projection centres, and residuals of control and check points."""
     adjusted = result.adjusted
     role = {g.name: "check" if g.check else "control" for g in facts.ground}
@@ -311,7 +392,7 @@ def _xyz(name: str, values: _Floats) -> dict[str, _Floats]:
     return {f"{name}_{axis}": np.ascontiguousarray(values[:, k], float) for k, axis in enumerate("xyz")}
 
 
-def block_json(figures: AdjustFigures, result: MapResult) -> dict[str, Any]:
+def block_json(figures: AdjustReport, result: MapResult) -> dict[str, Any]:
     """All figures by their keys."""
     inputs = result.prepared.inputs
     own = ("sigma0", "redundancy", "unknowns", "iterations", "seconds", "measurements", "points", "notes")
@@ -362,6 +443,7 @@ def block_json(figures: AdjustFigures, result: MapResult) -> dict[str, Any]:
         "inputs": {str(path): fingerprint(path).digest for path in inputs.files},
         "versions": versions(),
         "settings": dict(figures.settings),
+        "not_oriented": [{"name": name, "reason": reason} for name, reason in figures.not_oriented],
     }
 
 
@@ -389,7 +471,7 @@ def _measurement(m: NamedMeasurement) -> dict[str, Any]:
     return pick(m, "residual", "normalised", observation="what")
 
 
-def _positions(figures: AdjustFigures) -> dict[str, Any] | None:
+def _positions(figures: AdjustReport) -> dict[str, Any] | None:
     if not figures.strips:
         return None
     own = ("name", "rejected", "mean", "rms", "shift", "rate", "sigma_shift", "sigma_rate")
@@ -401,13 +483,15 @@ def _positions(figures: AdjustFigures) -> dict[str, Any] | None:
     }
 
 
+#: Gross errors that are printed; the rest is in the report.
+_SHOWN = 20
 #: Kept measurements that are named.
 _WORST = 15
 #: Redundancy from which a group's variance factor says something, and from which ratio on it is told.
 _SOUND, _CONTRADICTED = 30.0, 1.4
 
 
-def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: float) -> AdjustFigures:
+def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: float) -> AdjustReport:
     """The figures of a block."""
     prepared, adjusted = result.prepared, result.adjusted
     inputs, project = prepared.inputs, prepared.inputs.project
@@ -418,7 +502,7 @@ def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: 
     sigma = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
     system = project.height_system
     residuals = adjusted.residuals[used]
-    return AdjustFigures(
+    return AdjustReport(
         title=title,
         crs=f"{crs_label(project.crs)} · heights {height_label(system)} · earth curvature "
         f"{project.orientation.earth_curvature}",

@@ -6,10 +6,10 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from photoplan.orientation.bundle.model import Adjusted, AdjustSettings
 from photoplan.orientation.judgement import Evidence, fitting, impossible, misfit
 from photoplan.orientation.resection import ResectSettings
 from photoplan.plain import pick
-from photoplan.products.adjust.findings import AdjustFigures, block_json, point_layers, summarise
+from photoplan.products.adjust.findings import AdjustReport, block_json, point_layers, summarise
 from photoplan.products.adjust.inputs import (
     AdjustInputs,
     EarlierResult,
@@ -45,6 +45,7 @@ from photoplan.products.adjust.inputs import (
 from photoplan.products.adjust.sensors import Free, camera_entries, geometry_of, nadir_heights, parse_calibrate
 from photoplan.products.film import control_rows, measured_control, resected
 from photoplan.project.scene import input_files
+from photoplan.requests.orient import AdjustRequest
 
 #: Change of a camera constant, and part of the squared residuals that it explains, from which the block is refused.
 _FAR, _ALL = 0.1, 0.9
@@ -163,64 +164,8 @@ _POOR = 0.1
 OUTPUTS = ("report.json", "points.gpkg", "image_points.csv")
 
 
-@dataclass(frozen=True)
-class AdjustRequest:
-    """What is asked."""
-
-    project: Path
-    calibrate: tuple[str, ...] = ()
-    """``CAMERA=c,x0,y0,k1`` each; empty: as [adjustment] states."""
-    datum: Literal["observations", "orientations"] | None = None
-    """What places the block: observations (control, observed positions), or the orientations that the project states;
-    None: as [adjustment] states."""
-    images: tuple[str, ...] = ()
-    """Names or patterns; empty: all."""
-    robust: bool = True
-    critical: float = 4.0
-    variance_components: bool = True
-    """Whether each group of observations gets the accuracy that its residuals show."""
-    correlation: bool = True
-    """Whether errors of neighbouring image points may be alike."""
-    iterations: int = 40
-    """Most iterations of each least-squares solution."""
-    output: Path | None = None
-    """Folder; None: ``adjustment`` beside the project file."""
-    dry_run: bool = False
-    """Adjust and tell, but write nothing."""
-    overwrite: bool = False
-
-    @property
-    def folder(self) -> Path:
-        """Where reports go."""
-        return self.output if self.output is not None else self.project.resolve().parent / "adjustment"
-
-
-@dataclass(frozen=True, eq=False)
-class AdjustReport:
-    """What came out."""
-
-    written: tuple[Path, ...]
-    """Empty after a dry run."""
-    figures: AdjustFigures
-    orientations: int
-    """Images whose orientation was written into the project."""
-    data: dict[str, Any]
-    not_oriented: tuple[tuple[str, str], ...] = ()
-    """Images that were asked for and could not be oriented: name and reason."""
-
-    def json_fields(self) -> dict[str, Any]:
-        """Those of ``report.json``, with the files."""
-        return {"files": self.written, **self.data}
-
-
 def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustReport:
     """Adjust the block of a project and write the result into it.
-
-    Parameters
-    ----------
-    request : AdjustRequest
-    events : Events
-        Told what is used, and of each iteration.
 
     Raises
     ------
@@ -233,8 +178,6 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     ResourceError
         The disk is full.
     """
-    if not (math.isfinite(request.critical) and request.critical > 0):
-        raise UsageError(f"`critical` {request.critical:g}; a positive number of standard deviations is needed")
     project = load_project(request.project)
     if request.datum is not None:
         own = project.adjustment.model_copy(update={"datum": request.datum})
@@ -247,13 +190,8 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     if not request.dry_run:
         _refuse_inputs(request, inputs.files)
     begun = time.perf_counter()
-    settings = AdjustSettings(
-        request.robust,
-        request.critical,
-        request.variance_components,
-        correlation=request.correlation,
-        iterations=request.iterations,
-    )
+    method = ("robust", "critical", "variance_components", "correlation", "iterations")
+    settings = AdjustSettings(**pick(request, *method))
     try:
         prepared, adjusted = _adjusted(inputs, free, settings, events)
     except DatumDefect as error:
@@ -268,16 +206,14 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     title = f"Bundle adjustment of {request.project.resolve().parent.name}"
     causes = weighed_causes(prepared.block, adjusted)
     refuse_cause(causes)
-    figures = summarise(title, result, settings, time.perf_counter() - begun)
-    figures = replace(figures, notes=(*cause_notes(causes, result), *figures.notes))
-    data = block_json(figures, result)
+    report = summarise(title, result, settings, time.perf_counter() - begun)
+    report = replace(report, notes=(*cause_notes(causes, result), *report.notes))
     reasons = dict((*result.prepared.inputs.lost, *adjusted.left_out))
     images = [image.name for image in inputs.images if image.name not in adjusted.images]
     lost = tuple((name, reasons.get(name, "no reason is known")) for name in images)
-    data["not_oriented"] = [{"name": name, "reason": reason} for name, reason in lost]
-    if request.dry_run:
-        return AdjustReport(written=(), figures=figures, orientations=0, data=data, not_oriented=lost)
-    return _write(request, project, result, figures, data, lost)
+    report = replace(report, not_oriented=lost)
+    report = replace(report, data=block_json(report, result))
+    return report if request.dry_run else _write(request, project, result, report)
 
 
 def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events: Events) -> tuple[Prepared, Adjusted]:
@@ -389,22 +325,15 @@ def _used(prepared: Prepared) -> str:
     )
 
 
-def _write(
-    request: AdjustRequest,
-    project: Project,
-    result: MapResult,
-    figures: AdjustFigures,
-    data: dict[str, Any],
-    lost: tuple[tuple[str, str], ...],
-) -> AdjustReport:
+def _write(request: AdjustRequest, project: Project, result: MapResult, report: AdjustReport) -> AdjustReport:
     folder, adjusted = request.folder, result.adjusted
     with recording("adjust", request, [request.project, *result.prepared.inputs.files]) as record:
-        changes = _changes(result, lost)
+        changes = _changes(result, report.not_oriented)
         try:
             make_parents(folder)
         except OSError as error:
             raise disk_error(folder, error) from error
-        write_point_layers(folder / "points.gpkg", point_layers(result, figures), result.prepared.frame.crs)
+        write_point_layers(folder / "points.gpkg", point_layers(result, report), result.prepared.frame.crs)
         write_residuals(
             folder / "image_points.csv",
             result.prepared.inputs.points,
@@ -413,7 +342,7 @@ def _write(
             adjusted.redundancies,
             adjusted.rejected,
         )
-        write_atomically(folder / "report.json", stated_json(data, folder))
+        write_atomically(folder / "report.json", stated_json(report.data, folder))
         files = []
         for name, kind, found in result.corrections:
             file = kind.output(project.stems[name])
@@ -424,24 +353,9 @@ def _write(
                 changes.images[name]["correction"] = where
         edit_project(request.project, changes)
         written = (*(folder / name for name in OUTPUTS), *files)
-        figures_of_block = (
-            "sigma0",
-            "redundancy",
-            "unknowns",
-            "iterations",
-            "seconds",
-            "measurements",
-            "points",
-            "rejected",
-        )
-        record((*written, request.project), pick(figures, *figures_of_block))
-    return AdjustReport(
-        written=written,
-        figures=figures,
-        orientations=len(adjusted.images) + len(adjusted.projections),
-        data=data,
-        not_oriented=lost,
-    )
+        own = ("sigma0", "redundancy", "unknowns", "iterations", "seconds", "measurements", "points", "rejected")
+        record((*written, request.project), pick(report, *own))
+    return replace(report, files=written, orientations=len(adjusted.images) + len(adjusted.projections))
 
 
 def _changes(result: MapResult, lost: Sequence[tuple[str, str]]) -> ProjectChanges:
