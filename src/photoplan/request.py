@@ -7,15 +7,19 @@ pydantic model. Modules of requests import nothing heavy, so that the help answe
 from __future__ import annotations
 
 import re
+import types
 from collections.abc import Mapping
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from photoplan.errors import UsageError
 from photoplan.public import fitted
+
+Part = TypeVar("Part", bound="Request")
 
 #: Bounds of numbers, as pydantic calls them, and how messages call them.
 _LIMITS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
@@ -45,13 +49,15 @@ class Request(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False)
 
     def __init__(self, *values: Any, **named: Any) -> None:
-        fields = tuple(type(self).model_fields)
+        # Arguments of the command come first, also those of a class that derives from another one.
+        declared = type(self).model_fields
+        fields = sorted(declared, key=lambda name: not how_of(declared[name]).get("argument"))
         if len(values) > len(fields):
             raise UsageError(f"{type(self).__name__} takes {len(fields)} values at most, found {len(values)}")
         named = dict(zip(fields, values)) | named
         for name in set(named).intersection(fields):
-            annotation = type(self).model_fields[name].annotation
-            named[name] = fitted(named[name], annotation, f"`{name}`")
+            annotation = declared[name].annotation
+            named[name] = fitted(_parsed(named[name], annotation), annotation, f"`{name}`")
         try:
             super().__init__(**named)
         except ValidationError as error:
@@ -59,7 +65,9 @@ class Request(BaseModel):
         seen: dict[Path, str] = {}
         for name, paths in self.files_written().items():
             for path in paths:
-                if (other := seen.setdefault(path.resolve(), name)) != name or len(paths) > len(set(paths)):
+                if len(paths) > len({each.resolve() for each in paths}):
+                    raise UsageError(f"`{name}` {path}: one file twice; give each its own name")
+                if (other := seen.setdefault(path.resolve(), name)) != name:
                     raise UsageError(f"{path}: `{other}` and `{name}` are the same file; choose two names")
         self.check()
 
@@ -73,6 +81,10 @@ class Request(BaseModel):
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other values, checked."""
         return type(self)(**({name: getattr(self, name) for name in type(self).model_fields} | changes))
+
+    def part(self, kind: type[Part]) -> Part:
+        """Return the options of a class from which this one derives, or that it holds; those that were set are set."""
+        return kind(**{name: getattr(self, name) for name in kind.model_fields if name in self.model_fields_set})
 
     @property
     def product(self) -> Path:
@@ -102,6 +114,19 @@ class Request(BaseModel):
                 values = value if isinstance(value, tuple) else (value,)
                 found |= {name: [each for each in values if isinstance(each, Path)]}
         return found
+
+
+def _parsed(value: Any, hint: Any) -> Any:
+    """Return a value of a class with `parse` from its text, a value that a record states from its mapping."""
+    for kind in get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,):
+        if get_origin(kind) is tuple and hasattr(get_args(kind)[0], "parse"):
+            each = (value,) if isinstance(value, str) else value
+            return tuple(_parsed(one, get_args(kind)[0]) for one in each) if isinstance(each, list | tuple) else value
+        if isinstance(value, str) and hasattr(kind, "parse"):
+            return kind.parse(value)
+        if isinstance(value, dict) and isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, Request)):
+            return kind(**value)
+    return value
 
 
 def how_of(field: FieldInfo) -> Mapping[str, Any]:

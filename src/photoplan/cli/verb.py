@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 
 import click
+from click.core import ParameterSource
 
 from photoplan.cli.options import BYTES, NEW_FOLDER, PATH, PROJECT, all_cores, json_option, listed, quiet_option
 from photoplan.cli.output import can_draw, show, show_json, spelled, talking
@@ -35,6 +36,9 @@ class Verb:
     draw: Mapping[str, str] = field(default_factory=dict)
     """The function that draws a file from the result, by option, option and ending such as ``outputs.png``, or key of
     `Request.drawn`. That of a folder, such as ``pictures/``, returns pictures by place; `make` has checked places."""
+    each: str = ""
+    """Function that draws a part of the result as soon as it is announced to the events, from it, the request and a
+    function that reports whether pictures can be drawn if they are wanted; it returns what there is to say."""
     record: str = ""
     """Kind of the run record, for operations that write none themselves."""
     figures_first: bool = False
@@ -50,6 +54,11 @@ class Verb:
         """Return the click command of a request; `call` takes the request and the two options of what is printed."""
 
         def callback(as_json: bool, quiet: bool, **given: Any) -> None:
+            context = click.get_current_context()
+            for name, option in ((each.name or "", each) for each in command.params):
+                # A value that nobody gave may be the project's.
+                if context.get_parameter_source(name) is ParameterSource.DEFAULT and given.get(name) == option.default:
+                    given.pop(name, None)
             call(_request(kind, given), as_json=as_json, quiet=quiet)
 
         command = VerbCommand(name, callback=callback, help=self.help)
@@ -89,11 +98,29 @@ def load(place: str) -> Any:
 def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     """Run the operation of a verb, draw what is drawn, and print the result."""
     from photoplan.cli.telling import Telling
+    from photoplan.findings import Result
     from photoplan.io.store import recording, together
     from photoplan.request import how_of
 
     dry_run = getattr(request, "dry_run", False)
-    talk = talking(quiet)
+    talk, shown = talking(quiet), set[object]()
+
+    def once(line: str) -> None:
+        if line not in shown:
+            talk(line)
+        shown.add(line)
+
+    def announced(part: object) -> None:
+        """Print the files of a part of the result that is complete; those of a record get their names at the end."""
+        files = part.written() if isinstance(part, Result) else ()
+        for path in () if opened else files:
+            if not as_json and path not in shown:
+                show(path)
+            shown.add(path)
+        draws = load(verb.each) if verb.each and files else lambda *_: ()
+        for line in draws(part, request, lambda wanted: can_draw(wanted, once)):
+            once(line)
+
     drawn = {
         path: key
         for name, paths in request.files_written().items()
@@ -108,7 +135,7 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     opened = {path: _opened(path, key, request) for path, key in drawn.items()} if drawing else {}
     recorded = recording(verb.record, request, request.files_read()) if verb.record and not dry_run else nullcontext()
     with recorded as record, together() if opened else nullcontext():
-        with Telling(quiet) as events:
+        with Telling(quiet, announced) as events:
             result = load(verb.make)(request, events)
         made: list[Path] = []
         for path, file in opened.items():
@@ -137,8 +164,8 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
         show_json(result, **more)
     else:
         # A project that was changed is recorded, and no product.
-        shown = [file for file in files if file not in request.files_read()]
-        for line in (*result.summary(), *shown) if verb.figures_first else (*shown, *result.summary()):
+        rest = [file for file in files if file not in request.files_read() and file not in shown]
+        for line in (*result.summary(), *rest) if verb.figures_first else (*rest, *result.summary()):
             show(line)
     for message in result.messages():
         if not as_json or message.startswith(("note:", "warning:")):
@@ -201,14 +228,19 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
                 more["nargs"], hint = len(get_args(hint)), get_args(hint)[0]
             more["multiple"] = True
             if how.get("listed"):
-                more["callback"] = _numbers if hint in (int, float) else _words
+                more["callback"] = partial(_numbers, how["listed"]) if hint in (int, float) else _words
+    if hasattr(hint, "parse"):
+        # A value of a class that reads itself from text.
+        hint = str
+        if how.get("listed") and "multiple" not in more:
+            more |= {"multiple": True, "callback": lambda context, parameter, given: ",".join(given) or None}
     choices = [str(each) for each in get_args(hint)] if get_origin(hint) is Literal else how.get("choices")
     if isinstance(choices, Mapping):
         more["callback"] = partial(_value_of, choices)
     kind: Any = click.Choice(choices) if choices else BYTES if how.get("size") else hint
     if hint is Path:
         kind = NEW_FOLDER if how.get("folder") else PROJECT if how.get("project") else PATH
-    if more.get("callback") is _numbers:
+    if isinstance(more.get("callback"), partial):
         kind = str
     if how.get("argument"):
         if more.pop("multiple", False):
@@ -219,7 +251,7 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     if hint is bool and not choices:
         if how.get("off") or flag[2:].startswith("no-"):
             return click.Option([name, flag], is_flag=True, flag_value=False, default=True, help=entry.description)
-        both = bool(default) or optional
+        both = (bool(default) or optional) and "/" not in flag
         names = [name, flag + (f"/--{'no'}-{flag[2:]}" if both else "")]
         return click.Option(names, is_flag=True, default=None if optional else default, help=entry.description)
     if name == "workers":
@@ -244,11 +276,12 @@ def _words(context: click.Context, parameter: click.Parameter, given: tuple[str,
     return listed(given)
 
 
-def _numbers(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> tuple[float, ...]:
+def _numbers(
+    needed: str | bool, context: click.Context, parameter: click.Parameter, given: tuple[str, ...]
+) -> tuple[float, ...]:
     try:
         return tuple(float(word) for text in given for word in text.replace(",", " ").split())
     except ValueError:
         example = f", such as {parameter.metavar}" if parameter.metavar else ""
-        raise click.BadParameter(
-            f"{' '.join(given)!r}: numbers with commas are required{example}", context, parameter
-        ) from None
+        needed = needed if isinstance(needed, str) else f"numbers with commas are required{example}"
+        raise click.BadParameter(f"{parameter.name} {' '.join(given)}: {needed}", context, parameter) from None
