@@ -27,7 +27,6 @@ from photoplan.plan.footprint import Tile
 from photoplan.products.surface import plan as surface_job
 from photoplan.products.surface.plan import (
     SurfaceJob,
-    SurfaceSettings,
     counted,
     finer_levels,
     median,
@@ -39,6 +38,7 @@ from photoplan.products.surface.plan import (
 from photoplan.products.surface.run import findings
 from photoplan.project.scene import ScenesAddress
 from photoplan.report import surface as report
+from photoplan.requests.surface import SurfaceSettings
 
 CLOUDS = (".las", ".laz", ".ply")
 BOUNDS = (X0 - 18, Y0 - 30, X0 + 18, Y0 + 30)

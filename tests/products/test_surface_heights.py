@@ -22,7 +22,7 @@ from photoplan.products.monoplot import MonoplotRequest, monoplot_file
 from photoplan.products.surface.plan import _start
 from photoplan.products.surface.plan import plan_surface
 from photoplan.products.surface.run import make_surface
-from photoplan.products.surface.plan import SurfaceSettings
+from photoplan.requests.surface import SurfaceSettings
 from pathlib import Path
 project, (x, y, z) = load_project("project.toml"), map(float, sys.argv[1:])
 plan = plan_surface(project, SurfaceSettings(3.0, bounds=(x - 9, y - 9, x + 9, y + 9), start=str(z + 1), reach=8.0))

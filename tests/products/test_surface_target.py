@@ -117,7 +117,7 @@ def test_the_scene_stood_up_is_a_wall(scene: Scene, on_map: Path, tmp_path: Path
     assert said.code == 3 and "which is no map" in said.err, said.err
 
 
-def test_a_picture_names_what_is_along_its_axes(on_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_names_what_is_along_its_axes(on_map: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = []
 
     def kept(figure: Any) -> bytes:
@@ -125,7 +125,7 @@ def test_a_picture_names_what_is_along_its_axes(on_map: Path, tmp_path: Path, mo
         return b""
 
     monkeypatch.setattr(maps, "png", kept)
-    maps.draw_surface(on_map / "surface.tif", tmp_path / "s.png", ("u", "v"))
+    maps.draw_surface(on_map / "surface.tif", ("u", "v"))
     assert drawn == ["v [m]", "", "u [m]v [m]", "u [m]", "m", "m", ""]
 
 

@@ -15,7 +15,8 @@ from tools.small_block import CRS, X0, Y0
 from photoplan.geometry.grid import Window
 from photoplan.io.project.file import load_project
 from photoplan.plan.footprint import Tile
-from photoplan.products.surface.plan import SurfaceJob, SurfaceSettings, plan_surface
+from photoplan.products.surface.plan import SurfaceJob, plan_surface
+from photoplan.requests.surface import SurfaceSettings
 
 pytestmark = pytest.mark.slow
 BOUNDS = (X0 - 30, Y0 - 45, X0 + 30, Y0 + 45)

@@ -121,7 +121,20 @@ VERBS: dict[str, str | Verb] = {
         {"preview": "report.illumination:draw_light"},
     ),
     "object": "Make a product of each object alone.",
-    "surface": "Heights and grey values from all images at once.",
+    "surface": Verb(
+        "Heights and grey values from all images at once.",
+        """Compute heights and grey values from all images at once, each with its standard deviation.
+
+        NAME.tif has the heights, NAME_sigma.tif their standard deviations, NAME_count.tif the images that see them,
+        NAME_fit.tif the residuals around them, NAME_grey.tif the grey values of the surface, NAME_grey_sigma.tif their
+        standard deviations. The heights serve as [terrain] of a project. The same command continues a run that was
+        interrupted.
+        """,
+        "requests.surface:SurfaceRequest",
+        "products.surface.run:surface_project",
+        {"report": "report.surface:surface_page"},
+        each="report.maps:surface_drawn",
+    ),
     "register": Verb(
         "Compare two images to a small part of a pixel.",
         """Find by how much SECOND lies beside FIRST, patch by patch, to a small part of a pixel.

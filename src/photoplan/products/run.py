@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,13 @@ class Run:
     """Whether to write a preview of the products, such as `ortho_overview.png`."""
     events: Events = SILENT
     """Told of tiles that are done, and of each product's result, also if some of its tiles failed."""
+
+    @classmethod
+    def of(cls, request: Any, events: Events, again: bool = False) -> Run:
+        """Return what a request states of its run."""
+        options = dict(request)
+        known = {f.name: options[f.name] for f in fields(cls) if f.name in options}
+        return cls(**known, events=events, again=again)
 
     def check(self, each: int = _EACH) -> None:
         """Refuse what cannot work, before any work.

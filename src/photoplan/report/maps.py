@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from photoplan.io.quicklook import read_reduced
 from photoplan.io.store import write_atomically
 from photoplan.products.seams import SeamsReport
 from photoplan.products.surface.plan import MISFIT
+from photoplan.products.surface.run import SurfaceResult
 from photoplan.report.drawing import (
     BLUE,
     GREEN,
@@ -32,6 +33,7 @@ from photoplan.report.drawing import (
     round_down,
     shortened,
 )
+from photoplan.requests.surface import SurfaceRequest
 
 #: Longest side of what is drawn, pixels; ellipses along it; length of the largest of them, part of their distance.
 _SIDE, _ELLIPSES, _LARGEST = 900, 16, 0.8
@@ -124,8 +126,16 @@ def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:
     return path
 
 
-def draw_surface(heights: Path, picture: Path, coordinates: tuple[str, str] = ("X", "Y")) -> Path:
-    """Draw heights, grey values, standard deviations and residuals of a surface as one PNG; replaces an older one."""
+def surface_drawn(result: SurfaceResult, request: SurfaceRequest, can_draw: Callable[[bool], bool]) -> Iterator[str]:
+    """Draw a surface as a PNG beside it if that is wanted, and say so; replaces an older one."""
+    if can_draw(request.quicklook):
+        picture = result.path.with_suffix(".png")
+        write_atomically(picture, draw_surface(result.path, result.plan.axes))
+        yield f"  drawn in {picture}"
+
+
+def draw_surface(heights: Path, coordinates: tuple[str, str] = ("X", "Y")) -> bytes:
+    """Return heights, grey values, standard deviations and residuals of a surface as one PNG."""
     load_matplotlib("a picture of the surface", "say `no_quicklook`")
     (z,), (left, bottom, right, top) = read_reduced(heights, max_side=_SIDE_OF_FOUR)
     grey, sigma, fit = (
@@ -168,8 +178,7 @@ def draw_surface(heights: Path, picture: Path, coordinates: tuple[str, str] = ("
             _on_map(ax, title, f"{coordinates[0]} [m]" if ax in axes[2:] else "", ylabel=None)
         for ax in axes[::2]:
             ax.set_ylabel(f"{coordinates[1]} [m]")
-        write_atomically(picture, png(fig))
-    return picture
+        return png(fig)
 
 
 def _most(values: NDArray[np.float64], percent: float) -> tuple[float, float]:

@@ -21,8 +21,9 @@ _Doubles = NDArray[np.float64]
 _SIDE, _CLASSES, _PICTURES = 1200, 4, 12
 
 
-def surface_page(plan: SurfacePlan, result: SurfaceResult) -> str:
-    """The HTML document of a finished surface; its files are read again, reduced."""
+def surface_page(result: SurfaceResult) -> str:
+    """Return the HTML document of a finished surface; its files are read again, reduced."""
+    plan = result.plan
     paths = outputs(result.path.parent, plan)
     bands = {kind: read_reduced(path, max_side=_SIDE) for kind, path in paths.items() if kind != "residuals"}
     sigma, count, fit = (bands[kind][0][0] for kind in ("sigma", "count", "fit"))

@@ -792,6 +792,11 @@ class Project(Entry):
         project._unusable = {**self._unusable, **reasons}
         return project
 
+    @property
+    def unusable(self) -> Mapping[str, str]:
+        """Images that `leaving_out` names, with the reasons."""
+        return self._unusable
+
     def oriented(self, names: Sequence[str], approximate: bool = False) -> tuple[list[str], list[str]]:
         """The oriented ones of some images, and a line for each of the others; `approximate` ones count if asked for.
 

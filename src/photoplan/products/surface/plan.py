@@ -1,4 +1,4 @@
-"""Plans of surface reconstruction: settings, targets, initial surface, scheme of grids, job."""
+"""Plans of surface reconstruction: targets, initial surface, scheme of grids, job."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from photoplan.cameras.framed import FramedCamera
 from photoplan.engine.run import Made, Output
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events, stretch
+from photoplan.findings import Result
 from photoplan.geometry.bounds import MOST_HEIGHT, bounds_fault, odd_place
 from photoplan.geometry.frames import CylinderFrame, Frame, ImageFrame
 from photoplan.geometry.grid import MapGrid, Window
@@ -34,49 +35,19 @@ from photoplan.plain import advised, pick
 from photoplan.plan.footprint import Tile, Tiles
 from photoplan.products.orthophoto.plan import extent_text, look_at
 from photoplan.project.ground import Ground, ground_of, open_terrain
-from photoplan.project.scene import Scene, ScenesAddress, map_order, open_scene, surface_of, target_frame
+from photoplan.project.scene import (
+    Scene,
+    ScenesAddress,
+    map_order,
+    open_scene,
+    refuse_unusable,
+    surface_of,
+    target_frame,
+)
+from photoplan.requests.surface import SurfaceSettings
 from photoplan.surfaces.objects import without_objects
 
 Bounds = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class SurfaceSettings:
-    """What a user may choose about a surface."""
-
-    resolution: float
-    """Distance of the height posts, metres."""
-    target: str = "map"
-    """What heights are over: `map`, `wall:X,Y,Z,AZIMUTH[,TILT]`, `vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`,
-    `column:X,Y,Z,AZIMUTH,RADIUS` or `image:NAME[,DISTANCE]`, see `photoplan.project.scene`."""
-    bounds: Bounds | None = None
-    """xmin, ymin, xmax, ymax; None: all that two images see, or the image that is the target; others need them."""
-    start: str = "terrain"
-    """`terrain` (the project's), a height in metres, or a file of heights; on a target that is no map a height, for
-    `terrain` 0."""
-    reach: float | None = None
-    """How far the start may be wrong, metres; None: a tenth of the flying height."""
-    search: bool | None = None
-    """Whether heights are first searched post by post within the reach, for strong relief; None: where the reach is
-    many pixels of parallax, and no image was taken on a turbulent flight."""
-    bands: tuple[int, ...] = ()
-    """Bands of every image whose mean is its grey value, from 1; empty: luminance of three, the mean of others."""
-    residuals: bool = False
-    """Whether to write the residuals of every image, too."""
-    points: tuple[Path, ...] = ()
-    """Files that the heights are written to as points, too: .las, .laz or .ply."""
-    name: str = "surface"
-    """Of the product, and of its files without the extension."""
-
-    @property
-    def seen(self) -> str:
-        """What images see, as messages call it."""
-        return "ground" if self.target == "map" else "target"
-
-    @property
-    def start_file(self) -> Path | None:
-        """The file of heights with which it begins, if it begins with one."""
-        return None if self.start == "terrain" or number(self.start) is not None else Path(self.start)
 
 
 def check_start(project: Project, settings: SurfaceSettings) -> None:
@@ -92,7 +63,7 @@ def check_start(project: Project, settings: SurfaceSettings) -> None:
         check_cloud(path)
     if settings.start == "terrain":
         return
-    height = number(settings.start)
+    height = settings.start_height
     if height is not None and not math.isfinite(height):
         raise UsageError(f"start {settings.start}; give `terrain`, a height in metres, or a file of heights")
     odd = None if height is None else odd_place((0.0, 0.0, height), camera=True)
@@ -104,24 +75,6 @@ def check_start(project: Project, settings: SurfaceSettings) -> None:
         if not Path(settings.start).exists():
             raise UsageError(f"start {settings.start!r}: is no height and no file; give `terrain`, a height, or a file")
         open_terrain(Path(settings.start)).in_crs(project.crs)
-
-
-def check_bands(project: Project, bands: Sequence[int], names: Sequence[str]) -> None:
-    """Refuse bands that an image does not have, or that are stated twice."""
-    if len(set(bands)) < len(bands) or any(band < 1 for band in bands):
-        raise UsageError(f"bands {', '.join(map(str, bands))}; numbers from 1 on are needed, each once")
-    for name in names if bands else ():
-        own = open_scene(project, name).reader.bands
-        if max(bands) > own:
-            raise UsageError(f"bands {', '.join(map(str, bands))}: image {name!r} has {own}")
-
-
-def number(text: str) -> float | None:
-    """Of a text; None: it is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return None
 
 
 #: Classes, the binary logarithms of their least and largest standard deviation, metres.
@@ -249,15 +202,15 @@ class StartGap:
 
 
 def start_gap(
-    start: str, reach: float, bounds: Bounds, crs: str, looked: Sequence[SeenTarget], ground: Ground
+    settings: SurfaceSettings, reach: float, bounds: Bounds, crs: str, looked: Sequence[SeenTarget], ground: Ground
 ) -> StartGap:
     """Compare a start with the project's terrain, place by place inside the bounds."""
+    start, height, stated = settings.start, settings.start_height, None
     if start == "terrain":
         return StartGap()
     x0, y0, x1, y1 = bounds
     part = (np.arange(_PLACES) + 0.5) / _PLACES
     XY = np.stack(np.meshgrid(x0 + part * (x1 - x0), y0 + part * (y1 - y0)), axis=-1)
-    height, stated = number(start), None
     if height is None:
         opened = open_terrain(Path(start)).in_crs(crs)[0]
         stated, begun = opened.height_system, np.asarray(opened.surface.heights(XY), float)
@@ -624,7 +577,7 @@ HARDLY = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class SurfacePlan:
+class SurfacePlan(Result):
     """A surface before its heights."""
 
     project: Project
@@ -731,8 +684,24 @@ class SurfacePlan:
             f", heights searched within {s.reach:.3g} m ({pixels:.0f} px) of it on {levels} level{'s' * (levels > 1)}"
         )
 
+    def written(self) -> Sequence[Path]:
+        """Return no file: none is written."""
+        return ()
+
+    def summary(self) -> Sequence[str]:
+        """Return the plan."""
+        return [str(self)]
+
+    def messages(self) -> Sequence[str]:
+        """Return the images that are left out."""
+        return [f"note: left out: {line}" for line in self.blind]
+
+    def raise_failures(self) -> None:
+        """Name the images that could not be used."""
+        refuse_unusable(self.project.unusable, len(self.images) + len(self.blind))
+
     def json_fields(self) -> dict[str, object]:
-        """What a dry run tells."""
+        """Return what a dry run prints."""
         return {
             **pick(
                 self,
@@ -798,7 +767,9 @@ def plan_surface(
         settings = _on_frame(settings, settings.bounds or own)
         assert settings.bounds is not None
         looked, blind = over_frame(project, names, frame, settings.bounds, float(settings.start), events)
-    check_bands(project, settings.bands, [one.name for one in looked])
+    for one in looked if settings.bands else ():
+        if max(settings.bands) > (own_bands := open_scene(project, one.name).reader.bands):
+            raise UsageError(f"bands {', '.join(map(str, settings.bands))}: image {one.name!r} has {own_bands}")
     bounds, seen_share = _bounds(settings, None if frame is not None else project.crs, looked, blind)
     gsd = float(np.median([one.gsd for one in looked]))
     if settings.resolution < _FINEST * gsd * 0.999:
@@ -814,7 +785,7 @@ def plan_surface(
     scheme, height_error = scheme_of(settings, looked, grid, frame, gsd, pixels)
     gap = StartGap()
     if frame is None:
-        gap = start_gap(settings.start, scheme.reach, grid.bounds, project.crs, looked, ground_of(project))
+        gap = start_gap(settings, scheme.reach, grid.bounds, project.crs, looked, ground_of(project))
     used, file = tuple(one.name for one in looked), settings.start_file
     return SurfacePlan(
         project=project,
@@ -842,7 +813,7 @@ def _on_frame(settings: SurfaceSettings, bounds: Bounds | None) -> SurfaceSettin
     if bounds is None:
         raise UsageError(f"target {settings.target}: it has no end; give `bounds`, u and v on it in metres")
     MapGrid.covering(bounds, settings.resolution, None)
-    return replace(settings, bounds=bounds, start="0" if settings.start == "terrain" else settings.start)
+    return settings.replace(bounds=bounds, start="0" if settings.start == "terrain" else settings.start)
 
 
 def _key(project: Project, images: tuple[str, ...], settings: SurfaceSettings, **stated: object) -> str:
@@ -851,7 +822,7 @@ def _key(project: Project, images: tuple[str, ...], settings: SurfaceSettings, *
     files = [Path(path) for path, _ in address.digests]
     if settings.start_file is not None:
         files.append(settings.start_file)
-    stated |= {"settings": replace(settings, points=()), "facts": address.facts}
+    stated |= {"settings": settings.replace(points=()), "facts": address.facts}
     return run_key("surface", stated, files)
 
 

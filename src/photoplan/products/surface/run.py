@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,17 +12,21 @@ import numpy as np
 
 from photoplan import __version__
 from photoplan.engine.run import Tally, Work
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import InputError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted
 from photoplan.io.disk import make_folder
 from photoplan.io.point_cloud import write_cloud
 from photoplan.io.product import ProductFile, check_output
+from photoplan.io.project.file import load_project
 from photoplan.io.raster_info import ImageForm
 from photoplan.io.store import input_entry, scratch, together, write_run_record
 from photoplan.io.surface_file import TARGET
 from photoplan.plain import pick
 from photoplan.products.run import Run, refuse_inputs
-from photoplan.products.surface.plan import HARDLY, TILE, SurfaceJob, SurfacePlan, median
-from photoplan.project.scene import at_heights, input_files
+from photoplan.products.surface.plan import HARDLY, TILE, SurfaceJob, SurfacePlan, median, plan_surface
+from photoplan.project.scene import Attempts, at_heights, input_files
+from photoplan.requests.surface import SurfaceRequest, SurfaceSettings
 
 #: An image whose sigma0 is so many times the median of the others is told of; or all, if sigma0 is this part of the
 #: contrast of the surface. Parts of the heights that fit badly, last corrections, and standard deviations, pixels of
@@ -186,9 +190,10 @@ _FINE = ("grey", "grey_sigma", "residuals")
 
 
 @dataclass(frozen=True)
-class SurfaceResult:
-    """What became of a surface."""
+class SurfaceResult(Result):
+    """Files and figures of a surface."""
 
+    plan: SurfacePlan
     path: Path
     """The heights."""
     others: tuple[Path, ...]
@@ -215,8 +220,29 @@ class SurfaceResult:
     resumed: int
     """Tiles taken over from an earlier run."""
 
+    def written(self) -> Sequence[Path]:
+        """Return the heights first, then all other files."""
+        return (self.path, *self.others)
+
+    def messages(self) -> Sequence[str]:
+        """Return how exact the heights are, what speaks against them, and which images are left out."""
+        posts = self.plan.grid.width * self.plan.grid.height
+        median = "unknown" if self.sigma is None else f"{self.sigma:.3g} m ({self.sigma_px:.2g} px of parallax)"
+        known = [f"{name} {value:.3g}" for name, value in self.sigma0.items() if value is not None]
+        return [
+            f"surface in {self.seconds:.1f} s · {self.valid_share:.1%} of {posts} posts "
+            f"have a height, median standard deviation {median}; {self.misfit_share:.2%} fit badly",
+            f"  last corrections, coarse to fine: {', '.join(f'{c:.3f}' for c in self.corrections[::-1])} px",
+            f"  sigma0 of grey values: {', '.join(known)}",
+            *noted(self.notes),
+        ]
+
+    def raise_failures(self) -> None:
+        """Name the images that could not be used."""
+        self.plan.raise_failures()
+
     def json_fields(self) -> dict[str, Any]:
-        """All figures, with units."""
+        """Return all figures, with units."""
         more = {"sigma_m": "sigma", "corrections_px": "corrections", "resumed_tiles": "resumed"}
         own = (
             "path",
@@ -237,6 +263,31 @@ def outputs(folder: Path, plan: SurfacePlan) -> dict[str, Path]:
     """Files of a surface."""
     kinds = {kind: ending for kind, (ending, _, _) in KINDS.items() if kind != "residuals" or plan.settings.residuals}
     return {kind: folder / f"{plan.settings.name}{ending}.tif" for kind, ending in kinds.items()}
+
+
+def surface_project(request: SurfaceRequest, events: Events = SILENT) -> SurfacePlan | SurfaceResult:
+    """Plan and make the surface of a project; images whose files cannot be used are left out.
+
+    Raises
+    ------
+    UsageError
+        A file exists, an option cannot be, or `memory` does not suffice.
+    InputError
+        An input cannot be used, or the images contradict the surface and it is not forced.
+    GeometryError
+        Fewer than two images see a common piece of ground, or an orientation cannot be right.
+    TilesFailed
+        Tiles failed again and again; nothing is written.
+    """
+    settings, images = request.part(SurfaceSettings), request.images or None
+    for attempt in Attempts(load_project(request.project), images):
+        with attempt as usable:
+            plan = plan_surface(usable, settings, images, force=request.force, events=events)
+            if not request.dry_run:
+                for line in (*plan.messages(), str(plan)):
+                    events.talk(line)
+                result = make_surface(plan, request.folder, Run.of(request, events))
+    return plan if request.dry_run else result
 
 
 def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) -> SurfaceResult:
@@ -280,8 +331,6 @@ def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) 
     written = [*paths.values(), *plan.settings.points]
     inputs = [Path(path) for path, _ in plan.inputs]
     refuse_inputs([*input_files(plan.project), *inputs], written)
-    if len({path.resolve() for path in written}) < len(written):
-        raise UsageError(f"points {', '.join(map(str, plan.settings.points))}: one file twice; give each its own name")
     for path in written:
         check_output(path, [], overwrite=run.overwrite)
     for place in (folder, *(path.parent for path in plan.settings.points)):
@@ -384,6 +433,7 @@ def _result(
     seen, total, squares = totals["greys"]
     contrast = float(np.sqrt(max(squares / seen - (total / seen) ** 2, 0.0))) if seen else 0.0
     return SurfaceResult(
+        plan=plan,
         path=files["heights"].path,
         others=(*(file.path for kind, file in files.items() if kind != "heights"), *plan.settings.points),
         images=plan.images,
