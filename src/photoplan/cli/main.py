@@ -95,7 +95,17 @@ VERBS: dict[str, str | Verb] = {
     ),
     "check": "Validate a project and print what to expect of it.",
     "budget": "What limits the accuracy of products, cause by cause.",
-    "balance": "Even colours: tables by which images agree where they overlap.",
+    "balance": Verb(
+        "Even colours: tables by which images agree where they overlap.",
+        """Find tables by which the images of PROJECT agree in colour where they overlap.
+
+        Each image gets a file with a table for every band, and an entry `balance` in PROJECT: `ortho` and `mosaic`
+        apply it from then on.
+        """,
+        "requests.ortho:BalanceRequest",
+        "products.balance:balance_project",
+        {"picture": "report.balance:draw_balance"},
+    ),
     "seams": Verb(
         "Find where images of a mosaic are best joined.",
         """Find seams between the images of PROJECT where they are least seen.

@@ -19,6 +19,7 @@ from photoplan.engine.executors import executor_factory
 from photoplan.engine.run import steps, tiles_in_flight
 from photoplan.errors import GeometryError, InputError, PhotoplanError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted
 from photoplan.geometry.crs import crs_step, same_crs
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import lock_of, make_folder, make_parents
@@ -41,9 +42,18 @@ from photoplan.products.orthophoto.shown import shown
 from photoplan.products.plausibility import one_colour_told
 from photoplan.products.run import BASE_MEMORY, question, refuse_inputs
 from photoplan.project.cameras import is_there
-from photoplan.project.scene import Attempts, Scene, SceneAddress, input_files, map_order, open_scene
+from photoplan.project.scene import (
+    Attempts,
+    Scene,
+    SceneAddress,
+    input_files,
+    map_order,
+    open_scene,
+    refuse_unusable,
+)
 from photoplan.radiometry.balance import Balanced, Pairs, balanced, even_images, pairs_of
 from photoplan.radiometry.equations import BLOCK, SIDE, Cells, cells_of
+from photoplan.requests.ortho import BalanceRequest
 from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
@@ -303,51 +313,17 @@ class _Sampling:
         return replace(cells, uv=uv).some(np.flatnonzero(np.isfinite(uv).all(axis=(1, 2))))
 
 
+#: Pairs that are listed; all are in the table.
+_LISTED = 12
 #: What the order of curve and fall-off may change over the block without a note, part of the brightness.
 _DOUBTFUL = 0.02
 
 
-@dataclass(frozen=True)
-class BalanceRequest:
-    """What is asked."""
-
-    project: Path
-    images: tuple[str, ...] = ()
-    """Names or patterns; none: all."""
-    reference_image: str | None = None
-    """The image that stays as it is; None: the block keeps its mean and its contrast."""
-    reference: Path | None = None
-    """A raster on the map whose colours the images get."""
-    degree: int = 2
-    """Of the trend over an image; 0: tables alone."""
-    factor: bool = False
-    """One factor for each image and band, from ratios of means (Behr 1989, section 6.3.3), instead of tables."""
-    resolution: float | None = None
-    """Side of the pixels that are compared, metres."""
-    output: Path | None = None
-    workers: int = 1
-    executor: str = "threads"
-    """Who looks at the images: ``threads``, ``processes`` or a Dask scheduler's address."""
-    memory: int | None = None
-    """Bytes the run should stay under; None: no bound but the tiles under way."""
-    overwrite: bool = False
-    dry_run: bool = False
-
-    @property
-    def folder(self) -> Path:
-        """Where tables are written."""
-        return self.output or self.project.resolve().parent / "balance"
-
-    @property
-    def table(self) -> Path:
-        """The table of overlaps."""
-        return self.folder / "overlaps.csv"
-
-
 @dataclass(frozen=True, eq=False)
-class BalanceReport:
-    """What was found."""
+class BalanceReport(Result):
+    """Tables of the images, and how well these agree."""
 
+    request: BalanceRequest
     survey: Survey
     notes: tuple[str, ...]
     """Images without tables, and other things that a user should know."""
@@ -369,8 +345,49 @@ class BalanceReport:
         assert self.pairs is not None
         return self.pairs.before.mean(axis=0), self.pairs.after.mean(axis=0)
 
+    def written(self) -> Sequence[Path]:
+        """Return the table of overlaps; the balance files are entries of the project."""
+        return () if self.pairs is None else (self.request.table,)
+
+    def summary(self) -> Sequence[str]:
+        """Return the differences of the overlaps before and after, the worst first, and what is not determined."""
+        grid, pairs, made = self.survey.grid, self.pairs, self.balanced
+        if pairs is None or made is None:
+            pixels = f"{grid.width} × {grid.height} pixels of {grid.resolution:g} m"
+            return [f"{len(self.survey.names)} images, compared on {pixels}"]
+
+        def row(name: str, *values: NDArray[np.float64]) -> str:
+            return f"{name:32}" + "".join(f"  {' '.join(f'{value:6.1f}' for value in each):>24}" for each in values)
+
+        count = f"{len(made.images)} images, {len(pairs.images)} overlaps at {grid.resolution:g} m"
+        lines = [f"{count}: rms differences, grey values", f"{'':32}  {'before':>24}  {'after':>24}"]
+        lines.append(row("mean of the overlaps", *self.rms()))
+        for k in (-pairs.after.mean(axis=1)).argsort()[:_LISTED].tolist():
+            both = " – ".join(self.named(i)[-15:] for i in pairs.images[k])
+            lines.append(row(both, pairs.before[k], pairs.after[k]))
+        if len(pairs.images) > _LISTED:
+            lines.append(f"and {len(pairs.images) - _LISTED} more, better ones")
+        if made.modes:
+            parts = ", ".join(f"{mode.name} {100 * mode.sigma:.1f} %" for mode in made.modes)
+            lines.append(f"standard deviations over the block, from its middle to its edge: {parts}")
+        if held := [mode.name for mode in made.modes if mode.held]:
+            what = "held at what the exposures of the images suggest"
+            lines.append(f"overlaps do not determine {', '.join(held)}: {what}")
+        if made.shoulder:
+            lines.append("bright and dark ends of the tables are bent to stay inside the range")
+        files = f"{len(self.files)} balance files are entered in the project"
+        return [*lines, f"{files}; `ortho` and `mosaic` apply them"]
+
+    def messages(self) -> Sequence[str]:
+        """Return the notes."""
+        return noted(self.notes)
+
+    def raise_failures(self) -> None:
+        """Name the images that could not be used."""
+        refuse_unusable(self.unusable, len(self.survey.names) + len(self.survey.blind))
+
     def json_fields(self) -> dict[str, Any]:
-        """Figures by name."""
+        """Return figures by name."""
         fields: dict[str, Any] = {
             "images": self.survey.names,
             "resolution": self.survey.grid.resolution,
@@ -445,10 +462,10 @@ def _balance(
     notes = [f"left out: {line}" for line in found.blind]
     workers = tiles_in_flight(request.workers, request.memory, BASE_MEMORY + found.kept_bytes, found.tile_bytes)
     if request.dry_run:
-        return BalanceReport(found, tuple(notes))
+        return BalanceReport(request, found, tuple(notes))
     make_folder(request.folder)
     with together(), locked(lock_of(request.table)):
-        report = _made(replace(request, workers=workers), project, found, fixed, notes, events)
+        report = _made(request.replace(workers=workers), project, found, fixed, notes, events)
         _keep(request, project, report, times())
     return report
 
@@ -463,7 +480,9 @@ def _made(
         raise GeometryError(f"{reference.path}: shows nothing of the ground that the images show")
     made, pairs = _adjusted(request, cells, found, fixed, events, notes)
     files = tuple(request.folder / f"{project.stems[found.names[k]]}.toml" for k in made.images.tolist())
-    return BalanceReport(survey=found, notes=tuple(notes), cells=cells, balanced=made, pairs=pairs, files=files)
+    return BalanceReport(
+        request, survey=found, notes=tuple(notes), cells=cells, balanced=made, pairs=pairs, files=files
+    )
 
 
 def _keep(request: BalanceRequest, project: Project, report: BalanceReport, times: dict[str, Any]) -> None:
@@ -542,12 +561,6 @@ def _check(request: BalanceRequest, project: Project, names: Sequence[str]) -> s
     executor_factory(request.executor, request.workers)
     if len(names) < 2:
         raise UsageError(f"{len(names)} image; two at least are compared")
-    if request.reference is not None and request.factor:
-        raise UsageError("factors from ratios know no reference; give a reference image, or leave `factor` out")
-    if request.reference is not None and request.reference_image is not None:
-        raise UsageError("a reference image and a reference; give one of them")
-    if not 0 <= request.degree <= 4:
-        raise UsageError(f"degree {request.degree}; allowed are 0 (tables alone) to 4, usual is 2")
     if request.folder.exists() and not request.folder.is_dir():
         raise UsageError(f"{request.folder}: is a file; give the name of a folder")
     if not request.dry_run:

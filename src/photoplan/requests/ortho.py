@@ -1,4 +1,4 @@
-"""Requests of commands that make orthophotos and mosaics: seams, light and haze."""
+"""Requests of commands that make orthophotos and mosaics: seams, balance, light and haze."""
 
 from __future__ import annotations
 
@@ -43,6 +43,52 @@ class SeamsRequest(Request):
     def product(self) -> Path:
         """The file of regions."""
         return self.output or self.project.resolve().parent / "products" / "seams.gpkg"
+
+
+class BalanceRequest(Request):
+    """Options of even colours between the images of a project."""
+
+    project: Path = PROJECT
+    images: tuple[str, ...] = IMAGES
+    reference_image: str | None = opt("Image that stays as it is [mean and contrast of all stay].", None,
+                                      metavar="NAME")  # fmt: skip
+    reference: Path | None = opt("Raster on the map whose colours the images get.", None, metavar="FILE",
+                                 section="input")  # fmt: skip
+    degree: int = opt("Degree of the trend over an image; 0: tables alone.", 2)
+    factor: bool = opt("Find one factor for each image and band from means, instead of tables.", False)
+    resolution: float | None = opt("Pixels that are compared, metres [by the images' size].", None, metavar="R")
+    output: Path | None = opt("Folder of the tables [balance by the project].", None, metavar="FOLDER", folder=True,
+                              section="result")  # fmt: skip
+    picture: bool = PICTURE
+    dry_run: bool = DRY_RUN
+    workers: int = ONE_WORKER
+    executor: str = EXECUTOR
+    memory: int | None = MEMORY
+    overwrite: bool = OVERWRITE
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the tables."""
+        return self.output or self.project.resolve().parent / "balance"
+
+    @property
+    def product(self) -> Path:
+        """File whose name the picture has."""
+        return self.folder / "balance.csv"
+
+    @property
+    def table(self) -> Path:
+        """The table of overlaps."""
+        return self.folder / "overlaps.csv"
+
+    def check(self) -> None:
+        """Refuse what does not go together."""
+        if self.reference is not None and self.factor:
+            raise UsageError("factors from ratios know no reference; set `reference_image`, or leave `factor` out")
+        if self.reference is not None and self.reference_image is not None:
+            raise UsageError("a reference image and a reference; give one of them")
+        if not 0 <= self.degree <= 4:
+            raise UsageError(f"degree {self.degree}; allowed are 0 (tables alone) to 4, usual is 2")
 
 
 class IlluminationRequest(Request):
