@@ -19,10 +19,9 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.products.mtf.edges import LUMINANCE, LightImage, measure_edges
 from photoplan.products.mtf.result import MeasuredEdge
-from photoplan.products.restore import DesignRequest, RestoreRequest, design_restoration, restore_images
+from photoplan.products.restore import RestoreRequest, design_restoration, restore_images
 from photoplan.project.steps import linearisation_of
 from photoplan.quality.edges.response import EdgeMeasurement, measure_edge
-from photoplan.quality.restoration.design import DesignOptions
 from photoplan.requests.quality import MtfRequest
 
 LIGHT = "srgb"
@@ -95,7 +94,7 @@ def measured_again(path: Path, edge: MeasuredEdge) -> EdgeMeasurement | None:
 def restore_chart(chart: Path, folder: Path, method: Literal["exact", "regularised"]) -> Outcome:
     """Measure a filter in the left half, restore the right half, measure its edges before and after."""
     left, right = halves(chart, folder)
-    found = design_restoration(DesignRequest((left,), LIGHT, options=DesignOptions(method)))
+    found = design_restoration(RestoreRequest((left,), linearisation=LIGHT, method=method))
     report = restore_images(
         RestoreRequest((right,), found.filter, folder / method, linearisation=LIGHT, overwrite=True)
     )

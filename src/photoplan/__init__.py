@@ -57,7 +57,7 @@ __getattr__, __dir__, __all__ = public(
         "requests.ortho": "BalanceRequest",
         "products.seams": "SeamsRequest make_seams",
         "products.illumination": "IlluminationRequest correct_illumination",
-        "products.restore": "RestoreRequest plan_restoration restore_images DesignRequest design_restoration",
+        "products.restore": "RestoreRequest plan_restoration restore_images design_restoration",
         "products.chromatic": "ChromaticRequest measure_chromatic",
         "products.mtf.patterns": "MtfRequest measure_mtf",
         "products.sensor": "SensorRequest describe_sensor",

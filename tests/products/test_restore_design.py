@@ -7,8 +7,7 @@ from scipy.ndimage import convolve
 from tools.blurred_scenes import any_edges, discrete_spread, taken
 
 from photoplan.errors import InputError, UsageError
-from photoplan.products.restore import DesignRequest, design_restoration
-from photoplan.quality.restoration.design import DesignOptions
+from photoplan.products.restore import RestoreRequest, design_restoration
 
 pytestmark = pytest.mark.usefixtures("searched_once")
 
@@ -64,7 +63,7 @@ def test_a_filter_is_measured_and_restores_other_images(scenes, whole):
 @pytest.fixture(scope="module")
 def whole(scenes):
     """What the first image alone shows."""
-    return design_restoration(DesignRequest(scenes[1][:1], most_edges=MOST, options=DesignOptions("regularised")))
+    return design_restoration(RestoreRequest(scenes[1][:1], most_edges=MOST, method="regularised"))
 
 
 @pytest.mark.parametrize("level", [65535.0 + 110.0, pytest.param(-90.0, marks=pytest.mark.slow)])
@@ -73,13 +72,13 @@ def test_full_skies_and_black_shadows_do_not_hide_the_noise(scenes, tmp_path, le
     made, _ = scenes
     flat = level + np.random.default_rng(3).normal(0.0, 50.0, (144, SIZE))
     path = write(tmp_path / "sky.tif", np.concatenate([100.0 * made[0][0], flat])[None])
-    (part,) = design_restoration(DesignRequest((path,), most_edges=FEW, options=DesignOptions("regularised"))).parts
+    (part,) = design_restoration(RestoreRequest((path,), most_edges=FEW, method="regularised")).parts
     assert part.scene.noise * 65535 == pytest.approx(50.0, rel=0.05)
 
 
 def test_the_exact_inverse_for_whoever_asks_for_it(scenes):
     _, files = scenes
-    found = design_restoration(DesignRequest(files[:1], most_edges=FEW, options=DesignOptions("exact")))
+    found = design_restoration(RestoreRequest(files[:1], most_edges=FEW, method="exact"))
     (part,) = found.parts
     assert part.design.method == "exact"
     assert found.filter.facts["rule"].startswith("exact: as asked for")
@@ -93,7 +92,7 @@ def test_the_exact_inverse_for_whoever_asks_for_it(scenes):
 @pytest.mark.slow
 def test_what_a_part_of_the_field_does_not_show_is_taken_from_the_whole(scenes, whole):
     _, files = scenes
-    asked = DesignRequest(files[:1], cells=3, most_edges=MOST, options=DesignOptions("regularised"))
+    asked = RestoreRequest(files[:1], cells=3, most_edges=MOST, method="regularised")
     found = design_restoration(asked)
     (whole,) = whole.parts
     assert len(found.filter.kernels) == 9
@@ -109,7 +108,7 @@ def test_what_a_part_of_the_field_does_not_show_is_taken_from_the_whole(scenes, 
 @pytest.mark.slow
 def test_parts_without_edges_get_the_filter_of_the_whole_field(scenes):
     _, files = scenes
-    found = design_restoration(DesignRequest(files[:1], cells=6, most_edges=FEW, options=DesignOptions("regularised")))
+    found = design_restoration(RestoreRequest(files[:1], cells=6, most_edges=FEW, method="regularised"))
     assert sum(part.edges == 0 for part in found.parts) > 10
     assert any("get the filter of the whole field" in note for note in found.notes)
 
@@ -119,7 +118,7 @@ def test_bands_of_different_sharpness_get_filters_of_their_own(tmp_path):
     scene = any_edges(rng, 256)
     bands = [taken(scene, sigma, rng)[0] for sigma in (0.35, 0.65)]
     file = write(tmp_path / "colour.tif", 100.0 * np.array(bands))
-    found = design_restoration(DesignRequest((file,), per_band=True, most_edges=5))
+    found = design_restoration(RestoreRequest((file,), per_band=True, most_edges=5))
     assert [kernel.band for kernel in found.filter.kernels] == [1, 2]
     gains = [kernel.noise_gain for kernel in found.filter.kernels]
     print("noise gains", np.round(gains, 2))
@@ -130,20 +129,20 @@ def test_images_of_different_size_are_refused(scenes, tmp_path):
     made, _ = scenes
     files = [write(tmp_path / f"{rows}.tif", 100.0 * made[0][0][None, :rows, :144]) for rows in (144, 140)]
     with pytest.raises(UsageError, match="different size"):
-        design_restoration(DesignRequest(tuple(files), most_edges=2))
+        design_restoration(RestoreRequest(tuple(files), most_edges=2))
 
 
 def test_images_without_edges_give_no_filter(tmp_path):
     rng = np.random.default_rng(23)
     file = write(tmp_path / "flat.tif", rng.normal(1000.0, 20.0, (1, 300, 300)))
     with pytest.raises(InputError, match="no image can be measured"):
-        design_restoration(DesignRequest((file,)))
+        design_restoration(RestoreRequest((file,)))
 
 
 @pytest.mark.slow
 def test_of_several_parts_the_noisiest_tells_of_the_condition(scenes):
     _, files = scenes
-    found = design_restoration(DesignRequest(files[:1], cells=3, most_edges=60))
+    found = design_restoration(RestoreRequest(files[:1], cells=3, most_edges=60))
     worst = max(found.parts, key=lambda part: part.design.noise_gain)
     assert found.filter.facts["rule"].startswith("of 9 parts 9 regularised; the noisiest, at col")
     assert str(worst.design.condition_x) in found.filter.facts["condition"]

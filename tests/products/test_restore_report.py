@@ -16,7 +16,7 @@ from tools.command import Here
 
 from photoplan.errors import UsageError
 from photoplan.io.raster import RasterReader
-from photoplan.products.restore import DesignedPart, DesignRequest, FilterRequest, FoundFilter, requested_filter
+from photoplan.products.restore import DesignedPart, FoundFilter, RestoreRequest, requested_filter
 from photoplan.quality.restoration.design import DesignOptions, design_filter
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.scene import SceneStatistics
@@ -61,8 +61,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def found(scene: Path) -> FoundFilter:
     """A filter in two by two parts, measured."""
-    asked = DesignRequest((scene,), cells=2, most_edges=30, options=DesignOptions("regularised"))
-    return requested_filter(FilterRequest(design=asked))
+    return requested_filter(RestoreRequest((scene,), cells=2, most_edges=30, method="regularised"))
 
 
 def test_the_expected_curve_is_mtf_times_response(found: FoundFilter) -> None:
@@ -133,10 +132,10 @@ def test_parts_without_edges_are_named_once_and_stay_empty_in_the_map(found: Fou
 
 def test_filters_of_files_and_apertures_say_where_they_come_from(tmp_path: Path) -> None:
     (tmp_path / "one.txt").write_text("1\n")
-    made = requested_filter(FilterRequest(tmp_path / "one.txt"), lambda total: None)
+    made = requested_filter(RestoreRequest(tmp_path, tmp_path / "one.txt"))
     assert origin(made) == f"The filter comes from the file {tmp_path / 'one.txt'}."
     assert made.measured is None and field_maps(made.filter, None) == []
-    made = requested_filter(FilterRequest(aperture="round:1.2"), lambda total: None)
+    made = requested_filter(RestoreRequest(tmp_path, aperture="round:1.2"))
     assert "aperture of a scanner, round:1.2" in origin(made)
     first = plain_facts(made.filter)[0]
     assert first[0] == "rule" and "Ecker 1991" in first[1]

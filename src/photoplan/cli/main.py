@@ -183,7 +183,20 @@ VERBS: dict[str, str | Verb] = {
         record="mtf",
         figures_first=True,
     ),
-    "restore": "Restore images with a filter, given or measured.",
+    "restore": Verb(
+        "Restore images with a filter, given or measured.",
+        """Restore images of any size: NAME_restored.tif (a cloud-optimised GeoTIFF) and its run record.
+
+        Without --filter the sharpness of the images is measured at edges that they show, all together as images of one
+        camera, and the filter follows from it; it is kept as a file. Noise grows by the figure that is printed first.
+        If an image fails, the others are still restored (exit code 4). The same command continues a run that was
+        interrupted.
+        """,
+        "requests.quality:RestoreRequest",
+        "products.restore:restore",
+        {"report": "report.restore:restore_page"},
+        one_by_one=True,
+    ),
     "characterise": "Know a camera from image series.",
     "sensor": Verb(
         "Resolution, bandwidth and noise of a sensor.",

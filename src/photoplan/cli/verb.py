@@ -41,6 +41,8 @@ class Verb:
     function that reports whether pictures can be drawn if they are wanted; it returns what there is to say."""
     record: str = ""
     """Kind of the run record, for operations that write none themselves."""
+    one_by_one: bool = False
+    """Products get their names as they are finished, not all at the end together with what is drawn."""
     figures_first: bool = False
     """Figures are printed before the files, and these in the order of the options."""
     files: str = ""
@@ -111,12 +113,14 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
         shown.add(line)
 
     def announced(part: object) -> None:
-        """Print the files of a part of the result that is complete; those of a record get their names at the end."""
+        """Print files and messages of a part of the result that is complete; a group gets its names at the end."""
         files = part.written() if isinstance(part, Result) else ()
-        for path in () if opened else files:
+        for path in () if grouped else files:
             if not as_json and path not in shown:
                 show(path)
             shown.add(path)
+        for line in part.messages() if isinstance(part, Result) else ():
+            events.talk(line)
         draws = load(verb.each) if verb.each and files else lambda *_: ()
         for line in draws(part, request, lambda wanted: can_draw(wanted, once)):
             once(line)
@@ -134,7 +138,8 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     drawing = not dry_run or how_of(type(request).model_fields["dry_run"]).get("draws")
     opened = {path: _opened(path, key, request) for path, key in drawn.items()} if drawing else {}
     recorded = recording(verb.record, request, request.files_read()) if verb.record and not dry_run else nullcontext()
-    with recorded as record, together() if opened else nullcontext():
+    grouped = bool(opened) and not verb.one_by_one
+    with recorded as record, together() if grouped else nullcontext():
         with Telling(quiet, announced) as events:
             result = load(verb.make)(request, events)
         made: list[Path] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -16,6 +16,7 @@ from photoplan.engine.executors import threads
 from photoplan.engine.run import Kept, Made, Runner, Tally, Work, tiles_in_flight
 from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result, raise_failed
 from photoplan.geometry.grid import Window
 from photoplan.io.disk import make_folder, make_parents
 from photoplan.io.files import fingerprint, unique_stems
@@ -38,7 +39,7 @@ from photoplan.io.store import (
 )
 from photoplan.plain import pick
 from photoplan.plan.footprint import Tile, Tiles
-from photoplan.products.chromatic import load_chromatic, measured_once, model_figures, save_chromatic
+from photoplan.products.chromatic import load_chromatic, measured_once, model_figures, model_lines, save_chromatic
 from photoplan.products.mtf.edges import LightImage, measure_edges
 from photoplan.products.mtf.result import ImageMtf, MtfReport
 from photoplan.project.align import AlignStep
@@ -48,6 +49,7 @@ from photoplan.project.steps import (
     FallOffStep,
     SteppedReader,
     entries_of,
+    fall_off_line,
     kept_nodata,
     linearisation_of,
     load_fall_off,
@@ -75,40 +77,13 @@ from photoplan.quality.restoration.design import (
 )
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.scene import SceneStatistics, block_spectra, scenes_of
-from photoplan.requests.quality import MtfRequest
+from photoplan.requests.quality import MtfRequest, RestoreRequest, table_of
 
 #: Windows of an image in which its contrast is looked for, in each direction, and their side.
 _WINDOWS = 5
 _SIDE = 256
 #: Share of the blocks of an image that must hold no saturated pixel, for the noise to be looked for in these alone.
 _CLEAN = 0.1
-
-
-@dataclass(frozen=True)
-class DesignRequest:
-    """What is asked."""
-
-    images: tuple[Path, ...]
-    linearisation: str | None = None
-    """``linear``, ``srgb`` or a file with a table: the light that the filter holds for; None: linear, with a warning
-    for images of 8 bits."""
-    per_band: bool = False
-    """A filter for each band instead of one for all, from the luminance."""
-    cells: int = 1
-    """Parts of the field in each direction that get filters of their own, where they have edges enough."""
-    most_edges: int = 200
-    """Edges of an image that are measured."""
-    least_length: float | None = None
-    """Of an edge, pixels; None: 20."""
-    noise: float | None = None
-    """Standard deviation of the white noise in the images' light; None: found in them."""
-    options: DesignOptions = field(default_factory=DesignOptions)
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.cells <= 15:
-            raise UsageError(f"a field of {self.cells} × {self.cells} parts; allowed are 1 to 15")
-        if self.noise is not None and not 0.0 <= self.noise < float("inf"):
-            raise UsageError(f"`noise` {self.noise:g}; it is a standard deviation in light, 0 or more")
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +144,7 @@ class MeasuredFilter:
     """What a user should know: edge enhancement, parts of the field without edges."""
 
 
-def design_restoration(request: DesignRequest, events: Events = SILENT) -> MeasuredFilter:
+def design_restoration(request: RestoreRequest, events: Events = SILENT) -> MeasuredFilter:
     """Measure the sharpness of images at their edges, all together, and design the filter that restores them.
 
     Raises
@@ -222,7 +197,7 @@ def _channels(images: Sequence[ImageMtf], per_band: bool) -> list[int]:
 
 
 def _parts(
-    request: DesignRequest,
+    request: RestoreRequest,
     band: int | None,
     size: tuple[int, int],
     edges: Sequence[EdgeMeasurement],
@@ -259,8 +234,12 @@ def _cell(edge: EdgeMeasurement, size: tuple[int, int], n: int) -> tuple[int, in
     return int((edge.col + 0.5) * n / size[0]), int((edge.row + 0.5) * n / size[1])
 
 
+def _options(request: RestoreRequest) -> DesignOptions:
+    return DesignOptions(request.method, request.rotation, None if request.size is None else request.size // 2)
+
+
 def _designed(
-    request: DesignRequest,
+    request: RestoreRequest,
     band: int | None,
     at: tuple[float, float] | None,
     edges: Sequence[EdgeMeasurement],
@@ -279,7 +258,7 @@ def _designed(
         y = whole.sharpness[1] if "y" in missing or y.doubt else y
     transfer = curve_transfer(x.modulation(), y.modulation())
     scenes = whole.scenes if whole is not None else scenes_of(spectrum.power, transfer, spectrum.noise, request.noise)
-    design = design_filter(x, y, scenes, request.options, spectrum.kept)
+    design = design_filter(x, y, scenes, _options(request), spectrum.kept)
     return DesignedPart(
         band=band, at=at, edges=len(edges), sharpness=(x, y), missing=missing, scenes=scenes, design=design
     )
@@ -356,7 +335,7 @@ def _where(part: DesignedPart, parts: Sequence[DesignedPart]) -> str:
     return f"of {len(parts)} parts {counted}; the noisiest, {which}: "
 
 
-def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[int, int]) -> RestorationFilter:
+def _filter(request: RestoreRequest, parts: Sequence[DesignedPart], size: tuple[int, int]) -> RestorationFilter:
     kernels = tuple(FilterKernel(part.design.kernel, part.at, part.band) for part in parts)
     # Of several parts the one that restoration costs most tells of the condition.
     worst = max(parts, key=lambda part: part.design.noise_gain)
@@ -368,7 +347,7 @@ def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[i
         + f"along rows: {worst.design.condition_x}; along columns: {worst.design.condition_y}",
         "rule": _where(worst, parts) + worst.design.reason,
         "expected": _where(worst, parts) + f"error {worst.design.expectation} (rms in light{scale})",
-        "rotation": f"{request.options.rotation}: weights off the axes follow from those on them",
+        "rotation": f"{request.rotation}: weights off the axes follow from those on them",
         "linearisation": request.linearisation or "linear",
         "noise_gain": round(max(part.design.noise_gain for part in parts), 3),
         "parts": [{k: v for k, v in part.facts().items() if v is not None} for part in parts],
@@ -383,22 +362,6 @@ FILTER_NAME = "restoration_filter.toml"
 NO_FILTER = "none"
 
 
-@dataclass(frozen=True)
-class FilterRequest:
-    """Where a filter comes from: one of these."""
-
-    file: Path | None = None
-    aperture: str | None = None
-    """``square`` or ``round``, with ``:RATIO`` of aperture by step where that is not 1."""
-    design: DesignRequest | None = None
-    none: bool = False
-    """No filter: the image is corrected otherwise alone."""
-
-    def __post_init__(self) -> None:
-        if sum(source is not None for source in (self.file, self.aperture, self.design)) + self.none != 1:
-            raise UsageError("give a filter file, the aperture of a scanner, or images to measure; one of them")
-
-
 @dataclass(frozen=True, eq=False)
 class FoundFilter:
     """A filter and where it comes from."""
@@ -410,23 +373,24 @@ class FoundFilter:
     """What was measured, where it was."""
 
 
-def requested_filter(request: FilterRequest, events: Events = SILENT) -> FoundFilter:
-    """The filter that is asked for."""
-    if request.none:
+def requested_filter(request: RestoreRequest, events: Events = SILENT) -> FoundFilter:
+    """Return the filter that is set; if none is, design it from what is measured in the images."""
+    if request.filter == "none":
         return FoundFilter(RestorationFilter((FilterKernel(np.ones((1, 1))),), description=NO_FILTER), "")
-    if request.file is not None:
-        return FoundFilter(load_filter(request.file), f"the file {request.file}")
+    if isinstance(request.filter, RestorationFilter):
+        return FoundFilter(request.filter, request.filter.description)
+    if isinstance(request.filter, Path):
+        return FoundFilter(load_filter(request.filter), f"the file {request.filter}")
     if request.aperture is not None:
         return FoundFilter(_for_aperture(request.aperture), f"the aperture of a scanner, {request.aperture}")
-    assert request.design is not None
-    found = design_restoration(request.design, events)
+    found = design_restoration(request, events)
     for line in _lines(found):
         events.talk(line)
     return FoundFilter(found.filter, "edges of the images", found)
 
 
 def keep_filter(path: Path, filter_: RestorationFilter, *, overwrite: bool = False) -> Path:
-    """Write a filter beside its results, unless the file holds the very same one already."""
+    """Write a filter, unless the file holds the very same one already."""
     try:
         if path.read_text(encoding="utf-8") == filter_text(entries_of(filter_)):
             return path
@@ -455,7 +419,7 @@ def _for_aperture(text: str) -> RestorationFilter:
 
 
 def _lines(found: MeasuredFilter) -> list[str]:
-    """What was measured, for people."""
+    """Return what was measured, and what to mind, for people."""
     lines = []
     for part in found.parts[:9]:
         name = "all bands" if part.band is None else f"band {part.band}"
@@ -468,65 +432,6 @@ def _lines(found: MeasuredFilter) -> list[str]:
     if len(found.parts) > 9:
         lines.append(f"… and {len(found.parts) - 9} more parts; the filter file has them all")
     return lines + list(found.notes)
-
-
-#: What `dtype` may be; grey values keep their scale in all of them.
-TYPES = ("same", "float32", "uint16")
-
-
-@dataclass(frozen=True)
-class RestoreRequest:
-    """What is asked."""
-
-    images: tuple[Path, ...]
-    filter: RestorationFilter | Path
-    """The filter, or its file."""
-    output: Path | None = None
-    """Folder of the results; None: `restored` beside the first image."""
-    bands: tuple[int, ...] = ()
-    """Bands that are restored, from 1; all if empty. The others stay as they are."""
-    linearisation: str = "linear"
-    """``linear``, ``srgb`` or a file with a table."""
-    dtype: str = "same"
-    """Type of the results: ``same``, ``float32`` or ``uint16``."""
-    chromatic: ChromaticModel | Path | Literal["measure"] | None = None
-    """Lateral chromatic aberration, which is corrected before the filter: a model, its file, or ``measure``: every
-    image's own discs or edges; None: the bands stay where they are."""
-    fall_off: Path | None = None
-    """A correction of light fall-off, which comes before all others."""
-    compress: str = "deflate"
-    workers: int = 1
-    memory: int | None = None
-    """Bytes the run should stay under; None: no bound but the tiles in flight."""
-    overwrite: bool = False
-    quicklook: bool = True
-
-    def __post_init__(self) -> None:
-        if not self.images:
-            raise UsageError("no image is given")
-        if self.dtype not in TYPES:
-            raise UsageError(f"dtype {self.dtype!r}; allowed are {', '.join(TYPES)}")
-        if self.compress not in COMPRESSIONS:
-            raise UsageError(f"compression {self.compress!r}; allowed are {', '.join(COMPRESSIONS)}")
-
-    @property
-    def folder(self) -> Path:
-        """Where the results are written."""
-        return self.images[0].parent / "restored" if self.output is None else self.output
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """What decides the results beside images and filter, as plain values."""
-        return {
-            "bands": list(self.bands),
-            "linearisation": self.linearisation,
-            "dtype": self.dtype,
-            "chromatic": "a model"
-            if isinstance(self.chromatic, ChromaticModel)
-            else self.chromatic and str(self.chromatic),
-            "fall_off": self.fall_off and str(self.fall_off),
-            "compress": self.compress,
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -564,7 +469,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class RestoredImage:
+class RestoredImage(Result):
     """What became of one image."""
 
     image: str
@@ -590,6 +495,26 @@ class RestoredImage:
         """Clipped pixels among the valid ones of all bands, 0 to 1."""
         valid = self.valid_share * self.pixels * len(self.below)
         return (sum(self.below) + sum(self.above)) / valid if valid else 0.0
+
+    def written(self) -> list[Path]:
+        """Return the restored image."""
+        return [self.path]
+
+    def messages(self) -> list[str]:
+        """Return what became of the image, with advice if pixels were clipped."""
+        lines = [f"{self.image}: {self.pixels / 1e6:.1f} Mpx in {self.seconds:.1f} s"]
+        below, above = sum(self.below), sum(self.above)
+        if below or above:
+            way_out = "`dtype` float32 keeps all values"
+            if self.dtype == "uint8" and above:
+                way_out += ", `dtype` uint16 those above 255"
+            lines.append(
+                f"warning: {self.image}: {below} values fell below and {above} above what the type holds "
+                f"({self.clipped_share:.2%}) and were clipped; {way_out}"
+            )
+        if self.picture is not None:
+            lines.append(f"quick look: {self.picture}")
+        return lines
 
     def json_fields(self) -> dict[str, Any]:
         """With the share of clipped pixels."""
@@ -737,7 +662,7 @@ def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: Product
     aligned, lit = job.reader.step(AlignStep), job.reader.step(FallOffStep)
     return {
         "product": result,
-        "settings": how.settings,
+        "settings": _settings(how),
         "linearisation": restorer.linearisation.describe(),
         "chromatic": None if aligned is None else model_figures(aligned.model),
         "fall_off": lit and lit.fall_off,
@@ -755,23 +680,45 @@ def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: Product
     }
 
 
+def _settings(request: RestoreRequest) -> dict[str, Any]:
+    """Return what decides the results beside images and filter, as plain values."""
+    chromatic = "a model" if isinstance(request.chromatic, ChromaticModel) else request.chromatic
+    return {
+        "bands": list(request.bands),
+        "linearisation": request.linearisation or "linear",
+        "dtype": request.dtype,
+        "chromatic": chromatic and str(chromatic),
+        "fall_off": request.fall_off and str(request.fall_off),
+        "compress": request.compress,
+    }
+
+
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 416 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
-class RestoreReport:
+class RestoreReport(Result):
     """What became of all images."""
 
     images: tuple[RestoredImage, ...]
     failed: dict[str, str]
     """Why an image could not be restored, by its name."""
-    filter: RestorationFilter
+    found: FoundFilter
     folder: Path
+    jobs: tuple[Job, ...]
 
     def json_fields(self) -> dict[str, Any]:
-        """The filter by its figures."""
-        return {**pick(self, "images", "failed", "folder"), "filter": filter_figures(self.filter)}
+        """Return the images, and the filter by its figures."""
+        return {**pick(self, "images", "failed", "folder"), "filter": filter_figures(self.found.filter)}
+
+    def written(self) -> list[Path]:
+        """Return the restored images."""
+        return [image.path for image in self.images]
+
+    def raise_failures(self) -> None:
+        """Name the images that failed."""
+        raise_failed(self.failed, len(self.images))
 
 
 def filter_figures(filter_: RestorationFilter) -> dict[str, Any]:
@@ -800,7 +747,7 @@ class OpticalCorrections:
         """Those that are asked for, their files read."""
         fall_off = None if request.fall_off is None else load_fall_off(request.fall_off)
         model = load_chromatic(request.chromatic) if isinstance(request.chromatic, Path) else request.chromatic
-        return cls(fall_off, model, light)
+        return cls(fall_off, cast("ChromaticModel | Literal['measure'] | None", model), light)
 
     def source(self, path: Path) -> SteppedReader:
         """The pixels of an image, corrected."""
@@ -813,11 +760,11 @@ class OpticalCorrections:
 
 
 @dataclass(frozen=True, eq=False)
-class RestorePlan:
+class RestorePlan(Result):
     """All images that can be restored, before any pixel is."""
 
     request: RestoreRequest
-    filter: RestorationFilter
+    found: FoundFilter
     jobs: tuple[Job, ...]
     failed: dict[str, str]
     in_flight: int
@@ -827,9 +774,61 @@ class RestorePlan:
         """Tiles of all images."""
         return sum(job.tiles for job in self.jobs)
 
+    def json_fields(self) -> dict[str, Any]:
+        """Return the filter by its figures, and what becomes of each image."""
+        rows = [
+            {
+                "image": job.reader.info.path,
+                "path": job.target,
+                **pick(job.reader, "size", "bands"),
+                "dtype": str(job.reader.dtype),
+                "tiles": job.tiles,
+            }
+            for job in self.jobs
+        ]
+        return {"filter": filter_figures(self.found.filter), "images": rows, "failed": self.failed}
 
-def plan_restoration(request: RestoreRequest) -> RestorePlan:
-    """Open the filter and all images, and see where the results go; nothing is written.
+    def written(self) -> list[Path]:
+        """Return nothing: no file was written."""
+        return []
+
+    def summary(self) -> list[str]:
+        """Return what becomes of each image."""
+        return [
+            f"{job.reader.info.path}: {job.reader.size[0]} × {job.reader.size[1]}, {_count(job.reader.bands, 'band')} "
+            f"of {job.reader.dtype}, {_count(job.tiles, 'tile')} → {job.target}"
+            for job in self.jobs
+        ]
+
+    def lines(self) -> list[str]:
+        """Return what to know before the filter is used: growth of noise, rules, corrections."""
+        figures, lines = filter_figures(self.found.filter), []
+        if self.found.filter.description != NO_FILTER:
+            sums = ", ".join(f"{total:.4g}" for total in figures["sums"][:6])
+            lines.append(
+                f"filter {figures['size'][0]} × {figures['size'][1]}, {_count(figures['kernels'], 'kernel')}, sum "
+                f"{sums}: noise grows {figures['noise_gain']:.3g} times"
+            )
+        lines += [f"{name}: {figures['facts'][name]}" for name in ("condition", "rule", "expected")
+                  if name in figures["facts"]]  # fmt: skip
+        for job in self.jobs:
+            lit, aligned = job.reader.step(FallOffStep), job.reader.step(AlignStep)
+            found = [] if lit is None else [fall_off_line(lit.fall_off)]
+            found += [] if aligned is None else model_lines(aligned.model)
+            lines += [f"{job.reader.info.path.name}: {line}" for line in found]
+        return lines
+
+    def raise_failures(self) -> None:
+        """Name the images that cannot be restored."""
+        raise_failed(self.failed, len(self.jobs))
+
+
+def _count(number: int, what: str) -> str:
+    return f"1 {what}" if number == 1 else f"{number} {what}s"
+
+
+def plan_restoration(request: RestoreRequest, events: Events = SILENT) -> RestorePlan:
+    """Find the filter, open all images, and see where the results go; nothing is written.
 
     Raises
     ------
@@ -838,18 +837,20 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
     InputError
         The filter or the table of the linearisation cannot be used.
     """
-    given = request.filter
-    filter_ = load_filter(given) if isinstance(given, Path) else given
+    if request.compress not in COMPRESSIONS:
+        raise UsageError(f"compression {request.compress!r}; allowed are {', '.join(COMPRESSIONS)}")
+    found = requested_filter(request, events)
+    filter_ = found.filter
     text = filter_text(entries_of(filter_))
-    light = linearisation_of(request.linearisation)
+    light = linearisation_of(request.linearisation or "linear")
     corrections = OpticalCorrections.of(request, light)
     files = [path.resolve() for path in request.images]
     twice = [path for path in files if files.count(path) > 1]
     if twice:
         raise UsageError(f"image {twice[0]} is given twice")
     stems = unique_stems(str(path.absolute()) for path in request.images)
-    tools = [path for path in (given, request.chromatic, request.fall_off) if isinstance(path, Path)]
-    tools += [] if request.linearisation in ("linear", "srgb") else [Path(request.linearisation)]
+    tools = [path for path in (request.filter, request.chromatic, request.fall_off) if isinstance(path, Path)]
+    tools += table_of(request.linearisation)
     jobs, failed = [], {}
     for path in request.images:
         try:
@@ -865,7 +866,7 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
     for job in jobs:
         _check_outputs(job, request)
     return RestorePlan(
-        request=request, filter=filter_, jobs=tuple(jobs), failed=failed, in_flight=_in_flight(request, jobs)
+        request=request, found=found, jobs=tuple(jobs), failed=failed, in_flight=_in_flight(request, jobs)
     )
 
 
@@ -888,7 +889,7 @@ def _only(filter_: RestorationFilter, bands: tuple[int, ...]) -> RestorationFilt
 def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str, tools: tuple[Path, ...]) -> Job:
     info = reader.info
     digest = fingerprint(info.path).digest
-    facts = [text, request.settings["bands"], str(reader.dtype), request.linearisation]
+    facts: list[Any] = [text, list(request.bands), str(reader.dtype), request.linearisation or "linear"]
     aligned, lit = reader.step(AlignStep), reader.step(FallOffStep)
     if aligned is not None:
         facts.append(model_figures(aligned.model))
@@ -918,7 +919,7 @@ def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str
 
 def _check_outputs(job: Job, request: RestoreRequest) -> None:
     """Refuse results that exist, but for those of this very run when it was interrupted."""
-    mine = earlier_result(job, request.settings) is not None
+    mine = earlier_result(job, _settings(request)) is not None
     outputs = [job.target, *([job.picture] if request.quicklook else [])]
     outputs += [job.chromatic_file] if request.chromatic == "measure" else []
     for path in outputs:
@@ -931,16 +932,18 @@ def _in_flight(request: RestoreRequest, jobs: list[Job]) -> int:
     return tiles_in_flight(wanted, request.memory if jobs else None, BASE_MEMORY, each)
 
 
-def restore_images(request: RestoreRequest, events: Events = SILENT, more: bool = False) -> RestoreReport:
+def restore(request: RestoreRequest, events: Events = SILENT) -> RestoreReport | RestorePlan:
+    """Restore all images, see `restore_images`; in a dry run return the plan."""
+    plan = plan_restoration(request, events)
+    for line in plan.lines():
+        events.talk(line)
+    return plan if request.dry_run else _restore(plan, events)
+
+
+def restore_images(request: RestoreRequest, events: Events = SILENT) -> RestoreReport:
     """Restore all images; one that cannot be used does not stop the others.
 
-    Parameters
-    ----------
-    events : Events
-        Told of tiles that are done, and of each image as soon as it is written.
-    more : bool
-        Whether the caller makes more of the images, such as a report: those that are all there are then no reason to
-        refuse.
+    Images that are all restored already are refused, unless a report is made of them.
 
     Raises
     ------
@@ -949,13 +952,20 @@ def restore_images(request: RestoreRequest, events: Events = SILENT, more: bool 
     ResourceError
         Disk or memory ran out; the same request goes on where it stopped.
     """
-    plan = plan_restoration(request)
-    settings = request.settings
+    return _restore(plan_restoration(request, events), events)
+
+
+def _restore(plan: RestorePlan, events: Events) -> RestoreReport:
+    request = plan.request
+    if plan.found.measured is not None:
+        path = request.save_filter or request.folder / FILTER_NAME
+        events.talk(f"filter: {keep_filter(path, plan.found.filter, overwrite=request.overwrite)}")
+    settings = _settings(request)
     kept = {job.target: earlier_result(job, settings) for job in plan.jobs} if not request.overwrite else {}
     for job in plan.jobs:
         if kept.get(job.target):
             tidy([job.target, job.picture, job.chromatic_file, record_path(job.target)])
-    if plan.jobs and not more and all(kept.get(job.target) for job in plan.jobs):
+    if plan.jobs and request.report is None and all(kept.get(job.target) for job in plan.jobs):
         first = plan.jobs[0].target
         raise UsageError(f"{first}: exists already; choose another output or say `overwrite`")
     make_folder(request.folder)
@@ -982,4 +992,5 @@ def restore_images(request: RestoreRequest, events: Events = SILENT, more: bool 
     events.begin("restoring", plan.tiles)
     with threads(request.workers) as workers:
         results = Runner(workers, plan.in_flight, events, excuse).run(works())
-    return RestoreReport(tuple(r for r in results if r is not None), failed, plan.filter, request.folder)
+    images = tuple(result for result in results if result is not None)
+    return RestoreReport(images, failed, plan.found, request.folder, plan.jobs)

@@ -386,10 +386,12 @@ _AXES = (("x", "rows", (1.0, 0.0)), ("y", "columns", (0.0, 1.0)))
 _BANDS = 6
 
 
-def restore_page(found: FoundFilter, jobs: Sequence[Job], made: RestoreReport) -> str:
-    """The report as one HTML document; images and results are opened again for details."""
-    by_path = {job.target: job for job in jobs}
-    parts = [section("The filter", _filter(found))]
+def restore_page(made: RestoreReport) -> str | None:
+    """Return the report as one HTML document, if an image was restored; images are opened again for details."""
+    if not made.images:
+        return None
+    by_path = {job.target: job for job in made.jobs}
+    parts = [section("The filter", _filter(made.found))]
     for k, image in enumerate(made.images):
         parts.append(section(image.image, _image(image, by_path[image.path], k < _PICTURED)))
     if made.failed:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator
 
 from photoplan.errors import UsageError
-from photoplan.request import DRY_RUN, OVERWRITE, Request, arg, opt
+from photoplan.request import DRY_RUN, MEMORY, ONE_WORKER, OVERWRITE, Request, arg, opt
 
 REPORT: Any = opt("Report with plots to write.", None, metavar="HTML", writes=True)
 
@@ -71,6 +75,85 @@ class MtfRequest(Request):
 
     def files_read(self) -> list[Path]:
         """Return images and tables."""
+        return [*super().files_read(), *table_of(self.linearisation)]
+
+
+def _file_or(word: str, value: Any) -> Any:
+    """Return the path of a file, a word that stands for none, or a value instead of a file."""
+    if not isinstance(value, str | os.PathLike):
+        return value
+    return word if os.fspath(value) == word else Path(value)
+
+
+class RestoreRequest(Request):
+    """Options of the restoration of images, and of the measurement of a filter."""
+
+    images: tuple[Path, ...] = arg("Images.")
+    filter: Annotated[Path | object | None, BeforeValidator(partial(_file_or, "none"))] = opt(
+        "Filter: TOML, or one kernel as rows of numbers; none: no filter [measured at edges of the images].", None,
+        metavar="FILE|none", section="input",
+    )  # fmt: skip
+    output: Path | None = opt("Folder of the results [restored, beside the first image].", None, metavar="FOLDER",
+                              folder=True, writes=True)  # fmt: skip
+    bands: tuple[int, ...] = opt("Band to restore; may be repeated [all]. Others stay as they are.", (), flag="band",
+                                 metavar="N")  # fmt: skip
+    linearisation: str | None = opt("Conversion of grey values into the light that is filtered [linear].", None,
+                                    metavar="linear|srgb|TABLE", section="input")  # fmt: skip
+    dtype: str = opt("Type of the results: same, float32 or uint16.", "same", metavar="TYPE", section="result")
+    chromatic: Annotated[Path | object | None, BeforeValidator(partial(_file_or, "measure"))] = opt(
+        "First bring the bands together: by a model, or as measured in each image.", None, metavar="FILE|measure",
+        section="input",
+    )  # fmt: skip
+    fall_off: Path | None = opt("Before all else correct the light fall-off, by a model of `photoplan characterise`.",
+                                None, metavar="TOML", section="input")  # fmt: skip
+    aperture: str | None = opt("Aperture of a scanner to undo: square or round, RATIO of aperture by step [1].", None,
+                               metavar="SHAPE[:RATIO]")  # fmt: skip
+    method: Literal["auto", "exact", "regularised"] = opt(
+        "Method of a measured filter; auto: the one of least expected error.", "auto"
+    )
+    rotation: Literal["radial", "separable"] = opt("Form of an exact inverse in two dimensions.", "radial")
+    size: int | None = opt("Side of a measured filter, pixels [11 or more].", None, ge=3, le=101, metavar="N")
+    cells: int = opt("Filters for N by N parts of the field, interpolated between them.", 1, ge=1, le=15, metavar="N")
+    per_band: bool = opt("Measure a filter for each band.", False)
+    most_edges: int = opt("Number of edges that are measured in an image.", 200, ge=1, le=5000)
+    least_length: float | None = opt("Shortest edge, pixels [20].", None, ge=8, le=10_000, metavar="PX")
+    noise: float | None = opt(
+        "Standard deviation of the noise in light, full scale 1 [found in the images].", None, ge=0, metavar="SIGMA"
+    )
+    save_filter: Path | None = opt("Measured filter to write [restoration_filter.toml by the results].", None,
+                                   metavar="TOML", writes=True)  # fmt: skip
+    compress: str = opt("Compression: deflate, zstd, lzw, jpeg or none.", "deflate", section="result")
+    report: Path | None = REPORT
+    quicklook: bool = opt("Write no pictures.", True, flag="no-quicklook", section="result")
+    dry_run: bool = DRY_RUN
+    workers: int = ONE_WORKER
+    memory: int | None = MEMORY
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse options of a measurement beside a filter."""
+        if not self.images:
+            raise UsageError("no image is given")
+        if self.filter is not None and self.aperture is not None:
+            raise UsageError("give `filter`, `aperture`, or neither to measure a filter in the images; one of them")
+        given = "filter" if self.filter is not None else "aperture"
+        measuring = ("method", "rotation", "size", "cells", "per_band", "most_edges", "least_length", "noise",
+                     "save_filter")  # fmt: skip
+        for name in measuring if getattr(self, given) is not None else ():
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise UsageError(f"`{name}` is for filters that are measured; leave out `{given}`")
+        if self.size is not None and self.size % 2 == 0:
+            raise UsageError(f"`size` {self.size}: a filter has an odd number of rows and columns")
+        if self.dtype not in ("same", "float32", "uint16"):
+            raise UsageError(f"dtype {self.dtype!r}; allowed are same, float32, uint16")
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the results."""
+        return self.images[0].parent / "restored" if self.output is None else self.output
+
+    def files_read(self) -> list[Path]:
+        """Return images, filter, corrections and tables."""
         return [*super().files_read(), *table_of(self.linearisation)]
 
 
