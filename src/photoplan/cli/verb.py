@@ -109,7 +109,7 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
 
     def once(line: str) -> None:
         if line not in shown:
-            talk(line)
+            events.talk(line)
         shown.add(line)
 
     def announced(part: object) -> None:
@@ -120,7 +120,7 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
                 show(path)
             shown.add(path)
         for line in part.messages() if isinstance(part, Result) else ():
-            events.talk(line)
+            once(line)
         draws = load(verb.each) if verb.each and files else lambda *_: ()
         for line in draws(part, request, lambda wanted: can_draw(wanted, once)):
             once(line)
@@ -173,7 +173,7 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
         for line in (*result.summary(), *rest) if verb.figures_first else (*rest, *result.summary()):
             show(line)
     for message in result.messages():
-        if not as_json or message.startswith(("note:", "warning:")):
+        if message not in shown and (not as_json or message.startswith(("note:", "warning:"))):
             talk(message)
     result.raise_failures()
 
