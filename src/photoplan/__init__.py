@@ -43,7 +43,7 @@ __getattr__, __dir__, __all__ = public(
         "products.tie": "TieRequest find_ties",
         "products.control": "ControlRequest propose_control",
         "products.adjust.run": "AdjustRequest adjust_project",
-        "products.budget": "PolynomialsRequest write_polynomials BudgetRequest make_budget",
+        "products.budget": "write_polynomials BudgetRequest make_budget",
         "requests.surface": "SurfaceRequest SurfaceSettings",
         "products.surface.plan": "plan_surface",
         "products.surface.run": "make_surface surface_project",

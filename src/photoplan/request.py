@@ -80,7 +80,7 @@ class Request(BaseModel):
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other values, checked."""
-        return type(self)(**({name: getattr(self, name) for name in type(self).model_fields} | changes))
+        return type(self)(**({name: getattr(self, name) for name in self.model_fields_set} | changes))
 
     def part(self, kind: type[Part]) -> Part:
         """Return the options of a class from which this one derives, or that it holds; those that were set are set."""
@@ -177,3 +177,5 @@ WORKERS: Any = opt(_WORKERS, None, ge=1, section="run")
 ONE_WORKER: Any = opt(_WORKERS, 1, ge=1, section="run")
 """For calls from Python that use one worker unless told otherwise; the command line uses all cores."""
 BOUNDS: Any = opt("Part to process [all].", None, metavar="XMIN YMIN XMAX YMAX")
+_BEYOND = "Accept coordinates far outside the area of use of their CRS."
+BEYOND_AREA: Any = opt(_BEYOND, False, section="input")

@@ -16,7 +16,7 @@ from tools.orientation_blocks import (
 
 from photoplan.errors import InputError
 from photoplan.io.orientation.file import read_orientation, read_orientation_block, write_orientation
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 
 FORMATS = {"bluh": "", "bingo": "ORIA "}
 #: What a user has to declare of each.
@@ -106,10 +106,10 @@ def test_other_conventions_are_declared(tmp_path):
     table = read_orientation(path, TableFormat(angle_unit="rad", rotation="kpo", direction="ground-to-camera"), "bluh")
     assert (table.angle_unit, table.rotation, table.direction) == ("rad", "kpo", "ground-to-camera")
     assert table.images[0].angles == (3.0, 1.0, 2.0)
-    # The value that is the default of tables has to be declared expressly.
     with pytest.raises(InputError, match="tells the unit of angles in files of BLUH; declare `angle_unit`"):
-        read_orientation(path, TableFormat(angle_unit="deg"), "bluh")
-    declared = TableFormat(angle_unit="deg", rotation="opk", declared=frozenset({"angle_unit", "rotation"}))
+        read_orientation(path, TableFormat(), "bluh")
+    # The value that is the default of tables can be declared, too.
+    declared = TableFormat(angle_unit="deg", rotation="opk")
     table = read_orientation(path, declared, "bluh")
     assert (table.angle_unit, table.rotation) == ("deg", "opk")
     assert table.images[0].angles == (2.0, 1.0, 3.0)

@@ -12,9 +12,9 @@ from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.camera.model import BrownLens
 from photoplan.io.orientation.block import without_lenses
 from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 
-FROM_CAMERA = TableFormat(declared=frozenset({"direction"}))
+FROM_CAMERA = TableFormat(direction="camera-to-ground")
 TO_CAMERA = TableFormat(direction="ground-to-camera")
 #: φ = asin 0.6, κ = 90°: the rows are those of the matrix from camera to ground.
 TEXT = """\

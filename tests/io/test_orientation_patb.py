@@ -14,9 +14,9 @@ from photoplan.io.orientation.file import (
     read_orientation_block,
     write_orientation,
 )
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 
-FROM_CAMERA = TableFormat(declared=frozenset({"direction"}))
+FROM_CAMERA = TableFormat(direction="camera-to-ground")
 TO_CAMERA = TableFormat(direction="ground-to-camera")
 #: φ = asin 0.6, ω = 0, κ = 90°: all elements are exact.
 TEXT = """\

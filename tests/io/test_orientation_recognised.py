@@ -15,7 +15,7 @@ from photoplan.io.orientation.file import (
     read_orientation_block,
     write_orientation,
 )
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 
 
 @pytest.mark.parametrize("name", ["metashape", "opk", "pix4d", "opensfm", "odm", "colmap", "toml"])

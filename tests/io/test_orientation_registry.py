@@ -17,7 +17,8 @@ from photoplan.io.orientation.file import (
     write_orientation,
     written_formats,
 )
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage
 
 MARKS = {str(k): xy for k, xy in enumerate([(-106.0, -106.0), (106.0, -106.0), (106.0, 106.0)])}
 
@@ -144,8 +145,8 @@ def test_formats_that_are_only_read_say_which_are_written(tmp_path, monkeypatch)
 def test_fault_18_marks_and_line_ends_change_nothing(tmp_path, name, end):
     suffix = orientation_format(name).suffix
     path = write_orientation(block(), tmp_path / f"out{suffix}", name)[0]
-    undescribed = {"patb": {"direction"}, "bluh": {"angle_unit"}}
-    form = TableFormat(declared=frozenset(undescribed.get(name, ())))
+    undescribed = {"patb": {"direction": "camera-to-ground"}, "bluh": {"angle_unit": "deg"}}
+    form = TableFormat(**undescribed.get(name, {}))
     stated = name if name == "bluh" else None
     before = read_orientation(path, form, stated).images
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", end.encode()))

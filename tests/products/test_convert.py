@@ -11,13 +11,13 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.pose import angles_from_rotation, rotation_from_angles
 from photoplan.io.camera.film import FilmEntry
 from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation_block, write_orientation
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 from photoplan.orientation.conventions import Reading
 from photoplan.plain import json_text, plain
 from photoplan.products.convert import ConvertRequest, convert_orientation, list_readings
 
 MINE = ("csv", "toml", "patb", "bingo", "bluh", "inpho")
-FROM_CAMERA = TableFormat(declared=frozenset({"direction"}))
+FROM_CAMERA = TableFormat(direction="camera-to-ground")
 #: What has to be declared of files whose makers do not tell it.
 DECLARED = {"patb": FROM_CAMERA, "bluh": TableFormat(angle_unit="gon")}
 

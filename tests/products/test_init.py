@@ -6,6 +6,7 @@ import json
 import shutil
 from inspect import signature
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,16 +16,17 @@ from click.testing import CliRunner, Result
 from pyproj import Proj
 from rasterio.transform import from_origin
 
-from photoplan.cli.init import command
+from photoplan.cli.main import VERBS
 from photoplan.errors import HeightSystemError, InputError, PhotoplanError, UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.pose import rotation_opk
 from photoplan.io.camera.film import FilmEntry
 from photoplan.io.camera.frame import FrameEntry
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 from photoplan.io.project.file import load_project
 from photoplan.products.init import InitRequest, init_project, make_project
 
+command = VERBS["init"].command("init")
 HEAD = "name,x,y,z,omega,phi,kappa\n"
 YAML = "cam:\n  type: pinhole\n  im_size: [40, 30]\n  focal_len: 50\n  sensor_size: [40, 30]\n"
 
@@ -72,7 +74,7 @@ def test_the_drone_block(block: Path, tmp_path: Path) -> None:
         terrain=str(block / "dsm.tif"),
         height_system="same",
     )
-    result = init_project(request, said.append)
+    result = init_project(request, SimpleNamespace(talk=said.append))
     assert load_project(result.path) == result.project
     assert said[0] == (
         '  18 images · camera "DJI FC300S half-res", 2000 × 1125 px, OpenCV lens · EPSG:32615 (from ext.prj)'
@@ -97,7 +99,7 @@ def test_fault_02_undeclared_height_systems_stop_after_the_summary(block: Path, 
         str(block / "dsm.tif"),
     )
     with pytest.raises(HeightSystemError) as error:
-        init_project(request, said.append)
+        init_project(request, SimpleNamespace(talk=said.append))
     assert "18 images" in said[0]
     assert str(error.value).startswith(
         "height systems: terrain not stated, orientation not stated → declare one, or `height_system` same"
@@ -127,7 +129,7 @@ def test_images_and_lines_without_partner_are_listed(files: dict[str, Any], tmp_
     with files["orientation"].open("a") as table:
         table.write("d,1,2,3,4,5,6\n")
     said: list[str] = []
-    result = make_project(InitRequest(**files), said.append)
+    result = make_project(InitRequest(**files), SimpleNamespace(talk=said.append))
     assert result.without_orientation == ("c.tif",)
     assert result.without_image == ("d",)
     assert "  left out, no orientation: c.tif" in said
@@ -174,7 +176,7 @@ def test_fault_08_an_unreadable_image_among_many_is_left_out_and_listed(files: d
     (tmp_path / "images" / "broken.tif").write_bytes(b"II*\0 and no more")
     (tmp_path / "images" / "empty.tif").write_bytes(b"")
     said: list[str] = []
-    result = make_project(InitRequest(**files), said.append)
+    result = make_project(InitRequest(**files), SimpleNamespace(talk=said.append))
     assert [i.name for i in result.project.images] == ["a", "b"]
     assert len(result.unusable) == 2
     assert any("left out, 2 files cannot be read: " in line and "broken.tif" in line for line in said)
@@ -337,7 +339,7 @@ def test_opensfm_goes_into_the_terrains_crs_at_the_images_resolution(files: dict
     path.write_text(json.dumps(content))
     said: list[str] = []
     request = InitRequest(**{**files, "camera": path, "orientation": path, "height_system": "ellipsoidal"})
-    project = init_project(request, said.append).project
+    project = init_project(request, SimpleNamespace(talk=said.append)).project
     assert "(from dtm.tif)" in said[0]
     assert project.crs == "EPSG:32632"
     made = project.cameras["c"]
@@ -423,7 +425,7 @@ def test_images_without_orientation(files: dict[str, Any], tmp_path: Path) -> No
         earth_curvature="strict",
         refraction=True,
     )
-    project = init_project(request, said.append).project
+    project = init_project(request, SimpleNamespace(talk=said.append)).project
     assert load_project(request.path) == project
     assert "2 images without orientation" in said[0] and "as given" in said[0]
     assert said[1] == "  height systems: control declared the same"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from tools.small_block import BASE, CRS, NAMES, X0, Y0, Z0, Block, make_project
 from tools.stated_position import state_position
 
 from photoplan.errors import GeometryError
+from photoplan.io.orientation.form import TableFormat
 from photoplan.io.orientation.metashape import read as read_metashape
-from photoplan.io.orientation.table import TableFormat
 from photoplan.io.project.file import load_project
 from photoplan.products.check import check_project
 from photoplan.products.convert import ConvertRequest, convert_orientation
@@ -52,7 +53,7 @@ def _init(block: Block, orientation: Path) -> list[str]:
     said: list[str] = []
     pattern = str(block.folder / "images" / "*.tif")
     made = InitRequest(block.folder / "made", (pattern,), block.camera, orientation, "100", CRS, "same", overwrite=True)
-    init_project(made, said.append)
+    init_project(made, SimpleNamespace(talk=said.append))
     return [line.strip() for line in said if line.strip().startswith("warning")]
 
 
@@ -70,7 +71,7 @@ def test_convert_compares_lists_with_images_beside_them(small: Block, tmp_path: 
     """Lists state no files: images of the same names that lie beside them are looked at."""
     here = tmp_path / "list"
     here.mkdir()
-    form = TableFormat(direction="camera-to-ground", declared=frozenset({"direction"}))
+    form = TableFormat(direction="camera-to-ground")
     source = here / "list.txt"
     convert_orientation(
         ConvertRequest(small.orientation, format, source, crs=CRS, camera=small.camera, matrix="camera-to-ground")

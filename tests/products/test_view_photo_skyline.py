@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from tools.command import inside
 
 from photoplan.errors import GeometryError
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 from photoplan.io.orientation.toml import read as read_toml_orientation
 from photoplan.io.quicklook import write_png
 from photoplan.orientation.skyline import fit_skyline

@@ -64,7 +64,7 @@ def chain(shared: Path, block: Path, tmp_path_factory: pytest.TempPathFactory) -
         tie(made)
 
     folder = tmp_path_factory.mktemp("chain") / "copy"
-    commands = ["photoplan.cli.init", "photoplan.cli.convert", "photoplan.products.tie"]
+    commands = ["photoplan.products.init", "photoplan.products.convert", "photoplan.products.tie"]
     shutil.copytree(kept("brighton-chain", make, commands, [block, exif]), folder)
     return chain_in(folder)
 

@@ -42,7 +42,7 @@ from photoplan.io.camera.rpc.file import read_rpc
 from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.objects import read_objects
 from photoplan.io.orientation.file import read_orientation_block, write_orientation
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.points import read_gcp_list, read_ground_points, read_image_points, read_observed_positions
 from photoplan.io.project.file import load_project
@@ -382,7 +382,7 @@ READERS = [
     Reader("opendronemap cameras", shots_geojson, read_orientation_block, "json", mutated="cameras.json"),
     Reader("bluh", text("b.dat", BLUH), lambda p: read_orientation_block(p, TableFormat(angle_unit="gon"), "bluh")),
     Reader("exif orientation", exif, lambda p: read_orientation_block(p, format="exif"), "binary"),
-    Reader("patb", oriented("patb", "o.ori"), lambda p: read_orientation_block(p, TableFormat(direction="camera-to-ground", declared=frozenset({"direction"})), "patb")),
+    Reader("patb", oriented("patb", "o.ori"), lambda p: read_orientation_block(p, TableFormat(direction="camera-to-ground"), "patb")),
     Reader("bingo", oriented("bingo", "o.dat"), lambda p: read_orientation_block(p, format="bingo")),
     Reader("inpho", oriented("inpho", "o.prj"), lambda p: read_orientation_block(p, format="inpho")),
     Reader("metashape", oriented("metashape", "o.xml"), read_orientation_block),

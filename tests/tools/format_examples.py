@@ -17,7 +17,8 @@ from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.camera.model import BrownLens, IdealLens, OpenCVFisheyeLens, OpenCVLens
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.file import read_orientation_block, write_orientation
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage
 from photoplan.io.project.model import Image, interior_of, lens_of
 
 LENSES: dict[str, Any] = {

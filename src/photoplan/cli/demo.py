@@ -72,7 +72,7 @@ def command(folder: Path, resolution: float, overwrite: bool, quiet: bool) -> No
             terrain=str(data / "dsm.tif"),
             height_system="same",
         )
-        made = make_project(request, lambda line: events.talk(f"  {line}"))
+        made = make_project(request, events)
         # What a demo that was interrupted has written is the same; anything else is somebody's work.
         if not put(made.path, project_text(made.project).encode()):
             raise UsageError(f"{made.path}: exists already and differs; choose another folder or give `overwrite`")

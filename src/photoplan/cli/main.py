@@ -21,8 +21,26 @@ from photoplan.errors import PhotoplanError, PhotoplanWarning, ResourceError
 
 #: Verb and its one-line help, in the order of a job; the command is `photoplan.cli.<verb>:command`.
 VERBS: dict[str, str | Verb] = {
-    "init": "Write a project file from the files you have.",
-    "convert": "Orientations from one file format to another.",
+    "init": Verb(
+        "Write a project file from the files you have.",
+        """Write DIR/project.toml from images, camera, orientation and terrain.
+
+        Prints the path of the project file on stdout. Height systems must be stated by the files or declared. Without
+        --orientation the images are to be oriented (tie, resect, adjust), and --crs is needed.
+        """,
+        "requests.project:InitRequest",
+        "products.init:init_project",
+    ),
+    "convert": Verb(
+        "Orientations from one file format to another.",
+        """Write ORIENTATION, an orientation file or a project, in another format.
+
+        What the other format cannot hold is reported on stderr. A lens that it cannot hold is refused unless
+        --drop-lens is set.
+        """,
+        "requests.orient:ConvertRequest",
+        "products.convert:convert",
+    ),
     "fiducials": Verb(
         "Find the fiducial marks of film scans.",
         """Find the fiducial marks of scanned film photos, without approximate values.

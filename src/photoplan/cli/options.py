@@ -14,10 +14,6 @@ if TYPE_CHECKING:
     from photoplan.events import Events
     from photoplan.products.run import Run
 
-_DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
-DIRECTIONS = ["camera-to-ground", "ground-to-camera"]
-
-
 #: Endings of files: a folder of such a name would be made in silence.
 _FILE = re.compile(r"\.(csv|gpkg|html|jp2|jpe?g|json|la[sz]|pdf|png|tiff?|toml|vrt)$", re.IGNORECASE)
 
@@ -62,37 +58,6 @@ def several(*options: Callable[..., Any]) -> Callable[..., Any]:
         return command
 
     return decorate
-
-
-#: Options that say what an orientation file does not say of itself.
-reading_options = several(
-    click.option("--format", "format", metavar="FORMAT", help="Format of the orientation file [by its content]."),
-    click.option("--columns", help="Columns of a table: name,x,y,z,omega,phi,kappa[,camera] or name=LABEL,x=…"),
-    click.option("--delimiter", type=click.Choice([*_DELIMITERS]), help="Of a table [found by itself]."),
-    click.option("--decimal-comma", is_flag=True, help="Numbers of a table are written 1,5."),
-    click.option("--angle-unit", type=click.Choice(["deg", "gon", "rad"]), help="[deg, or the format's own]"),
-    click.option(
-        "--rotation",
-        type=click.Choice(["opk", "pok", "kpo", "kop", "okp", "pko"]),
-        help="Order of omega, phi, kappa; the first is primary [opk, or the format's own].",
-    ),
-    click.option(
-        "--rotation-direction",
-        "direction",
-        type=click.Choice(DIRECTIONS),
-        help="What the file's rotation does [camera-to-ground; some formats have to be told].",
-    ),
-)
-
-
-def table_format(options: dict[str, Any]) -> Any:
-    """TableFormat of `reading_options`, which are taken out of `options`."""
-    from photoplan.io.orientation.table import TableFormat
-
-    names = ("angle_unit", "rotation", "direction")
-    given = {name: value for name in names if (value := options.pop(name)) is not None}
-    sign: Any = _DELIMITERS.get(options.pop("delimiter") or "")
-    return TableFormat(options.pop("columns"), sign, options.pop("decimal_comma"), **given, declared=frozenset(given))
 
 
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}

@@ -239,7 +239,7 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
         hint = str
         if how.get("listed") and "multiple" not in more:
             more |= {"multiple": True, "callback": lambda context, parameter, given: ",".join(given) or None}
-    choices = [str(each) for each in get_args(hint)] if get_origin(hint) is Literal else how.get("choices")
+    choices = how.get("choices") or ([str(each) for each in get_args(hint)] if get_origin(hint) is Literal else None)
     if isinstance(choices, Mapping):
         more["callback"] = partial(_value_of, choices)
     kind: Any = click.Choice(choices) if choices else BYTES if how.get("size") else hint
@@ -265,8 +265,7 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     if isinstance(choices, Mapping):
         default = next((word for word, value in choices.items() if value == default), None)
     shown = default is not None and default != () and "[" not in (entry.description or "")
-    if "multiple" in more:
-        default = default or None
+    default = default if shown else None  # what is stated in words is left to the request
     needed = entry.is_required() or bool(how.get("required"))
     return click.Option(
         names, type=kind, required=needed, help=entry.description, default=default, show_default=shown, **more

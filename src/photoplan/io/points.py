@@ -23,7 +23,8 @@ from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.files import ImageNames, check_plain_file, crs_beside, read_text, same_images
 from photoplan.io.orientation.exif import map_positions, read_folder
 from photoplan.io.orientation.file import read_orientation
-from photoplan.io.orientation.table import TableFormat, angle_in_radians
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.tables import NUMBER, Columns, Dialect, Table, number, read_table, write_table
 from photoplan.io.vector_layer import read_layer
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Camera, on_level
 from photoplan.cameras.rpc import fit_rpc
 from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.findings import Result
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.local import GeodeticGround
 from photoplan.io.camera.rpc.text import rpc_text
@@ -43,6 +44,7 @@ from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.error_model import height_errors, known_height_errors, source_errors
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.scene import input_files
+from photoplan.requests.orient import ConvertRequest
 from photoplan.surfaces.hybrid import HeightErrors, StatedHeightErrors
 from photoplan.targets.map import MapTarget
 
@@ -136,18 +138,6 @@ _ROOM, _OF_DISTANCE = 0.1, 0.02
 
 
 @dataclass(frozen=True)
-class PolynomialsRequest:
-    """What is asked."""
-
-    project: Path
-    output: Path | None = None
-    """Folder of the files; None: that of the project."""
-    overwrite: bool = False
-    dry_run: bool = False
-    """Whether to fit polynomials, and write nothing."""
-
-
-@dataclass(frozen=True)
 class ImagePolynomials:
     """What the polynomials of an image leave of its camera, between the places of the fit."""
 
@@ -162,10 +152,11 @@ class ImagePolynomials:
 
 
 @dataclass(frozen=True)
-class PolynomialsReport:
-    """What came out."""
+class PolynomialsReport(Result):
+    """Polynomials of the images of a project."""
 
     images: tuple[ImagePolynomials, ...]
+    dry_run: bool
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -176,8 +167,21 @@ class PolynomialsReport:
         """Files, and the figures of each image."""
         return pick(self, "files", "images")
 
+    def written(self) -> Sequence[Path]:
+        """Return the files that were, or would be, written."""
+        return self.files
 
-def write_polynomials(request: PolynomialsRequest) -> PolynomialsReport:
+    def messages(self) -> Sequence[str]:
+        """Return how well the polynomials fit."""
+        lines = [
+            f"  {each.image}: off by at most {each.worst:.2g} px for heights from {each.heights[0]:.0f} to "
+            f"{each.heights[1]:.0f} m"
+            for each in self.images
+        ]
+        return [*lines, "  nothing is written"] if self.dry_run else lines
+
+
+def write_polynomials(request: ConvertRequest) -> PolynomialsReport:
     """Fit polynomials to all images of a project over the heights that they see, and write ``IMAGE_RPC.TXT``.
 
     Raises
@@ -189,16 +193,16 @@ def write_polynomials(request: PolynomialsRequest) -> PolynomialsReport:
     GeometryError
         An image sees no terrain, or does not look down.
     """
-    project = load_project(request.project)
+    project = load_project(request.orientation)
     folder = request.output or project.folder
     stems = unique_stems(image.file for image in project.images)
     outputs = {image.name: folder / f"{stems[image.file]}_RPC.TXT" for image in project.images}
-    inputs = [request.project, *input_files(project)]
+    inputs = [request.orientation, *input_files(project)]
     for path in outputs.values():
         check_output(path, inputs, overwrite=request.overwrite)
     with recording("convert", request, inputs) as record:
         fitted = [_fit(project, name, path) for name, path in outputs.items()]
-        report = PolynomialsReport(tuple(image for image, _, _ in fitted))
+        report = PolynomialsReport(tuple(image for image, _, _ in fitted), request.dry_run)
         if request.dry_run:
             return report
         try:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Lens
 from photoplan.errors import InputError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted
 from photoplan.geometry.bounds import area_fault, area_note
 from photoplan.geometry.crs import canonical_crs, require_projected_metres
 from photoplan.geometry.frames import triple
@@ -29,10 +31,12 @@ from photoplan.io.orientation.file import (
     write_orientation,
     written_formats,
 )
-from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, degrees_of
 from photoplan.io.points import named_as, read_ground_points, read_image_points
 from photoplan.io.product import check_output
 from photoplan.io.project.model import Image, interior_of, lens_of
+from photoplan.io.store import recording
 from photoplan.orientation.conventions import (
     FittedReading,
     Reading,
@@ -43,50 +47,19 @@ from photoplan.orientation.conventions import (
     turn_matrix,
 )
 from photoplan.plain import pick
+from photoplan.products.budget import write_polynomials
 from photoplan.products.init import camera_name, placed
 from photoplan.products.plausibility import differences, on_map, stated_positions
 from photoplan.project.cameras import is_there
+from photoplan.requests.orient import ConvertRequest
 
 #: Formats whose poses are read as those of a system in true metres.
 _CARTESIAN = ("colmap", "metashape", "odm", "opensfm", "opk")
 
 
 @dataclass(frozen=True)
-class ConvertRequest:
-    """What is asked."""
-
-    orientation: Path
-    """File, or folder of a format with several files; a project too."""
-    target: str
-    """Format to write, of `photoplan.io.orientation.file.FORMATS`."""
-    output: Path | None = None
-    """None: beside the orientation, called after it and the format."""
-    format: str | None = None
-    """Format to read; None: by the content."""
-    form: TableFormat = field(default_factory=TableFormat)
-    """What the file does not say of itself."""
-    camera: Path | None = None
-    """File with cameras, instead of those that the orientation file holds."""
-    crs: str | None = None
-    """CRS to write: declares that of a file without one, else the orientations are carried into it."""
-    camera_axes: str = "up-back"
-    """Directions of the camera's y and z in the file that is read: up-back, or down-forward."""
-    turned: int = 0
-    """Angle by which images are turned against the camera's axes of the file, counter-clockwise, degrees."""
-    matrix: Direction | None = None
-    """What matrices of the written file do, where its format leaves that open."""
-    beyond_area: bool = False
-    """Whether places far outside the area of use of the CRS are meant."""
-    drop_lens: bool = False
-    """Whether a camera is written without its lens where the format has no such lens."""
-    overwrite: bool = False
-    dry_run: bool = False
-    """Whether to write nothing, and only say what would be written and lost."""
-
-
-@dataclass(frozen=True)
-class ConvertReport:
-    """What came out."""
+class ConvertReport(Result):
+    """Files of a conversion, and what they cannot hold."""
 
     files: tuple[Path, ...]
     source_format: str
@@ -98,11 +71,30 @@ class ConvertReport:
     """How the file was read."""
     lost: tuple[Loss, ...]
     """What the target format cannot hold."""
+    dry_run: bool
 
     def json_fields(self) -> dict[str, Any]:
         """Formats as from and to."""
         own = pick(self, "files", "images", "cameras", "crs", "notes", "lost")
         return {**own, "from": self.source_format, "to": self.target_format}
+
+    def written(self) -> Sequence[Path]:
+        """Return the files that were, or would be, written."""
+        return self.files
+
+    def messages(self) -> Sequence[str]:
+        """Return what was converted, what is lost, and how the file was read."""
+        nothing = "; nothing is written" if self.dry_run else ""
+        lines = [f"  {self.images} images, from {self.source_format} to {self.target_format}{nothing}"]
+        lines += [f"  {self.target_format} holds {loss.text}" for loss in self.lost]
+        return [*lines, *noted(self.notes)]
+
+
+def convert(request: ConvertRequest, events: Events = SILENT) -> Result:
+    """Write an orientation in another format, polynomials of a project, or list readings, whichever is set."""
+    if request.list_readings and request.image_points is not None and request.control is not None:
+        return list_readings(request, request.image_points, request.control)
+    return write_polynomials(request) if request.target == "rpc" else convert_orientation(request)
 
 
 def convert_orientation(request: ConvertRequest) -> ConvertReport:
@@ -115,7 +107,7 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
     InputError
         The orientation cannot be used, or lacks something that the format needs.
     """
-    target = orientation_format(request.target)
+    target = orientation_format(request.target or "")
     if target.render is None:
         raise UsageError(f"orientation format {target.name} is read only; written are {', '.join(written_formats())}")
     source, block = read_block(request.orientation, request.form, request.format)
@@ -136,19 +128,23 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
     files = list(target.render(block, output))
     for file in files:
         check_output(file, inputs, overwrite=request.overwrite)
-    if not request.dry_run:
-        files = write_orientation(block, output, target.name, overwrite=request.overwrite)
     table = block.table
-    return ConvertReport(
-        files=tuple(files),
-        source_format=source,
-        target_format=target.name,
-        images=len(table.images),
-        cameras=tuple(block.cameras),
-        crs=table.crs,
-        notes=(*table.notes, *outside, *_against_positions(block, images)),
-        lost=lost,
-    )
+    with recording("convert", request, inputs) as record:
+        if not request.dry_run:
+            files = write_orientation(block, output, target.name, overwrite=request.overwrite)
+        report = ConvertReport(
+            files=tuple(files),
+            source_format=source,
+            target_format=target.name,
+            images=len(table.images),
+            cameras=tuple(block.cameras),
+            crs=table.crs,
+            notes=(*table.notes, *outside, *_against_positions(block, images)),
+            lost=lost,
+            dry_run=request.dry_run,
+        )
+        record(() if request.dry_run else report.files, report)
+    return report
 
 
 def _judged_area(table: OrientationTable, beyond: bool) -> tuple[str, ...]:
@@ -282,7 +278,7 @@ POOR = 20.0
 
 
 @dataclass(frozen=True)
-class ReadingsReport:
+class ReadingsReport(Result):
     """Readings of a file with their errors, the best first."""
 
     format: str
@@ -316,6 +312,17 @@ class ReadingsReport:
             "fitting": [self._fields(found) for found in self.fitting],
             "others": [self._fields(found) for found in self.others],
         }
+
+    def summary(self) -> Sequence[str]:
+        """Return a line for each reading with its error and the options that declare it."""
+        kinds = (("fits", self.fitting), ("", self.others))
+        return [
+            f"{r.median:10.2f} px  {fits:4}  {self.options(r.reading)}" for fits, readings in kinds for r in readings
+        ]
+
+    def messages(self) -> Sequence[str]:
+        """Return how many points were compared, and notes."""
+        return [f"  medians of {self.points} points in {self.images} images", *noted(self.notes)]
 
     def _fields(self, found: FittedReading) -> dict[str, Any]:
         reading = found.reading
@@ -370,8 +377,7 @@ def list_readings(request: ConvertRequest, image_points: Path, control: Path) ->
 def _as_stated(request: ConvertRequest) -> tuple[str, OrientationBlock]:
     """The file's numbers: read so that no unit or direction is refused; what they are taken for does not matter."""
     # Of all units gon allows the largest numbers.
-    form = replace(request.form, angle_unit="gon", rotation="opk", direction="camera-to-ground")
-    form = replace(form, declared=frozenset({"rotation", "direction"}))
+    form = request.form.replace(angle_unit="gon", rotation="opk", direction="camera-to-ground")
     return read_block(request.orientation, form, request.format)
 
 

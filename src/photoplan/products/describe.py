@@ -23,7 +23,7 @@ from photoplan.io.camera.rpc.file import is_rpc, read_rpc, rpc_beside, rpc_in
 from photoplan.io.files import looks_like, raster_driver, read_json, read_toml
 from photoplan.io.objects import read_objects
 from photoplan.io.orientation.file import choose_format, read_orientation_block
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.points import (
     is_gcp_list,

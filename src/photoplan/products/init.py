@@ -5,14 +5,16 @@ from __future__ import annotations
 import glob
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import HeightSystemError, InputError, UsageError, named_by
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.bounds import area_fault, area_note
 from photoplan.geometry.crs import (
     canonical_crs,
@@ -36,13 +38,15 @@ from photoplan.io.camera.rpc.file import read_rpc, rpc_beside, rpc_in
 from photoplan.io.disk import make_parents, received
 from photoplan.io.files import ImageNames, check_input_name, crs_beside, relative_path, shortest_paths
 from photoplan.io.orientation.file import read_orientation
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, degrees_of
 from photoplan.io.project.file import parse_project, write_project
 from photoplan.io.project.model import TAGS, Image, ImageEntry, Project, RpcImage, StatedTerrain
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.terrain.model import ModelReader, is_terrain_model
+from photoplan.plain import pick
 from photoplan.products.plausibility import differences, on_map, stated_positions
 from photoplan.project.cameras import size_fault
+from photoplan.requests.project import InitRequest
 
 #: Names that are listed; the rest is counted.
 SHOWN = 5
@@ -135,45 +139,6 @@ def some(names: list[str]) -> str:
     return ", ".join(names[:SHOWN]) + more
 
 
-class Systems(Protocol):
-    """What is declared; `photoplan.products.init.InitRequest` tells of each."""
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the project."""
-        ...
-
-    @property
-    def terrain(self) -> str | None:
-        """Raster of heights, or one height."""
-        ...
-
-    @property
-    def crs(self) -> str | None:
-        """CRS of the project."""
-        ...
-
-    @property
-    def height_system(self) -> str | None:
-        """Of whatever does not state one."""
-        ...
-
-    @property
-    def terrain_crs(self) -> str | None:
-        """CRS of a terrain file that states none."""
-        ...
-
-    @property
-    def terrain_height_system(self) -> str | None:
-        """The terrain's alone."""
-        ...
-
-    @property
-    def orientation_height_system(self) -> str | None:
-        """The orientation's alone."""
-        ...
-
-
 @dataclass(frozen=True)
 class TerrainSource:
     """What a terrain file states of its systems."""
@@ -191,7 +156,7 @@ def _terrain_facts(file: Path) -> TerrainSource:
     return TerrainSource(info.path, info.crs, info.height_system)
 
 
-def terrain_entry(request: Systems) -> tuple[StatedTerrain | None, TerrainSource | None]:
+def terrain_entry(request: InitRequest) -> tuple[StatedTerrain | None, TerrainSource | None]:
     """The terrain entry (height system still open) and the facts of its file."""
     if request.terrain is None:
         return None, None
@@ -216,7 +181,7 @@ def terrain_entry(request: Systems) -> tuple[StatedTerrain | None, TerrainSource
 
 
 def project_crs(
-    request: Systems,
+    request: InitRequest,
     table: OrientationTable | None,
     terrain: TerrainSource | None,
     place: tuple[float, float] | None = None,
@@ -261,7 +226,7 @@ def _horizontal(text: str) -> str:
 
 
 def height_systems(
-    request: Systems, table: OrientationTable | None, terrain: TerrainSource | None, ellipsoidal: bool = False
+    request: InitRequest, table: OrientationTable | None, terrain: TerrainSource | None, ellipsoidal: bool = False
 ) -> tuple[str | None, str]:
     """Height systems of terrain and orientation (with that of control): as declared, else as the files state.
 
@@ -319,7 +284,7 @@ def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDAr
 
 
 def in_declared_unit(
-    request: Systems, table: OrientationTable | None, others: Sequence[Path]
+    request: InitRequest, table: OrientationTable | None, others: Sequence[Path]
 ) -> OrientationTable | None:
     """The orientation with heights in metres, by the unit of its file or of the height system declared for it."""
     own = None if table is None else table.height_system
@@ -398,58 +363,7 @@ def own_geometry(files: Iterable[Path], folder: Path, names: Mapping[Path, str])
 
 
 @dataclass(frozen=True)
-class InitRequest:
-    """What `photoplan init` is given; relative paths start at the current folder."""
-
-    folder: Path
-    """Folder of the project; `project.toml` is written into it."""
-    images: tuple[str, ...]
-    """Files, or patterns with ``*``, ``?`` and ``**``."""
-    camera: Path | None
-    """File with cameras: TOML, YAML or JSON; None: all images have rational polynomials."""
-    orientation: Path | None = None
-    """File with orientations, of any format of `photoplan.io.orientation.file`; None: the images are to be oriented."""
-    terrain: str | None = None
-    """Raster of heights, or one height in metres; None: it is added to the project before products are made."""
-    crs: str | None = None
-    """Projected CRS of the project; None: that of the orientation. Needed without one."""
-    height_system: str | None = None
-    """Declares whatever the files do not state: ellipsoidal, EPSG:nnnn, same."""
-    terrain_crs: str | None = None
-    """CRS of a terrain file that states none, such as an ASCII grid."""
-    terrain_height_system: str | None = None
-    """Declares the terrain's, also against what its file states."""
-    orientation_height_system: str | None = None
-    """Declares the orientation's, also against what its file states."""
-    form: TableFormat = field(default_factory=TableFormat)
-    """What the orientation file does not say of itself."""
-    format: str | None = None
-    """Format of the orientation file; None: by its content."""
-    earth_curvature: str | None = None
-    """none, correction or strict; None: strict for poses that were computed in true metres, else none."""
-    refraction: bool = False
-    """Whether image points are corrected for refraction."""
-    scene: str = "z < 0"
-    """Side of the image on which the scene lies in the camera system of the files, "z < 0" or "z > 0"."""
-    image_points: tuple[Path, ...] = ()
-    """Files of measured image points, for [observations]."""
-    control: tuple[Path, ...] = ()
-    """Files of ground points, for [observations]."""
-    positions: Path | None = None
-    """Table of observed projection centres, for [observations]."""
-    beyond_area: bool = False
-    """Whether places far outside the area of use of the CRS are meant."""
-    overwrite: bool = False
-    """Whether an existing project file is replaced."""
-
-    @property
-    def path(self) -> Path:
-        """The project file."""
-        return self.folder / "project.toml"
-
-
-@dataclass(frozen=True)
-class InitResult:
+class InitResult(Result):
     """A project that was made, and what did not fit together."""
 
     path: Path
@@ -462,14 +376,23 @@ class InitResult:
     unusable: tuple[str, ...] = ()
     """Why files could not be opened; they are left out."""
 
+    def json_fields(self) -> dict[str, Any]:
+        """Images and systems of the project, and what is left out."""
+        terrain, orientation = self.project.terrain, self.project.orientation
+        return {
+            "project": self.path,
+            "images": [image.name for image in self.project.images],
+            "crs": self.project.crs,
+            "height_systems": {
+                "terrain": terrain and terrain.height_system,
+                "orientation": orientation.height_system,
+            },
+            **pick(self, "without_orientation", "without_image"),
+        }
 
-def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line: None) -> InitResult:
-    """Make a project of the given files and write `project.toml`.
 
-    Parameters
-    ----------
-    talk : callable
-        Takes lines for the user: what was found and what was left out.
+def init_project(request: InitRequest, events: Events = SILENT) -> InitResult:
+    """Make a project of the given files and write `project.toml`; events get what was found and what was left out.
 
     Raises
     ------
@@ -483,7 +406,7 @@ def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     if (request.path.exists() or request.path.is_symlink()) and not request.overwrite:
         raise UsageError(f"{request.path} exists; give `overwrite` to replace it, or another folder")
     received(request.folder)
-    result = make_project(request, talk)
+    result = make_project(request, events)
     try:
         make_parents(request.folder)
     except OSError as error:
@@ -492,8 +415,9 @@ def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     return result
 
 
-def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line: None) -> InitResult:
-    """The project of the given files, without writing anything; see `init_project`."""
+def make_project(request: InitRequest, events: Events = SILENT) -> InitResult:
+    """Return the project of the given files, without writing anything; see `init_project`."""
+    talk = events.talk
     infos, unusable = _readable(image_files(request.images))
     files = list(infos)
     names = project_names(files)
@@ -553,7 +477,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     curvature = request.earth_curvature or "none"
     if request.earth_curvature is None and table is not None and table.cartesian:
         curvature = _in_true_metres(table, *systems, crs, np.array([p[0] for p in poses.values()], float), talk)
-    request = replace(request, earth_curvature=curvature)
+    request = request.replace(earth_curvature=curvature)
     project = _checked(request, terrain, *systems, crs, dict(used.values()), images)
     return InitResult(
         path=request.path,
@@ -585,8 +509,8 @@ def _in_true_metres(
     crs: str,
     centers: NDArray[np.float64],
     talk: Callable[[str], None],
-) -> str:
-    """The earth curvature of poses in true metres: strict, unless heights cannot be brought onto the ellipsoid."""
+) -> Literal["none", "strict"]:
+    """Return the earth curvature of poses in true metres: strict, unless heights do not reach the ellipsoid."""
     X, Y = centers[:, :2].mean(axis=0).tolist()
     scale = float(LocalFrame(crs, (X, Y)).scale(np.array([X, Y])))
     metre = f"1 m on the ground is {scale:.5f} m of the map"

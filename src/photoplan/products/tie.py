@@ -23,7 +23,7 @@ from photoplan.findings import Result, noted
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import lock_of
 from photoplan.io.files import ImageNames, fingerprint, read_text
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 from photoplan.io.points import read_observed_positions, write_image_points
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
@@ -172,7 +172,7 @@ def _positions(project_: Project, use: bool) -> dict[str, NDArray[np.float64]]:
     if not use or project_.observations.positions is None:
         return {}
     orientation = project_.orientation
-    form = TableFormat(angle_unit=orientation.angle_unit, rotation=orientation.rotation)
+    form = TableFormat.of(orientation.angle_unit, orientation.rotation)
     table = read_observed_positions(
         project_.resolve(project_.observations.positions),
         form,

@@ -1,5 +1,4 @@
-"""Requests of commands that orient images: fiducial marks, tie points, control from orthophotos, resection,
-adjustment."""
+"""Requests of commands that orient images: from the conversion of orientations to bundle adjustment."""
 
 from __future__ import annotations
 
@@ -8,7 +7,51 @@ from pathlib import Path
 from typing import Literal
 
 from photoplan.errors import UsageError
-from photoplan.request import DRY_RUN, IMAGES, ONE_WORKER, OVERWRITE, PICTURE, PROJECT, Request, arg, opt
+from photoplan.io.orientation.form import Direction, TableFormat
+from photoplan.request import BEYOND_AREA, DRY_RUN, IMAGES, ONE_WORKER, OVERWRITE, PICTURE, PROJECT, Request, arg, opt
+
+
+class ConvertRequest(Request):
+    """Options of the conversion of orientations."""
+
+    orientation: Path = arg("Orientation file, folder of a format with several files, or a project.")
+    target: str | None = opt("Format to write: csv, toml, patb, bingo, rpc (of a project) …", None, flag="to",
+                             metavar="FORMAT", section="result")  # fmt: skip
+    output: Path | None = opt("File to write, or folder of several [beside the input].", None, writes=True)
+    format: str | None = opt("Format of the orientation file [by its content].", None, metavar="FORMAT",
+                             section="input")  # fmt: skip
+    form: TableFormat = TableFormat()
+    camera: Path | None = opt("Cameras: TOML, YAML, JSON [the orientation's].", None, section="input")
+    crs: str | None = opt("CRS to write; declares that of a file that states none.", None, metavar="CRS",
+                          section="result")  # fmt: skip
+    camera_axes: Literal["up-back", "down-forward"] = opt(
+        "Camera axes y and z of the file; down-forward as in computer vision.", "up-back", section="input"
+    )
+    turned: int = opt(
+        "Angle by which images are turned against the camera axes of the file, counter-clockwise, degrees.",
+        0,
+        choices={"0": 0, "90": 90, "180": 180, "270": 270},
+        flag="image-turned",
+        section="input",
+    )
+    matrix: Direction | None = opt("Direction of written rotation matrices (patb, inpho).", None, section="result")
+    beyond_area: bool = BEYOND_AREA
+    drop_lens: bool = opt("Write cameras without a lens that the format cannot hold.", False, section="result")
+    list_readings: bool = opt("Only list the readings of the file that fit measured points.", False)
+    image_points: Path | None = opt("Measured image points for `list_readings`.", None, section="input")
+    control: Path | None = opt("Their ground points.", None, section="input")
+    dry_run: bool = opt("Print what would be written and what would be lost, and stop.", False, section="run")
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse a list of readings without points, and points without it."""
+        if self.list_readings and (self.image_points is None or self.control is None):
+            raise UsageError("`list_readings` needs `image_points` FILE and `control` FILE")
+        if not self.list_readings and self.target is None:
+            raise UsageError("say the format to write with `target` FORMAT")
+        if not self.list_readings and (self.image_points is not None or self.control is not None):
+            raise UsageError("`image_points` and `control` go with `list_readings`")
+
 
 _AUTO = {"auto": None, "yes": True, "no": False}
 #: A dry run that computes and draws all the same.

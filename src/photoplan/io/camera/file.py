@@ -20,7 +20,7 @@ from photoplan.io.files import explain, looks_like, read_head, read_toml
 from photoplan.io.orientation import colmap as orientation_colmap
 from photoplan.io.orientation import metashape as orientation_metashape
 from photoplan.io.orientation import pix4d as orientation_pix4d
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 
 _CAMERAS = TypeAdapter(dict[str, Camera])
 

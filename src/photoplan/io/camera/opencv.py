@@ -20,7 +20,7 @@ from photoplan.io.camera.model import CameraEntry
 from photoplan.io.files import finite, parse_yaml, read_head, read_json, read_text, unique_stems
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 
 MAX_BYTES = 1_000_000
 _COUNTS = (0, 4, 5, 8, 12, 14)

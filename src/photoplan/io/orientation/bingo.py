@@ -13,7 +13,7 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, name_losses, require_map
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 from photoplan.io.orientation.text import angle_block, angle_lines, word_lines
 
 KEYWORD = "ORIA"

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.camera.model import CameraEntry, IdealLens, UnusableCamera
-from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.form import Direction, TableFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage
 
 LossKind = Literal["lens", "camera", "film", "crs", "height_system", "other"]
 

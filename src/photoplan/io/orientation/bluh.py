@@ -12,7 +12,7 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, require_map
-from photoplan.io.orientation.table import TableFormat
+from photoplan.io.orientation.form import TableFormat
 from photoplan.io.orientation.text import angle_block, angle_lines, word_lines
 
 COLUMNS = 7
@@ -24,7 +24,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     """Block of a file; `form` only where it declares other conventions."""
     rows = []
     lines = word_lines(path)
-    if not form.declares_angle_unit:
+    if not form.declares("angle_unit"):
         raise InputError(
             f"{path}: no public description tells the unit of angles in files of BLUH; declare `angle_unit` gon, deg "
             "or rad (with measured points, `list_readings` tells which)"

@@ -11,7 +11,8 @@ from pathlib import Path
 from photoplan.errors import InputError
 from photoplan.io.files import crs_beside
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, require_map
-from photoplan.io.orientation.table import ANGLE_NAMES, OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import ANGLE_NAMES, OrientationTable, OrientedImage
 from photoplan.io.tables import NUMBER, Columns, Dialect, Table, csv_line, read_table
 
 #: Header names (in small letters) of every role.

@@ -10,7 +10,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.files import read_head
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
-from photoplan.io.orientation.table import OrientationTable, TableFormat
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import OrientationTable
 from photoplan.io.product import check_output
 from photoplan.io.store import together, write_atomically
 

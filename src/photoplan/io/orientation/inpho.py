@@ -37,8 +37,9 @@ from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.files import build, read_text
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation.form import Direction, TableFormat
 from photoplan.io.orientation.inpho_write import losses, render
-from photoplan.io.orientation.table import Direction, OrientationTable, TableFormat, posed
+from photoplan.io.orientation.table import OrientationTable, posed
 from photoplan.io.orientation.text import DIRECTIONS, checked_rotation, numbers
 from photoplan.io.tables import number
 
@@ -192,7 +193,7 @@ class _Pose:
 
 def _direction(poses: list[_Pose], file: _InphoFile, form: TableFormat, path: Path) -> tuple[Direction, str]:
     """What the matrices do: as declared, as the angles of `$INS` tell, or as MATCH-AT writes them; and the reason."""
-    if form.declares_direction:
+    if form.declares("direction"):
         return form.direction, ""
     unit = _ANGLE_UNITS.get((file.other.text("$ANGULAR_UNITS") or "deg").lower(), np.nan)
     angles = {}

@@ -13,7 +13,8 @@ import numpy as np
 from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry, InPixels
 from photoplan.io.orientation.block import Loss, OrientationBlock, common_losses, require_map
-from photoplan.io.orientation.table import Direction, OrientedImage
+from photoplan.io.orientation.form import Direction
+from photoplan.io.orientation.table import OrientedImage
 from photoplan.io.orientation.text import DIRECTIONS
 
 DEFAULT: Direction = "ground-to-camera"

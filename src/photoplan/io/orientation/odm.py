@@ -27,7 +27,8 @@ from photoplan.io.camera.model import CameraEntry
 from photoplan.io.files import finite, read_json
 from photoplan.io.lens_forms import opencv_form
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, posed
 
 #: Longest distance of the two positions of an image, metres; the same numbers differ by rounding only.
 _AGREE = 0.05

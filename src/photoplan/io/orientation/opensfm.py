@@ -42,7 +42,8 @@ from photoplan.io.orientation.block import (
     require_cameras,
     without_unusable,
 )
-from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import FLIP, OrientationTable, posed
 
 _Floats = NDArray[np.float64]
 

@@ -24,7 +24,8 @@ from photoplan.geometry.pose import rotation_opk
 from photoplan.geometry.units import metric_system
 from photoplan.io.files import read_text
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, posed
 from photoplan.io.orientation.text import numbers
 
 MAX_BYTES = 256 << 20

@@ -22,7 +22,8 @@ from photoplan.io.orientation.block import (
     name_losses,
     require_map,
 )
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat, posed
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, posed
 from photoplan.io.orientation.text import DIRECTIONS, Words, checked_rotation, numbers, one_word, word_lines
 from photoplan.io.tables import number
 
@@ -35,7 +36,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     lines = word_lines(path)
     if not lines:
         raise InputError(f"{path}: holds no image")
-    if not form.declares_direction:
+    if not form.declares("direction"):
         raise InputError(
             f"{path}: PATB does not say what its rotation matrix does; declare `rotation_direction` camera-to-ground "
             "or ground-to-camera (with measured points, `list_readings` tells which)"

@@ -25,7 +25,8 @@ from photoplan.io.camera.model import CameraEntry
 from photoplan.io.files import read_text, whole_number
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, posed
 from photoplan.io.orientation.text import checked_rotation, numbers
 
 MAX_BYTES = 1 << 30

@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import InputError
 from photoplan.geometry.bounds import odd_angles, odd_place
-from photoplan.geometry.pose import ANGLE_UNITS, ROTATION_ORDERS, angles_from_rotation, rotation_from_angles
+from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation, rotation_from_angles
 from photoplan.geometry.units import agreed_metres, metric_heights, metric_system, unit_label
+from photoplan.io.orientation.form import Direction
 
-Direction = Literal["camera-to-ground", "ground-to-camera"]
 #: By the letters that spell an order of rotations.
 ANGLE_NAMES = {"o": "omega", "p": "phi", "k": "kappa"}
 #: From camera axes x right, y down, z forwards to x right, y up, z backwards, and back.
@@ -25,61 +24,6 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 def angle_in_radians(value: NDArray[np.float64], unit: str) -> NDArray[np.float64]:
     """Angles of a unit (deg, gon, rad) in radians."""
     return value * (2 * np.pi / ANGLE_UNITS[unit])
-
-
-@dataclass(frozen=True)
-class TableFormat:
-    """What a table of numbers does not say of itself; checked at birth."""
-
-    columns: str | None = None
-    """None: the header names the columns. ``"name=Label,x=East,…"``: roles and header names. ``"name,x,y,z,…"``: roles
-    of the columns in their order, ``-`` for one that is not used; the table then needs no header."""
-    delimiter: Literal[",", ";", "\t", " "] | None = None
-    """None: the one that splits all lines equally."""
-    decimal_comma: bool = False
-    """Whether numbers are written 1,5 instead of 1.5."""
-    angle_unit: str = "deg"
-    """deg, gon or rad."""
-    rotation: str = "opk"
-    """Order of rotations, the first is the primary one. It is not the order of columns: each angle has its own."""
-    direction: Direction = "camera-to-ground"
-    """What the matrix of the angles does; ``ground-to-camera`` tables are transposed."""
-    declared: frozenset[str] = frozenset()
-    """Which of angle_unit, rotation and direction a user declared with the value that is the default here as well: a
-    file format with other conventions of its own then gives way."""
-
-    def conventions(self, angle_unit: str, rotation: str, direction: Direction) -> tuple[str, str, Direction]:
-        """Angle unit, rotation and direction for a format that defines its own: those, unless others are declared."""
-        return (
-            self.angle_unit if self.declares_angle_unit else angle_unit,
-            self.rotation if self._is_declared("rotation", "opk") else rotation,
-            self.direction if self.declares_direction else direction,
-        )
-
-    @property
-    def declares_angle_unit(self) -> bool:
-        """Whether a user declared the unit of angles."""
-        return self._is_declared("angle_unit", "deg")
-
-    @property
-    def declares_direction(self) -> bool:
-        """Whether a user declared what the rotation does."""
-        return self._is_declared("direction", "camera-to-ground")
-
-    def _is_declared(self, name: str, default: str) -> bool:
-        return name in self.declared or getattr(self, name) != default
-
-    def __post_init__(self) -> None:
-        if self.angle_unit not in ANGLE_UNITS:
-            raise UsageError(f"angle unit {self.angle_unit!r}; allowed are {', '.join(ANGLE_UNITS)}")
-        if self.rotation not in ROTATION_ORDERS:
-            raise UsageError(f"rotation {self.rotation!r}; allowed are {', '.join(ROTATION_ORDERS)}")
-        if self.direction not in ("camera-to-ground", "ground-to-camera"):
-            raise UsageError(f"rotation direction {self.direction!r}; allowed are camera-to-ground, ground-to-camera")
-        if self.delimiter not in (None, ",", ";", "\t", " "):
-            raise UsageError(f"delimiter {self.delimiter!r}; allowed are comma, semicolon, tab and space")
-        if self.delimiter == "," and self.decimal_comma:
-            raise UsageError("a comma cannot be both delimiter and decimal sign")
 
 
 @dataclass(frozen=True)

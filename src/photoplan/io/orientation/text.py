@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import InputError
 from photoplan.io.files import read_text
 from photoplan.io.orientation.block import OrientationBlock
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage
 from photoplan.io.tables import number
 
 MAX_BYTES = 200_000_000

@@ -18,7 +18,8 @@ from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import Fiducials, Name, Pixels, Triple
 from photoplan.io.files import explain, read_toml
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, require_map
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage
 from photoplan.io.project.file import camera_lines, toml_value
 from photoplan.io.project.model import Orientation
 

@@ -16,7 +16,8 @@ from photoplan.geometry.bounds import area_note
 from photoplan.geometry.pose import ANGLE_UNITS, Pose, angles_from_rotation
 from photoplan.io.files import ImageNames, match_key
 from photoplan.io.orientation.exif import image_files
-from photoplan.io.orientation.table import TableFormat, angle_in_radians
+from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.points import (
     PositionTable,
     is_gcp_list,
@@ -305,7 +306,7 @@ def _positions(project: Project, names: Sequence[str], notes: list[str]) -> Posi
     if project.observations.positions is None:
         return None
     orientation = project.orientation
-    form = TableFormat(angle_unit=orientation.angle_unit, rotation=orientation.rotation)
+    form = TableFormat.of(orientation.angle_unit, orientation.rotation)
     table = read_observed_positions(
         project.resolve(project.observations.positions), form, crs=project.crs, height_system=orientation.height_system
     )
