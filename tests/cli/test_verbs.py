@@ -28,6 +28,7 @@ class Outer(Request):
     output: Path = opt("Raster to write.", metavar="TIF", writes=True)
     method: Literal["d8", "dinf"] = opt("How areas are summed.", "d8")
     bounds: tuple[float, float, float, float] | None = opt("Part.", None, section="input")
+    scene: bool | None = opt("Side of the scene.", None, choices={"auto": None, "z<0": True})
     classes: tuple[float, ...] = opt("Limits.", (), listed=True, metavar="A,B")
     header: bool = opt("The first line is a point.", True, flag="no-header")
     inner: Inner = Inner()
@@ -85,18 +86,26 @@ def test_options_of_the_command_come_from_the_fields() -> None:
         "--classes",
         "20",
         "--no-header",
+        "--scene",
+        "z<0",
         "--width",
         "3",
     ]
     command.main(words, standalone_mode=False)
     assert made["request"] == Outer(
-        "m.tif", output="o.tif", bounds=(1, 2, 3, 4), classes=(5, 10, 20), header=False, inner=Inner(width=3)
+        "m.tif",
+        output="o.tif",
+        bounds=(1, 2, 3, 4),
+        scene=True,
+        classes=(5, 10, 20),
+        header=False,
+        inner=Inner(width=3),
     )
     text = command.get_help(command.make_context("outer", ["m", "-o", "o"]))
     titles = [line for line in text.splitlines() if line.rstrip(":") in ("Input", "Result", "Method", "Run")]
     assert titles == ["Input:", "Result:", "Method:", "Run:"]
     assert text.index("Input:") < text.index("--bounds") < text.index("Result:") < text.index("--output")
-    assert "[d8|dinf]" in text and "[default: d8]" in text
+    assert "[d8|dinf]" in text and "[default: d8]" in text and "--scene [auto|z<0]" in text
 
 
 @pytest.mark.parametrize(

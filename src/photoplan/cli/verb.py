@@ -245,7 +245,7 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     kind: Any = click.Choice(choices) if choices else BYTES if how.get("size") else hint
     if hint is Path:
         kind = NEW_FOLDER if how.get("folder") else PROJECT if how.get("project") else PATH
-    if isinstance(more.get("callback"), partial):
+    if isinstance(more.get("callback"), partial) and not choices:
         kind = str
     if how.get("argument"):
         if more.pop("multiple", False):
