@@ -23,6 +23,7 @@ CASES: dict[str, dict[str, Any]] = {
     "small steps": {"strips": 3, "along": 4, "seed": 6, "steps": 0.05, "haze": 0.02},
     "one slope in all images": {"strips": 2, "along": 10, "seed": 7, "shared_haze": 0.06},
     "one slope over the ground": {"strips": 2, "along": 10, "seed": 8, "shared_haze": 0.06, "turned": True},
+    "a steep slope over the ground": {"strips": 2, "along": 10, "seed": 33, "shared_haze": 0.2, "turned": True},
     "curves": {"strips": 3, "along": 3, "seed": 9, "gammas": 0.25},
     "no steps": {"strips": 1, "along": 8, "seed": 10, "steps": 0.0, "haze": 0.03},
     "no fall-off": {"strips": 2, "along": 3, "seed": 11, "fall_off": 0.0, "steps": 0.1},

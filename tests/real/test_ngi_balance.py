@@ -87,11 +87,12 @@ def test_overlaps_after_are_those_of_tables_without_a_prior(shared: Path, tmp_pa
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="15.0, 11.7, 8.8 where 13.7, 10.7, 8.4 are raw: missed, see docs/status.md")
 def test_balanced_colours_are_nearer_to_those_of_a_satellite(shared: Path, tmp_path: Path) -> None:
-    """Independent of all that was adjusted. The slope over the ground that all images have is held too tightly."""
+    """Independent of all that was adjusted."""
     satellite = shared / "data" / "ngi_dmc" / "ref" / "sentinel2_b432_byte.tif"
     project = dmc_project(shared, tmp_path / "plain")
     plain = beside_satellite(project, satellite)
     balance_project(BalanceRequest(project, workers=2))
-    assert (beside_satellite(project, satellite) < 0.95 * plain).all()
+    even = beside_satellite(project, satellite)
+    print(plain, even)
+    assert (even < 0.95 * plain).all()

@@ -15,6 +15,8 @@ from scipy.spatial import cKDTree
 from photoplan.adjustment.least_squares import MEDIAN_1D, cauchy
 from photoplan.radiometry.equations import (
     COUNTS,
+    GROUND,
+    STEEP,
     Band,
     BandState,
     Basis,
@@ -74,6 +76,8 @@ class AdjustedBand:
     """Errors of all unknowns, (unknowns, k): their sum of squares over k is the variance."""
     prior_errors: _Floats
     """The same if there were no observations, (unknowns, k)."""
+    evidence: float
+    """Logarithm of the observations' probability under the prior (Laplace's approximation), but for a constant."""
     curve_last: bool = True
     """Whether curves act after trends."""
     relative: bool = False
@@ -146,11 +150,12 @@ def adjust(band: Band, gauge: Gauge, prior: Prior, *, judged: bool = True) -> Ad
         if rounds <= _COMPONENTS:
             prior = _with_components(prior, solved, P, wanted, component, state.vector)
     weights = _weigh(band, state, robust, gauge.fixed is None)
+    known = Solved.of(csr_array(P.T @ P), H)
     errors, before = np.zeros((2, state.vector.size, 0))
     if judged:
         drawn = P.T @ np.random.default_rng(0).normal(size=(P.shape[0], _DRAWS)) / np.sqrt(_DRAWS)
         errors = np.concatenate([_without_parts(band, state, weights, solved, N), solved.step(drawn, 0.0)], axis=1)
-        before = Solved.of(csr_array(P.T @ P), H).step(drawn, 0.0)
+        before = known.step(drawn, 0.0)
     return AdjustedBand(
         state=state,
         sigma=weights.sigma,
@@ -159,9 +164,19 @@ def adjust(band: Band, gauge: Gauge, prior: Prior, *, judged: bool = True) -> Ad
         prior=prior,
         errors=errors,
         prior_errors=before,
+        evidence=_evidence(band, state, weights, known, Solved.of(found.N + P.T @ P, H))
+        + prior.log_density
+        - float(np.square(wanted - P @ state.vector).sum()) / 2,
         curve_last=band.curve_last,
         relative=band.curve_last and gauge.fixed is None and not band.referred,
     )
+
+
+def _evidence(band: Band, state: BandState, weights: _Weights, known: Solved, solved: Solved) -> float:
+    """Logarithm of the probability of the observations given the prior's equations `known`, beside its own terms."""
+    residual, count = band.grey - band.predicted(state)[0], float(band.weight.sum()) / _CORRELATED
+    misfit = float((weights.of * residual**2).sum()) / 2 + count * float(np.log(weights.sigma))
+    return (known.log_determinant - solved.log_determinant) / 2 - misfit
 
 
 def _with_components(
@@ -446,7 +461,6 @@ def balanced(
     place = None if fixed is None else int(np.flatnonzero(images == fixed)[0])
     inner = _thinned(inner)
     nodes = np.linspace(*limits, NODES)
-    found: list[tuple[AdjustedBand, AdjustedBand]] = []
     bands: list[AdjustedBand] = []
     modes: tuple[BlockMode, ...] = ()
     if factor:
@@ -462,19 +476,24 @@ def balanced(
         )
         turns, middles = placed(inner, sizes[images], len(images))
 
-        def fitted(band: int, last: bool, judged: bool) -> AdjustedBand:
+        def fitted(band: int, last: bool, ground: float, judged: bool = False) -> AdjustedBand:
             equations = replace(Band.of(inner, band, sizes[images], basis, nodes), curve_last=last)
-            prior = Prior(
-                basis=basis, nodes=nodes, level=_level(equations), cameras=kinds.reshape(-1), parts=parts, turns=turns
-            )
+            prior = Prior(basis, nodes, _level(equations), kinds.reshape(-1), parts, turns, ground=ground)
             return adjust(equations, Gauge(parts, place), prior, judged=judged)
 
+        tried: dict[float, list[tuple[AdjustedBand, AdjustedBand]]] = {GROUND: [], STEEP: []}
         for band in range(cells.bands):
-            found.append((fitted(band, False, False), fitted(band, True, True)))
+            for ground, fits in tried.items():
+                fits.append((fitted(band, False, ground), fitted(band, True, ground)))
             done()
-        misfits = np.log([[each.sigma for each in both] for both in found]).mean(axis=0)
-        if misfits[0] < misfits[1] - _LESS:
-            found = [(last, fitted(band, False, True)) for band, (_, last) in enumerate(found)]
+        evidence = [[[each.evidence for each in both] for both in fits] for fits in tried.values()]
+        usual, steep = np.sum(evidence, axis=1)
+        # Curves that act in the other order than assumed look like a slope: it must be likelier under both orders.
+        ground = STEEP if (steep > usual).all() else GROUND
+        misfits = np.log([[each.sigma for each in both] for both in tried[ground]]).mean(axis=0)
+        last = bool(misfits[0] >= misfits[1] - _LESS)
+        others = [first if last else second for first, second in tried[ground]]
+        found = [(other, fitted(band, last, ground, judged=True)) for band, other in enumerate(others)]
         bands = [chosen for _, chosen in found]
         made = [
             [_tone(nodes, each, k, parts, degree, (int(size[0]), int(size[1]))) for each in bands]

@@ -179,9 +179,11 @@ _BEND, _SLOPE = 0.02, 1.0
 #: brightness, terms at the corner of the image. They count as so many observations.
 _FIRST, COUNTS = (0.10, 0.03, 0.02, 0.01, 0.01), 4.0
 _BOUNDS = ((0.01, 1.0), (0.002, 0.3), (0.002, 0.3), (0.002, 0.2), (0.002, 0.2))
-#: Standard deviations of the fall-off's radial terms r², r⁴, r⁶, of its other terms of degree 1 to 4, of the slope over
-#: the ground that all images have, and of an image's departure from radial terms above its own degree.
-_RADIAL, _OTHER, GROUND, _TIED = (0.5, 0.3, 0.2), (0.01, 0.01, 0.005, 0.005), 0.03, 0.002
+#: Standard deviations of the fall-off's radial terms r², r⁴, r⁶, of its other terms of degree 1 to 4, and of an image's
+#: departure from radial terms above its own degree.
+_RADIAL, _OTHER, _TIED = (0.5, 0.3, 0.2), (0.01, 0.01, 0.005, 0.005), 0.002
+#: Standard deviations of the slope over the ground that all images have: usual, and where the sun brightens one side.
+GROUND, STEEP = 0.03, 0.2
 #: Of the mean exposure beside the gauge.
 _LEVEL = 1.0
 
@@ -244,6 +246,8 @@ class Prior:
     """(images, 2, 2): slopes over the image that a slope over the ground (east, north) becomes."""
     sigmas: tuple[float, ...] = _FIRST
     """Standard deviations of the exposure and of the images' own terms of degree 1 to 4."""
+    ground: float = GROUND
+    """Standard deviation of the slope over the ground that all images have."""
 
     @property
     def common(self) -> int:
@@ -285,7 +289,7 @@ class Prior:
         for camera in range(int(self.cameras.max()) + 1):
             blocks.append((first + camera * terms + np.arange(terms), known, np.zeros(terms), np.full(terms, -1)))
         loose = np.arange(slope_at, first + self.common)
-        weak = np.diag(np.r_[np.full(2, 1 / GROUND), np.full(len(loose) - 2, 1 / _LEVEL)])
+        weak = np.diag(np.r_[np.full(2, 1 / self.ground), np.full(len(loose) - 2, 1 / _LEVEL)])
         blocks.append((loose, weak, np.zeros(len(loose)), np.full(len(loose), -1)))
         columns = np.concatenate([np.tile(at, len(A)) for at, A, _, _ in blocks])
         counts = np.concatenate([np.full(len(A), len(at)) for at, A, _, _ in blocks])
@@ -304,6 +308,12 @@ class Prior:
         for half, sigma in enumerate(_RADIAL, 1):
             covariance += sigma**2 * np.outer(self.basis.radial(half), self.basis.radial(half))
         return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T)
+
+    @property
+    def log_density(self) -> float:
+        """Logarithm of the density of the variance components before observations, but for a constant."""
+        s = np.array(self.sigmas)
+        return float(-COUNTS * (np.log(s) + np.square(_FIRST / s) / 2).sum())
 
     def updated(self, squares: _Floats, counts: _Floats) -> tuple[float, ...]:
         """Return standard deviations from the expected squares of the rows of each component."""
@@ -430,6 +440,14 @@ class Solved:
             return cls(factor, H, H.T)
         W = factor.solve(np.ascontiguousarray(H.T))
         return cls(factor, H, np.linalg.solve(H @ W, W.T).T)
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of N where the conditions leave the unknowns free, but for a constant."""
+        whole = float(np.log(np.abs(self.factor.U.diagonal())).sum())
+        if not len(self.H):
+            return whole
+        return whole + float(np.linalg.slogdet(self.H @ self.factor.solve(np.ascontiguousarray(self.H.T)))[1])
 
     def step(self, g: _Floats, missing: _Floats | float) -> _Floats:
         """Solutions for right sides (unknowns,) or (unknowns, k) that fulfil the conditions."""
