@@ -62,7 +62,7 @@ __getattr__, __dir__, __all__ = public(
         "products.mtf.patterns": "MtfRequest measure_mtf",
         "products.sensor": "SensorRequest describe_sensor",
         "products.characterise.run": "CharacteriseRequest characterise",
-        "products.simulate": "SimulateRequest simulate SceneRequest simulate_project",
+        "products.simulate": "SimulateRequest simulate",
         "products.dtm.build": "BuildRequest dtm_build RefineRequest dtm_refine",
         "products.dtm.lines": "SampleRequest dtm_sample ProfileRequest dtm_profile ContourRequest make_contours",
         "products.dtm.analyses": "VolumeRequest dtm_volume VisibleRequest dtm_visible FlowRequest dtm_flow",

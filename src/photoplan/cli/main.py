@@ -226,7 +226,16 @@ VERBS: dict[str, str | Verb] = {
         figures_first=True,
         files="written",
     ),
-    "simulate": "Form an image of a scene with blur, noise, jitter …",
+    "simulate": Verb(
+        "Form an image of a scene with blur, noise, jitter …",
+        """Form images of a scene with blur, noise, jitter, blooming and all else that a camera does.
+
+        SCENE is an image file, or a pattern: flat, edge:ANGLE, bars:PERIOD,ANGLE, star:SECTORS, wedge:STEPS or
+        discs:PITCH,DIAMETER. With --scene it is the terrain and the objects of a project, as its cameras see them.
+        """,
+        "requests.quality:SimulateRequest",
+        "products.simulate:simulate",
+    ),
     "info": "Show what a raster, project, plan or run record holds.",
     "demo": "Make the orthophotos of the included real block.",
 }

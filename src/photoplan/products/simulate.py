@@ -18,6 +18,7 @@ from photoplan.cameras.base import Camera
 from photoplan.engine.run import Steps, Store, steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted
 from photoplan.geometry.grid import MapGrid, Placement, Window
 from photoplan.io.camera.model import Entry, Number
 from photoplan.io.disk import make_folder
@@ -37,6 +38,7 @@ from photoplan.quality.formation.model import MOST_PIXELS, FormedFrame, ImageMod
 from photoplan.quality.formation.parts import Quantisation
 from photoplan.quality.formation.rendered import RenderedScene
 from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, parse_pattern
+from photoplan.requests.quality import SimulateRequest
 
 #: A description with a table of defects for every element of a large sensor stays below.
 _MAX_BYTES = 20_000_000
@@ -165,8 +167,8 @@ _BITS = {"uint8": 8, "uint16": 16}
 
 
 @dataclass(frozen=True)
-class SimulateReport:
-    """What was made, or would be."""
+class SimulateReport(Result):
+    """Images of a file or a pattern that were made, or would be."""
 
     images: tuple[SimulatedImage, ...]
     size: tuple[int, int]
@@ -178,7 +180,7 @@ class SimulateReport:
     record: Path | None
 
     def json_fields(self) -> dict[str, Any]:
-        """The images with what is known of each."""
+        """Return the images with what is known of each."""
         images = [{**pick(i, "path", "frame", "exposure", automatic_gain="gain"), **i.facts} for i in self.images]
         mtf50 = dict(zip("xy", self.mtf50))
         return {
@@ -186,6 +188,19 @@ class SimulateReport:
             "images": images,
             "model_mtf50": mtf50,
         }
+
+    def written(self) -> list[Path]:
+        """Return the images."""
+        return [image.path for image in self.images]
+
+    def messages(self) -> list[str]:
+        """Return the form of the images, the sharpness of the model, and notes."""
+        along = " ".join(f"{axis} {value:.4f}" for axis, value in zip("xy", self.mtf50))
+        line = (
+            f"{len(self.images)} images of {self.bands} × {self.size[0]} × {self.size[1]} pixels, {self.dtype} · MTF50 "
+            f"of the model: {along} cycles per pixel"
+        )
+        return [line, *noted(self.notes)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,8 +286,6 @@ def stated_model(path: Path | None, seed: int | None, dtype: str | None) -> tupl
     """The model of a file with another seed and type of pixels, where these are given, and the type of the files."""
     model = ImageModel() if path is None else read_model(path)
     if seed is not None:
-        if not 0 <= seed < 2**62:
-            raise UsageError(f"seed {seed}; a whole number from 0 on is needed")
         model = dataclasses.replace(model, seed=seed)
     if model.quantisation is None and dtype in _BITS:
         model = dataclasses.replace(model, quantisation=Quantisation(_BITS[dtype]))
@@ -310,39 +323,6 @@ def _notes(images: list[SimulatedImage]) -> list[str]:
     if lost > 0.5:
         notes.append(f"charge that overflowed beyond the border: up to {lost:.0f} electrons")
     return notes
-
-
-_MOST_FRAMES = 10_000
-
-
-@dataclass(frozen=True)
-class SimulateRequest:
-    """What is asked."""
-
-    scene: str
-    """An image file, or a pattern such as ``edge:5``."""
-    model: Path | None = None
-    """Description of the model; None: nothing happens to the scene but sampling."""
-    output: Path | None = None
-    """File; with several frames their number is added to the name. None: made from the scene's name, here."""
-    frames: int = 1
-    seed: int | None = None
-    """In place of the model's."""
-    exposure: tuple[float, ...] = ()
-    """One for all frames or one for each; 1 if empty."""
-    size: tuple[int, int] | None = None
-    """Of a pattern; 512 × 512 if not given."""
-    levels: tuple[float, float] | None = None
-    """Dark and bright of a pattern; 0 and 1 if not given."""
-    phase: tuple[float, float] | None = None
-    """Place of a pattern; the image's middle if not given."""
-    oversampling: int | None = None
-    """Cells of the scene along a side of a pixel; 1 for files, 8 for patterns if not given."""
-    dtype: str | None = None
-    """Of the files: uint8, uint16 or float32; None: as the model's quantisation says, else float32."""
-    workers: int = 1
-    overwrite: bool = False
-    dry_run: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,29 +375,39 @@ class FileScene:
         return np.pad(values, ((0, 0), (before[0], after[0]), (before[1], after[1])), mode="edge")
 
 
-def simulate(request: SimulateRequest, events: Events = SILENT) -> SimulateReport:
-    """Form images of a scene and write them.
+def simulate(request: SimulateRequest, events: Events = SILENT) -> SimulateReport | SceneReport:
+    """Form images of a scene, or of all images of a project, and write them.
 
     Raises
     ------
     UsageError
-        Options contradict each other, or an output exists.
+        Options contradict each other, or an output exists that this very command has not made, or all of them do.
     InputError
-        Scene or model cannot be used.
+        Scene, project, texture or model cannot be used.
+    GeometryError
+        An image of a project has nothing to look at.
     """
+    report = _simulate_project(request, events) if request.scene is None else _simulate_scene(request, events)
+    if request.dry_run:
+        events.talk("dry run: nothing was written")
+    return report
+
+
+def _simulate_scene(request: SimulateRequest, events: Events) -> SimulateReport:
+    name = str(request.scene)
     model, dtype = stated_model(request.model, request.seed, request.dtype)
     scene = _scene(request, model)
     exposures = _exposures(request)
     settings = {
         "model": model,
-        "scene": Path(request.scene).name,
+        "scene": Path(name).name,
         "size": scene.size,
         "oversampling": scene.oversampling,
     }
     masked = isinstance(scene, FileScene) and scene.reader.info.has_mask
     forming = Forming(
         kind="simulated images",
-        name=Path(request.scene).name,
+        name=Path(name).name,
         scene=scene,
         model=model,
         dtype=dtype,
@@ -433,17 +423,16 @@ def simulate(request: SimulateRequest, events: Events = SILENT) -> SimulateRepor
 
 
 def _scene(request: SimulateRequest, model: ImageModel) -> LightScene:
-    pattern = parse_pattern(request.scene)
+    name = str(request.scene)
+    pattern = parse_pattern(name)
     k = request.oversampling
     scene: LightScene
     if pattern is None:
         if request.size is not None or request.levels is not None or request.phase is not None:
             raise UsageError(f"`size`, `levels` and `phase` are for patterns ({', '.join(PATTERNS)}), not for files")
-        if not Path(request.scene).exists() and ":" in request.scene:
-            raise UsageError(
-                f"scene {request.scene!r}: no such file, and no pattern; patterns are {', '.join(PATTERNS)}"
-            )
-        scene = FileScene(RasterReader(Path(request.scene)), k or 1)
+        if not Path(name).exists() and ":" in name:
+            raise UsageError(f"scene {name!r}: no such file, and no pattern; patterns are {', '.join(PATTERNS)}")
+        scene = FileScene(RasterReader(Path(name)), k or 1)
     else:
         bands = max((each.band for each in model.lateral), default=1)
         scene = PatternScene(
@@ -455,15 +444,13 @@ def _scene(request: SimulateRequest, model: ImageModel) -> LightScene:
             phase=request.phase or (0.0, 0.0),
             bands=bands,
         )
-    check_fit(scene, request.scene, model, request.model)
+    check_fit(scene, name, model, request.model)
     if isinstance(scene, FileScene) and not scene.has_values:
-        raise InputError(f"{request.scene}: not one pixel has a value; nothing can be imaged, give another file")
+        raise InputError(f"{name}: not one pixel has a value; nothing can be imaged, give another file")
     return scene
 
 
 def _exposures(request: SimulateRequest) -> list[float]:
-    if not 1 <= request.frames <= _MOST_FRAMES:
-        raise UsageError(f"{request.frames} frames; allowed are 1 to {_MOST_FRAMES}")
     given = request.exposure or (1.0,)
     if any(not np.isfinite(e) or e < 0.0 for e in given):
         raise UsageError(f"exposures {given}; none may be negative")
@@ -477,8 +464,8 @@ def _output(request: SimulateRequest) -> Path:
         if request.output.suffix.lower() not in (".tif", ".tiff"):
             raise UsageError(f"{request.output}: images are written as TIFF; give a name that ends in .tif")
         return request.output
-    pattern = parse_pattern(request.scene)
-    stem = Path(request.scene).stem if pattern is None else pattern[0]
+    pattern = parse_pattern(str(request.scene))
+    stem = Path(str(request.scene)).stem if pattern is None else pattern[0]
     return Path(f"{stem}_simulated.tif")
 
 
@@ -493,7 +480,7 @@ def _paths(request: SimulateRequest) -> list[Path]:
 
 def _inputs(request: SimulateRequest) -> list[Path]:
     """Files that decide what is formed."""
-    scene = [] if parse_pattern(request.scene) is not None else [Path(request.scene)]
+    scene = [] if parse_pattern(str(request.scene)) is not None else [Path(str(request.scene))]
     return scene + ([] if request.model is None else [request.model])
 
 
@@ -559,41 +546,8 @@ _ORTHO = "true_orthophoto.tif"
 
 
 @dataclass(frozen=True)
-class SceneRequest:
-    """What is asked."""
-
-    project: Path
-    """Terrain, objects, and oriented images; their files need not be there."""
-    images: tuple[str, ...] = ()
-    """Names or patterns; all if empty."""
-    output: Path | None = None
-    """Folder of the images; None: `rendered` beside the project."""
-    model: Path | None = None
-    """Description of the camera; None: light is sampled, nothing else."""
-    texture: Path | None = None
-    """Raster of the ground's colours; None: a pattern."""
-    grain: float | None = None
-    """Shortest wavelength of the pattern, metres; None: eight ground pixels of the first image."""
-    truth: bool = False
-    """Whether a raster beside each image says what its pixels show."""
-    resolution: float | None = None
-    """Of a true orthophoto of the scene, metres; None: there is none."""
-    bounds: tuple[float, float, float, float] | None = None
-    """Of the true orthophoto; None: those of the terrain."""
-    seed: int | None = None
-    """In place of the model's."""
-    oversampling: int | None = None
-    """Rays along a side of a pixel; None: 2."""
-    dtype: str | None = None
-    """Of the images; None: as the model's quantisation says, else uint8."""
-    workers: int = 1
-    overwrite: bool = False
-    dry_run: bool = False
-
-
-@dataclass(frozen=True)
-class SceneReport:
-    """What was made, or would be."""
+class SceneReport(Result):
+    """Images of a project that were made, or would be."""
 
     images: tuple[SimulateReport, ...]
     """One for each image that was made now."""
@@ -605,7 +559,7 @@ class SceneReport:
     """Shortest wavelength of the pattern, metres."""
 
     def json_fields(self) -> dict[str, Any]:
-        """The images with what is known of each, and all other files."""
+        """Return the images with what is known of each, and all other files."""
         images = [
             {**image, **pick(report, "size", "bands", "dtype", "notes", run_record="record")}
             for report in self.images
@@ -613,26 +567,22 @@ class SceneReport:
         ]
         return {"images": images, **pick(self, "rasters", "kept", grain_m="grain")}
 
+    def written(self) -> list[Path]:
+        """Return images and rasters."""
+        return [*(path for each in self.images for path in each.written()), *self.rasters]
 
-def simulate_project(request: SceneRequest, events: Events = SILENT) -> SceneReport:
-    """Render images of a project and write them.
+    def messages(self) -> list[str]:
+        """Return the messages of each image, and the pattern's finest wave."""
+        kept = f" · {len(self.kept)} files of an earlier run kept" if self.kept else ""
+        lines = [line for each in self.images for line in each.messages()]
+        return [*lines, f"finest wave of the pattern: {self.grain:g} m{kept}"]
 
-    Raises
-    ------
-    UsageError
-        An option makes no sense, or an output exists that this very command has not made, or all of them do.
-    InputError
-        Project, texture or model cannot be used.
-    GeometryError
-        An image has nothing to look at.
-    """
+
+def _simulate_project(request: SimulateRequest, events: Events) -> SceneReport:
+    assert request.project is not None
     project = load_project(request.project)
     names = project.select(request.images or None)
-    if request.bounds is not None and request.resolution is None:
-        raise UsageError("`bounds` are those of the true orthophoto; give its `resolution`, too")
     grain = two_figures(_GRAIN * ground_pixel(project)) if request.grain is None else request.grain
-    if not 0 < grain < float("inf"):
-        raise UsageError(f"grain {grain}; a positive number of metres is needed")
     works = list(_works(request, project, names, grain, events))
     kept, todo = _divided(works, project, request.overwrite)
     images: list[SimulateReport] = []
@@ -649,12 +599,12 @@ def simulate_project(request: SceneRequest, events: Events = SILENT) -> SceneRep
     return SceneReport(tuple(images), tuple(rasters), tuple(kept), grain)
 
 
-def _folder(request: SceneRequest, project: Project) -> Path:
+def _folder(request: SimulateRequest, project: Project) -> Path:
     return request.output or project.folder / "rendered"
 
 
 def _works(
-    request: SceneRequest, project: Project, names: Sequence[str], grain: float, events: Events
+    request: SimulateRequest, project: Project, names: Sequence[str], grain: float, events: Events
 ) -> Iterator[Forming | TruthRaster]:
     """All that is asked for."""
     model, dtype = stated_model(request.model, request.seed, request.dtype)

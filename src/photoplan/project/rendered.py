@@ -126,7 +126,7 @@ class ProjectScene:
 
     @classmethod
     def of(cls, project: Project, raster: Path | None, grain: float, seed: int, oversampling: int) -> ProjectScene:
-        """The scene of a project; arguments as those of `SceneRequest`."""
+        """The scene of a project; arguments as those of `SimulateRequest`."""
         other = SolidTexture(grain, seed)
         texture = other if raster is None else DrapedTexture.of(raster, project.crs, other)
         return cls(project, texture, ground_of(project), oversampling)

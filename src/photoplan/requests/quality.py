@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator
 
 from photoplan.errors import UsageError
-from photoplan.request import DRY_RUN, MEMORY, ONE_WORKER, OVERWRITE, Request, arg, opt
+from photoplan.request import BOUNDS, DRY_RUN, IMAGES, MEMORY, ONE_WORKER, OVERWRITE, Request, arg, opt
 
 REPORT: Any = opt("Report with plots to write.", None, metavar="HTML", writes=True)
 
@@ -155,6 +155,56 @@ class RestoreRequest(Request):
     def files_read(self) -> list[Path]:
         """Return images, filter, corrections and tables."""
         return [*super().files_read(), *table_of(self.linearisation)]
+
+
+class SimulateRequest(Request):
+    """Options of images that are formed of a file, a pattern or a project by a described camera."""
+
+    scene: str | None = arg("Image file, or a pattern such as edge:5.", default=None, metavar="[SCENE]")
+    project: Path | None = opt("Render the images of a project from its terrain and objects.", None, flag="scene",
+                               metavar="PROJECT", project=True, section="input")  # fmt: skip
+    model: Path | None = opt("Description of the camera [changes nothing].", None, metavar="FILE", section="input")
+    output: Path | None = opt(
+        "TIFF to write [SCENE_simulated.tif]; folder for the images of a project [rendered, in its folder].", None,
+        metavar="PATH", writes=True,
+    )  # fmt: skip
+    images: tuple[str, ...] = IMAGES
+    texture: Path | None = opt("Raster of the ground's colours [a pattern].", None, metavar="FILE", section="input")
+    grain: float | None = opt("Finest wave of the pattern, metres [8 ground pixels].", None, gt=0, metavar="M")
+    truth: bool = opt("Write X, Y, Z and object of each pixel, too: NAME_truth.tif.", False, section="result")
+    resolution: float | None = opt("Ground pixel of a true orthophoto of the scene to write, too, metres [none].", None,
+                                   metavar="R", section="result")  # fmt: skip
+    bounds: tuple[float, float, float, float] | None = BOUNDS
+    frames: int = opt("Number of images to form, in numbered files.", 1, ge=1, le=10_000)
+    seed: int | None = opt("Seed of all that is random [the model's, else 0].", None, ge=0, lt=2**62)
+    exposure: tuple[float, ...] = opt("Factor of light and time; once, or once for each frame [1].", (),
+                                      metavar="FACTOR")  # fmt: skip
+    size: tuple[int, int] | None = opt("Size of a pattern, pixels [512 512].", None, metavar="WIDTH HEIGHT")
+    levels: tuple[float, float] | None = opt("Values of a pattern [0 1].", None, metavar="DARK BRIGHT")
+    phase: tuple[float, float] | None = opt("Pixels by which a pattern is moved from the middle [0 0].", None,
+                                            metavar="X Y")  # fmt: skip
+    oversampling: int | None = opt(
+        "Cells of the scene along a side of a pixel [files 1, patterns 8, projects 2].", None, ge=1, le=64
+    )
+    dtype: Literal["uint8", "uint16", "float32"] | None = opt("Type of the files [as the model states].", None,
+                                                              section="result")  # fmt: skip
+    dry_run: bool = DRY_RUN
+    workers: int = ONE_WORKER
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse options that do not belong to the kind of scene."""
+        if (self.scene is None) == (self.project is None):
+            raise UsageError("give SCENE, a file or a pattern, or `project` (the option --scene)")
+        of_projects, of_patterns = "images texture grain truth resolution bounds", "frames exposure size levels phase"
+        idle, kind = (of_patterns, "project") if self.scene is None else (of_projects, "file or pattern")
+        for name in idle.split():
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise UsageError(f"`{name}` does not go with a {kind}; leave it out")
+        if self.bounds is not None and self.resolution is None:
+            raise UsageError("`bounds` are those of the true orthophoto; give its `resolution`, too")
+        if self.size is not None and min(self.size) < 1:
+            raise UsageError(f"`size` {self.size[0]} {self.size[1]}: each side must be at least 1 pixel")
 
 
 def table_of(linearisation: str | None) -> list[Path]:
