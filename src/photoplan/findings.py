@@ -24,6 +24,10 @@ class Result:
     def raise_failures(self) -> None:
         """Raise if a part of the inputs failed, after the rest is written."""
 
+    def remarks(self) -> Sequence[str]:
+        """Return what to mind in any case, printed on stderr as it is."""
+        return ()
+
     def messages(self) -> Sequence[str]:
         """Return remarks, printed on stderr; ``note:`` and ``warning:`` also with `quiet`."""
         return ()

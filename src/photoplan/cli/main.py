@@ -215,7 +215,20 @@ VERBS: dict[str, str | Verb] = {
         {"report": "report.restore:restore_page"},
         one_by_one=True,
     ),
-    "characterise": "Know a camera from image series.",
+    "characterise": Verb(
+        "Know a camera from image series.",
+        """Measure a camera in image series: noise, gain, linearity, dark signal, defects, light fall-off …
+
+        SERIES is a TOML file that states which images are what (dark frames, flat frames, scenes …) and how they were
+        exposed. Every analysis that they allow is made; the others are listed with what is missing.
+        """,
+        "requests.quality:CharacteriseRequest",
+        "products.characterise.run:characterise",
+        {"report": "report.characterise:characterise_page"},
+        record="characterise",
+        figures_first=True,
+        files="written",
+    ),
     "sensor": Verb(
         "Resolution, bandwidth and noise of a sensor.",
         "Print resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes.",

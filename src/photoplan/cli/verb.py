@@ -15,7 +15,7 @@ import click
 from click.core import ParameterSource
 
 from photoplan.cli.options import BYTES, NEW_FOLDER, PATH, PROJECT, all_cores, json_option, listed, quiet_option
-from photoplan.cli.output import can_draw, show, show_json, spelled, talking
+from photoplan.cli.output import can_draw, say, show, show_json, spelled, talking
 
 if TYPE_CHECKING:
     from photoplan.report.page import ReportFile
@@ -169,9 +169,12 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
         show_json(result, **more)
     else:
         # A project that was changed is recorded, and no product.
-        rest = [file for file in files if file not in request.files_read() and file not in shown]
+        read = request.files_read()
+        rest = [file for file in files if file not in read and file not in shown]
         for line in (*result.summary(), *rest) if verb.figures_first else (*rest, *result.summary()):
             show(line)
+    for remark in result.remarks():
+        say(remark)
     for message in result.messages():
         if message not in shown and (not as_json or message.startswith(("note:", "warning:"))):
             talk(message)

@@ -18,7 +18,7 @@ from photoplan.cameras.base import Camera
 from photoplan.engine.run import Steps, Store, steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result, noted
+from photoplan.findings import Result
 from photoplan.geometry.grid import MapGrid, Placement, Window
 from photoplan.io.camera.model import Entry, Number
 from photoplan.io.disk import make_folder
@@ -194,13 +194,16 @@ class SimulateReport(Result):
         return [image.path for image in self.images]
 
     def messages(self) -> list[str]:
-        """Return the form of the images, the sharpness of the model, and notes."""
+        """Return the form of the images and the sharpness of the model."""
         along = " ".join(f"{axis} {value:.4f}" for axis, value in zip("xy", self.mtf50))
-        line = (
+        return [
             f"{len(self.images)} images of {self.bands} × {self.size[0]} × {self.size[1]} pixels, {self.dtype} · MTF50 "
             f"of the model: {along} cycles per pixel"
-        )
-        return [line, *noted(self.notes)]
+        ]
+
+    def remarks(self) -> tuple[str, ...]:
+        """Return the notes."""
+        return self.notes
 
 
 @dataclass(frozen=True, eq=False)
@@ -570,6 +573,10 @@ class SceneReport(Result):
     def written(self) -> list[Path]:
         """Return images and rasters."""
         return [*(path for each in self.images for path in each.written()), *self.rasters]
+
+    def remarks(self) -> list[str]:
+        """Return the notes of each image."""
+        return [note for each in self.images for note in each.notes]
 
     def messages(self) -> list[str]:
         """Return the messages of each image, and the pattern's finest wave."""

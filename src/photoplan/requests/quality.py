@@ -157,6 +157,23 @@ class RestoreRequest(Request):
         return [*super().files_read(), *table_of(self.linearisation)]
 
 
+class CharacteriseRequest(Request):
+    """Options of the measurement of a camera in image series."""
+
+    series: Path = arg("Image series (TOML).")
+    only: tuple[str, ...] = opt("Analysis to run; may be repeated [all possible].", (), metavar="NAME")
+    report: Path | None = REPORT
+    csv: Path | None = opt("Folder for the figures as tables.", None, metavar="FOLDER", folder=True, writes=True)
+    dry_run: bool = DRY_RUN
+    overwrite: bool = OVERWRITE
+
+    def files_read(self) -> list[Path]:
+        """Return the series and its files."""
+        from photoplan.io.series import read_series
+
+        return [self.series, *read_series(self.series).inputs]
+
+
 class SimulateRequest(Request):
     """Options of images that are formed of a file, a pattern or a project by a described camera."""
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result, raise_failed
 from photoplan.io.product import check_output
 from photoplan.io.raster import write_whole_image
 from photoplan.io.series import Plane, Series, grey_step, largest_of_steps, read_series
@@ -21,6 +22,7 @@ from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.registry import ANALYSES, Analysis
 from photoplan.products.characterise.result import Figure, Findings, Listing
 from photoplan.quality.camera.photon_transfer import FullWell, full_well
+from photoplan.requests.quality import CharacteriseRequest
 
 _LEAST = 4
 #: Share of samples at the largest grey value from which on that is what stops them.
@@ -77,20 +79,6 @@ def step_notes(data: SeriesData) -> tuple[str, ...]:
     return (f"grey values come in steps of {data.step:g} DN: rounding is taken as that coarse",)
 
 
-@dataclass(frozen=True)
-class CharacteriseRequest:
-    """What is asked."""
-
-    series: Path
-    only: tuple[str, ...] = ()
-    """Names of analyses; all that the series allows if empty."""
-    csv: Path | None = None
-    """Folder for the tables."""
-    overwrite: bool = False
-    dry_run: bool = False
-    """Say which analyses would run; read no pixel."""
-
-
 @dataclass(frozen=True, eq=False)
 class AnalysisRun:
     """What became of one analysis."""
@@ -120,13 +108,13 @@ class AnalysisRun:
 
 
 @dataclass(frozen=True, eq=False)
-class CharacteriseReport:
-    """What came out."""
+class CharacteriseReport(Result):
+    """Findings of the analyses that a series allows."""
 
     series: Series
     runs: tuple[AnalysisRun, ...]
-    written: tuple[Path, ...]
-    """Tables and what goes with them."""
+    tables: tuple[Path, ...]
+    """Tables that were written, and what goes with them."""
     notes: tuple[str, ...] = ()
     """What concerns all analyses."""
     levels: tuple[float, ...] = ()
@@ -138,15 +126,51 @@ class CharacteriseReport:
         return {run.analysis.name: f"{run.analysis.name}: {run.failed}" for run in self.runs if run.failed is not None}
 
     def json_fields(self) -> dict[str, Any]:
-        """The series by its facts."""
+        """Return facts of the series, and the analyses."""
         series = self.series
         return {
             "series": series.path,
             "camera": series.camera.model_dump(exclude_none=True),
             "frames": len(series.frames),
             **pick(series, "size", "saturation_dn"),
-            **pick(self, "notes", "written", analyses="runs"),
+            **pick(self, "notes", written="tables", analyses="runs"),
         }
+
+    def written(self) -> tuple[Path, ...]:
+        """Return tables and what goes with them."""
+        return self.tables
+
+    def summary(self) -> list[str]:
+        """Return the figures of each analysis, and what is not known."""
+        lines: list[str] = []
+        for run in self.runs:
+            if run.state == "possible":
+                lines.append(f"{run.analysis.name}: possible")
+            if run.outcome is not None:
+                lines += [run.analysis.title, *(f"  {figure}" for figure in run.outcome.figures)]
+                lines += [f"  not known: {what}: {why}" for what, why in run.outcome.refused.items()]
+        return lines
+
+    def remarks(self) -> list[str]:
+        """Return the notes on all analyses, then those on each."""
+        own = [f"{run.analysis.name}: {note}" for run in self.runs if run.outcome is not None
+               for note in run.outcome.notes]  # fmt: skip
+        return [*self.notes, *own]
+
+    def messages(self) -> list[str]:
+        """Return what the series lacks, and how many analyses were done or can be."""
+        lacking = [f"{run.analysis.name}: missing: {run.missing}" for run in self.runs if run.missing is not None]
+        states = [run.state for run in self.runs]
+        state = "possible" if "possible" in states else "done"
+        return [
+            *lacking,
+            f"{len(self.series.frames)} frames, {len(self.series.reduced)} reduced figures: {states.count(state)} "
+            f"analyses {state}, {len(lacking)} lack data",
+        ]
+
+    def raise_failures(self) -> None:
+        """Name the analyses that stopped."""
+        raise_failed(self.failed, sum(run.outcome is not None for run in self.runs), "analyses failed")
 
 
 def characterise(request: CharacteriseRequest, events: Events = SILENT) -> CharacteriseReport:
@@ -178,7 +202,7 @@ def characterise(request: CharacteriseRequest, events: Events = SILENT) -> Chara
     written = _write_tables(request, series, runs)
     wells = [data.wells.get(plane.name) for plane in data.planes]
     levels = tuple(series.saturation_dn if well is None else well.level_dn for well in wells)
-    return CharacteriseReport(series=series, runs=tuple(runs), written=tuple(written), notes=notes, levels=levels)
+    return CharacteriseReport(series=series, runs=tuple(runs), tables=tuple(written), notes=notes, levels=levels)
 
 
 def _chosen(only: Sequence[str]) -> list[Analysis]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result, noted, raise_failed
+from photoplan.findings import Result, raise_failed
 from photoplan.geometry.grid import Window
 from photoplan.io.tables import write_table
 from photoplan.plain import pick
@@ -260,9 +260,9 @@ class PatternReport(Result):
         """Return the figures of each image."""
         return [str(image) for image in self.images]
 
-    def messages(self) -> list[str]:
+    def remarks(self) -> list[str]:
         """Return the notes of each image."""
-        return noted(f"{image.name}: {note}" for image in self.images for note in image.notes)
+        return [f"{image.name}: {note}" for image in self.images for note in image.notes]
 
     def raise_failures(self) -> None:
         """Name the images that failed."""

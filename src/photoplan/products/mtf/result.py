@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.findings import Result, noted, raise_failed
+from photoplan.findings import Result, raise_failed
 from photoplan.plain import pick
 from photoplan.quality.edges.find import REASONS
 from photoplan.quality.edges.groups import CombinedValue, Enhancement, GaussianFit
@@ -279,12 +279,12 @@ class MtfReport(Result):
             lines.append(f"all {len(self.images)} images\n{group_lines(self.groups)}")
         return lines
 
-    def messages(self) -> list[str]:
+    def remarks(self) -> list[str]:
         """Return the notes of each image, and of all together."""
         notes = [f"{image.name}: {note}" for image in self.images for note in image.notes]
         if len(self.images) > 1 and self.enhancement is not None and self.enhancement.enhanced:
             notes.append(f"all images: {self.enhancement.warning}")
-        return noted(notes)
+        return notes
 
     def raise_failures(self) -> None:
         """Name the images that failed."""
