@@ -111,8 +111,26 @@ VERBS: dict[str, str | Verb] = {
         "products.adjust.run:adjust_project",
         {"report": "report.adjust:adjust_page"},
     ),
-    "check": "Validate a project and print what to expect of it.",
-    "budget": "What limits the accuracy of products, cause by cause.",
+    "check": Verb(
+        "Validate a project and print what to expect of it.",
+        """Open every input of PROJECT and print, image by image, what it promises.
+
+        Ends with exit code 3 if orientations are implausible or another reading fits better, which is named, and with 4
+        if files of some images cannot be used.
+        """,
+        "requests.project:CheckRequest",
+        "products.check:check",
+    ),
+    "budget": Verb(
+        "What limits the accuracy of products, cause by cause.",
+        """Standard deviations of position on level ground, cause by cause, in the middle, at an edge and in a corner.
+
+        For the images of PROJECT, or for a vertical image by numbers: --camera-constant and --height.
+        """,
+        "requests.project:BudgetRequest",
+        "products.budget:budget_or_tables",
+        {"picture": "report.budget:draw_picture"},
+    ),
     "balance": Verb(
         "Even colours: tables by which images agree where they overlap.",
         """Find tables by which the images of PROJECT agree in colour where they overlap.
@@ -249,7 +267,13 @@ VERBS: dict[str, str | Verb] = {
         "requests.quality:SimulateRequest",
         "products.simulate:simulate",
     ),
-    "info": "Show what a raster, project, plan or run record holds.",
+    "info": Verb(
+        "Show what a raster, project, plan or run record holds.",
+        """Show what FILE holds: any file that a command takes or makes, or a folder of images.""",
+        "requests.project:DescribeRequest",
+        "products.describe:describe_file",
+        {"picture": "report.restore:draw_filter"},
+    ),
     "demo": "Make the orthophotos of the included real block.",
 }
 

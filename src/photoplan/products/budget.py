@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Camera, on_level
 from photoplan.cameras.rpc import fit_rpc
 from photoplan.errors import GeometryError, InputError, UsageError
-from photoplan.findings import Result
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result, noted
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.local import GeodeticGround
 from photoplan.io.camera.rpc.text import rpc_text
@@ -45,6 +46,7 @@ from photoplan.project.error_model import height_errors, known_height_errors, so
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.scene import input_files
 from photoplan.requests.orient import ConvertRequest
+from photoplan.requests.project import BudgetRequest
 from photoplan.surfaces.hybrid import HeightErrors, StatedHeightErrors
 from photoplan.targets.map import MapTarget
 
@@ -62,8 +64,8 @@ _FLIGHT = (0.15324, 900.0, 6000.0)
 
 
 @dataclass(frozen=True)
-class SourceTables:
-    """What the source prints."""
+class SourceTables(Result):
+    """Tables and examples that the source prints."""
 
     heights: tuple[tuple[float, ...], ...]
     """Table 4.3: radial displacement in the image corner, mm, by flying height and height error."""
@@ -94,7 +96,8 @@ class SourceTables:
             "orientation_8_2_2_um": {image: dict(zip(names, row)) for image, row in self.images.items()},
         }
 
-    def __str__(self) -> str:
+    def summary(self) -> Sequence[str]:
+        """Return the tables."""
         lines = ["Ecker 1991, table 4.3: radial displacement in the corner (r = 140 mm) by a height error, mm"]
         lines.append("  flying height" + "".join(f"{e:>7g} m" for e in _ERRORS))
         lines += [f"  {h:>11g} m" + "".join(f"{v:>9.1f}" for v in row) for h, row in zip(_HEIGHTS, self.heights)]
@@ -107,9 +110,7 @@ class SourceTables:
             "Ecker 1991, §8.2.2: displacement in the corner by the orientation's standard deviations, µm",
             "  image        X0     Y0     Z0      ω      φ      κ",
         ]
-        return "\n".join(
-            [*lines, *(f"  {name:<7}" + "".join(f"{v:>7.0f}" for v in row) for name, row in self.images.items())]
-        )
+        return [*lines, *(f"  {name:<7}" + "".join(f"{v:>7.0f}" for v in row) for name, row in self.images.items())]
 
 
 def source_tables() -> SourceTables:
@@ -240,7 +241,6 @@ def _heights(camera: Camera, seen: tuple[float, float]) -> tuple[float, float]:
     return max(low - room, camera.vantage.floor), min(high + room, (high + top) / 2)
 
 
-Triple = tuple[float, float, float]
 #: Places of an image for which a budget is made.
 PLACES = ("middle", "edge", "corner")
 #: What is not an error of the project, but of making the product.
@@ -252,46 +252,6 @@ _USUAL_HEIGHT, _USUAL_CENTER, _USUAL_ANGLE = 0.1, 0.1, 0.01
 _CRS, _STATION = "EPSG:32633", (500_000.0, 5_000_000.0)
 #: Sides of the map of an image.
 _MAP_BUDGET = 41
-
-
-@dataclass(frozen=True)
-class BudgetRequest:
-    """What is asked: a project, or the numbers of a flight."""
-
-    project: Path | None = None
-    images: tuple[str, ...] | None = None
-    """Names of its images; None: all."""
-    camera_constant: float | None = None
-    """Millimetres; with `format`, `pixel` and `height` for a vertical image without a project."""
-    format: tuple[float, float] = (230.0, 230.0)
-    """Width and height of the image, millimetres."""
-    pixel: float = 15.0
-    """Side of its pixels, µm."""
-    height: float | None = None
-    """Flying height above ground, metres."""
-    sigma_terrain: float | None = None
-    """Metres; goes before what the project states, as the next two do."""
-    sigma_center: Triple | None = None
-    """Of X0, Y0, Z0, metres."""
-    sigma_angles: Triple | None = None
-    """Of the angles, in `angle_unit`, or in the project's."""
-    angle_unit: str = "gon"
-    kernel: str = "bicubic"
-    tolerance: float = 0.02
-    """Of the anchors, pixels."""
-
-    def __post_init__(self) -> None:
-        if self.kernel not in KERNELS:
-            raise UsageError(f"kernel {self.kernel!r}; allowed are {', '.join(KERNELS)}")
-        if (self.project is None) == (self.camera_constant is None):
-            raise UsageError(
-                "a budget is that of a project or of numbers: give PROJECT, or `camera_constant` and `height`"
-            )
-        if self.project is None and self.height is None:
-            raise UsageError("a budget of numbers needs the flying height above ground: give `height` METRES")
-        numbers = [self.camera_constant, self.height, *self.format, self.pixel, self.tolerance]
-        if not all(n is None or (np.isfinite(n) and n > 0) for n in numbers):
-            raise UsageError(f"numbers {numbers} of the flight; positive ones are needed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,7 +288,7 @@ class ImageBudget:
 
 
 @dataclass(frozen=True, eq=False)
-class Budget:
+class Budget(Result):
     """Budgets of images, and what stands for all of them."""
 
     images: tuple[ImageBudget, ...]
@@ -349,7 +309,8 @@ class Budget:
         """All images."""
         return {"images": self.images, "typical": self.typical.image, "worst": self.worst.image, "notes": self.notes}
 
-    def __str__(self) -> str:
+    def summary(self) -> Sequence[str]:
+        """Return the budgets of the typical and of the worst image."""
         shown = [self.typical] if len(self.images) == 1 else [self.typical, self.worst]
         heads = [
             f"{len(self.images)} images; the typical one, {self.typical.image}",
@@ -358,7 +319,11 @@ class Budget:
         lines = []
         for head, image in zip(heads if len(self.images) > 1 else [self.typical.image], shown):
             lines += [f"{head} · GSD {image.gsd:.3g} m", *_table(image)]
-        return "\n".join(lines)
+        return lines
+
+    def messages(self) -> Sequence[str]:
+        """Return the notes."""
+        return noted(self.notes)
 
 
 def _table(image: ImageBudget) -> list[str]:
@@ -369,6 +334,11 @@ def _table(image: ImageBudget) -> list[str]:
     lines.append(f"  {'total in image pixels':<{wide}}" + "".join(f"{v / image.gsd:>10.2f}" for v in image.total))
     limits = (f"{place}: {name} ({share:.0%})" for place, (name, share) in zip(PLACES, image.limits))
     return [*lines, "  limited by  " + " · ".join(limits)]
+
+
+def budget_or_tables(request: BudgetRequest, events: Events = SILENT) -> Result:
+    """Return the tables of the source if they are asked for, else the budget."""
+    return source_tables() if request.tables else make_budget(request)
 
 
 def make_budget(request: BudgetRequest) -> Budget:
@@ -384,9 +354,11 @@ def make_budget(request: BudgetRequest) -> Budget:
     GeometryError
         An image does not look down on its ground.
     """
+    if request.kernel not in KERNELS:
+        raise UsageError(f"kernel {request.kernel!r}; allowed are {', '.join(KERNELS)}")
     project = _of_numbers(request) if request.project is None else load_project(request.project)
     project, notes = _stated(project, request)
-    names, left_out = project.oriented(project.select(request.images))
+    names, left_out = project.oriented(project.select(request.images or None))
     notes += [f"left out: {line}" for line in left_out]
     project, unknown = _completed(project, names)
     ground = ground_of(project)

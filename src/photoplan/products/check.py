@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from photoplan.cameras.base import Camera, tremor_told, tremors_of
 from photoplan.cameras.base import project as image_points
-from photoplan.errors import InputError
+from photoplan.errors import GeometryError, InputError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
+from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Image, Project, image_size
 from photoplan.orientation.conventions import ImagePlausibility, JudgedView
 from photoplan.plain import pick
@@ -22,7 +25,8 @@ from photoplan.products.orthophoto.plan import heights_in_feet, two_figures
 from photoplan.products.plausibility import against_files, judged, reading_of_block
 from photoplan.project.cameras import camera_without_pixels, is_there, posed_camera
 from photoplan.project.ground import Ground, ground_of
-from photoplan.project.scene import map_order, open_scene, unusable_images
+from photoplan.project.scene import map_order, open_scene, refuse_unusable, unusable_images
+from photoplan.requests.project import CheckRequest
 from photoplan.surfaces.shifted import intersect
 
 #: Displacements by the choice of earth curvature above this are reported, pixels.
@@ -66,7 +70,7 @@ class ImageCheck:
 
 
 @dataclass(frozen=True)
-class ProjectCheck:
+class ProjectCheck(Result):
     """All images of a project."""
 
     images: tuple[ImageCheck, ...]
@@ -85,6 +89,8 @@ class ProjectCheck:
     """Images without orientation, and why."""
     unusable: Mapping[str, str] = field(default_factory=dict)
     """Images whose files cannot be used, and why."""
+    file: str = "project"
+    """Name of the project in messages."""
 
     @property
     def implausible(self) -> tuple[str, ...]:
@@ -105,6 +111,10 @@ class ProjectCheck:
         return {**own, "height_systems": systems}
 
     def __str__(self) -> str:
+        return "\n".join(self.summary())
+
+    def summary(self) -> Sequence[str]:
+        """Return height systems, a line for each image, and what would be better."""
         width = max(5, *(len(i.image) for i in self.images))
         lines = [
             f"{crs_label(self.crs)} · heights: terrain {self.heights[0]}, orientation {self.heights[1]}",
@@ -130,7 +140,23 @@ class ProjectCheck:
             closing.append(f"{len(self.unusable)} of {count} images cannot be used")
         lines += [f"left out: {line}" for line in self.left_out]
         lines += [f"left out: {name}: {reason}" for name, reason in self.unusable.items()]
-        return "\n".join([*lines, " · ".join(closing), *self.advice])
+        return [*lines, " · ".join(closing), *self.advice]
+
+    def raise_failures(self) -> None:
+        """Raise if orientations are implausible, another reading fits better, or files cannot be used."""
+        if self.implausible or self.alternative is not None:
+            faults = f"{len(self.implausible)} of {len(self.images)} images are implausible"
+            if not self.implausible:
+                faults = "another reading of the orientation fits better"
+            first = f": {self.implausible[0]}" if self.implausible else ""
+            raise GeometryError(f"{self.file}: {faults}{first}\n{self.remedy}")
+        refuse_unusable(self.unusable, len(self.images) + len(self.left_out) + len(self.unusable))
+
+
+def check(request: CheckRequest, events: Events = SILENT) -> ProjectCheck:
+    """Check a project file; see `check_project`."""
+    found = check_project(load_project(request.project), request.images or None)
+    return replace(found, file=str(request.project))
 
 
 def check_project(project: Project, images: Sequence[str] | None = None) -> ProjectCheck:

@@ -52,6 +52,7 @@ from photoplan.plain import pick
 from photoplan.products.simulate import stated_model
 from photoplan.project.steps import load_filter
 from photoplan.quality.restoration.restorer import Convolution, FilterKernel
+from photoplan.requests.project import DescribeRequest
 from photoplan.requests.terrain import InfoRequest
 from photoplan.surfaces.units import LineElement, UnitFigures
 
@@ -87,6 +88,34 @@ def place_of(kernel: FilterKernel) -> str:
     """Band and place in the field of a kernel."""
     band = "all bands" if kernel.band is None else f"band {kernel.band}"
     return band if kernel.at is None else f"{band} at {kernel.at[0]:g}, {kernel.at[1]:g}"
+
+
+@dataclass(frozen=True)
+class FileFacts(Result):
+    """Facts of a file, by name."""
+
+    file: Path
+    facts: Mapping[str, Any]
+
+    def json_fields(self) -> Mapping[str, Any]:
+        """Facts by name."""
+        return self.facts
+
+    def written(self) -> Sequence[Path]:
+        """Return nothing: the file is read."""
+        return ()
+
+    def summary(self) -> Sequence[str]:
+        """Return the facts as lines; long ones have several."""
+        width = max(len(key) for key in self.facts)
+        texts = {key: readable(value) for key, value in self.facts.items()}
+        rows = {key: text if isinstance(text, list) else [text] for key, text in texts.items()}
+        return [f"{key * (k == 0):<{width}}  {line}" for key, lines in rows.items() for k, line in enumerate(lines)]
+
+
+def describe_file(request: DescribeRequest, events: Events = SILENT) -> FileFacts:
+    """Describe a file of any kind; see `describe`."""
+    return FileFacts(request.file, describe(request.file))
 
 
 def describe(path: Path) -> dict[str, Any]:

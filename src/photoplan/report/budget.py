@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from photoplan.products.budget import PLACES, ImageBudget
+from photoplan.products.budget import PLACES, Budget, SourceTables
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, SOFT, figure_of, png, shortened, styled
 
 #: Contributions that are nowhere larger than this part of the total are not drawn.
@@ -13,8 +13,11 @@ _COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, SOFT)
 
 
 @styled
-def draw_picture(budget: ImageBudget) -> bytes:
-    """Bars for each place, and the map of the total over the image."""
+def draw_picture(found: Budget | SourceTables) -> bytes | None:
+    """Draw bars for each place, and the map of the total over the typical image; nothing for tables."""
+    if isinstance(found, SourceTables):
+        return None
+    budget = found.typical
     fig = figure_of(8.6, 3.6)
     bars, area = fig.subplots(1, 2, width_ratios=(1.25, 1))
     places = np.arange(len(PLACES))

@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
-from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
-from photoplan.io.store import write_atomically
 from photoplan.products.chromatic import model_figures
-from photoplan.products.describe import place_of
+from photoplan.products.describe import FileFacts, place_of
 from photoplan.products.restore import DesignedPart, FoundFilter, Job, MeasuredFilter, RestoredImage, RestoreReport
 from photoplan.project.align import AlignStep
 from photoplan.project.steps import FallOffStep, fall_off_line, load_filter, restoration_of
@@ -24,7 +21,7 @@ from photoplan.quality.colour import ChromaticModel
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.design import Sharpness
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, SOFT, figure_of, load_matplotlib, mpl, png, styled
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, SOFT, figure_of, mpl, png, styled
 from photoplan.report.page import Cell, cells, figure, headline, page, section, table, text
 
 Array = NDArray[np.float64]
@@ -108,14 +105,11 @@ def _response(axes: Any, values: Array) -> None:
     axes.legend(fontsize=7.5)
 
 
-def draw_filter(path: Path, picture: Path, *, overwrite: bool = False) -> Path:
-    """Draw a filter file as PNG."""
-    check_output(picture, [path], overwrite=overwrite)
-    load_matplotlib("a picture of a filter")
-    used = load_filter(path)
+def draw_filter(facts: FileFacts) -> bytes:
+    """Draw the kernels of a filter file."""
+    used = load_filter(facts.file)
     kernels = [(place_of(kernel), kernel.values) for kernel in used.kernels]
-    write_atomically(picture, draw_kernels(used.description or path.name, kernels))
-    return picture
+    return draw_kernels(used.description or facts.file.name, kernels)
 
 
 _WIDTH = 9.0

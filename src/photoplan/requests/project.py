@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
+from photoplan.errors import UsageError
 from photoplan.io.orientation.form import TableFormat
-from photoplan.request import BEYOND_AREA, OVERWRITE, Request, arg, opt
+from photoplan.request import BEYOND_AREA, IMAGES, OVERWRITE, PROJECT, Request, arg, opt
 
 
 def _input(help: str, metavar: str) -> Any:
@@ -51,3 +52,61 @@ class InitRequest(Request):
     def path(self) -> Path:
         """The project file."""
         return self.folder / "project.toml"
+
+
+class CheckRequest(Request):
+    """Options of the check of a project."""
+
+    project: Path = PROJECT
+    images: tuple[str, ...] = IMAGES
+
+
+class BudgetRequest(Request):
+    """Options of an error budget: of a project, or of a vertical image that numbers state."""
+
+    project: Path | None = opt("Project file, or the folder that holds `project.toml`.", None, argument=True,
+                               project=True)  # fmt: skip
+    images: tuple[str, ...] = IMAGES
+    camera_constant: float | None = opt("Camera constant of a vertical image, without a project.", None, metavar="MM",
+                                        section="input")  # fmt: skip
+    format: tuple[float, float] = opt("Width and height of its format [230 230].", (230.0, 230.0), metavar="MM MM",
+                                      section="input")  # fmt: skip
+    pixel: float = opt("Side of its pixels, µm [15].", 15.0, metavar="UM", section="input")
+    height: float | None = opt("Its flying height above ground.", None, metavar="M", section="input")
+    sigma_terrain: float | None = opt("Standard deviation of heights, metres [the project's].", None, metavar="M",
+                                      section="input")  # fmt: skip
+    sigma_center: tuple[float, float, float] | None = opt(
+        "Standard deviations of projection centres, metres [the project's].", None, metavar="X Y Z", section="input"
+    )
+    sigma_angles: tuple[float, float, float] | None = opt(
+        "Standard deviations of angles [the project's].", None, metavar="A B C", section="input"
+    )
+    angle_unit: Literal["deg", "gon", "rad"] = opt("Unit of angles without a project [gon].", "gon", section="input")
+    kernel: str = opt("Resampling kernel [bicubic].", "bicubic")
+    tolerance: float = opt("Largest residual of the anchors, pixels [0.02].", 0.02, metavar="PX")
+    tables: bool = opt("Print the tables and examples of Ecker 1991 instead.", False)
+    picture: Path | None = opt("Write a picture of contributions, and a map of the total.", None, metavar="PNG",
+                               writes=True)  # fmt: skip
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse a project with numbers, and numbers that are incomplete or not positive."""
+        if self.tables:
+            return
+        if (self.project is None) == (self.camera_constant is None):
+            raise UsageError(
+                "a budget is that of a project or of numbers: give PROJECT, or `camera_constant` and `height`"
+            )
+        if self.project is None and self.height is None:
+            raise UsageError("a budget of numbers needs the flying height above ground: give `height` METRES")
+        numbers = [self.camera_constant, self.height, *self.format, self.pixel, self.tolerance]
+        if not all(n is None or n > 0 for n in numbers):
+            raise UsageError(f"numbers {numbers} of the flight; positive ones are needed")
+
+
+class DescribeRequest(Request):
+    """Options of the description of a file."""
+
+    file: Path = arg("File of any kind that a command reads or writes, or folder of images.")
+    picture: Path | None = opt("Draw a restoration filter as PNG.", None, flag="plot", metavar="PICTURE", writes=True)
+    overwrite: bool = OVERWRITE
