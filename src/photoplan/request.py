@@ -6,6 +6,7 @@ pydantic model. Modules of requests import nothing heavy, so that the help answe
 
 from __future__ import annotations
 
+import os
 import re
 import types
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from photoplan.errors import UsageError
@@ -41,6 +42,17 @@ def opt(help: str, default: Any = ..., **how: Any) -> Any:
 def arg(help: str = "", **how: Any) -> Any:
     """Declare a field that is a positional argument of the command line."""
     return opt(help, argument=True, **how)
+
+
+def path_or(*words: str) -> BeforeValidator:
+    """Return what makes a path of text, but for some words; values in place of a file stay as they are."""
+
+    def path(value: Any) -> Any:
+        if not isinstance(value, str | os.PathLike):
+            return value
+        return os.fspath(value) if os.fspath(value) in words else Path(value)
+
+    return BeforeValidator(path)
 
 
 class Request(BaseModel):

@@ -1,7 +1,6 @@
 """The report of a built model: true figures, safe text, complete files, bounded work."""
 
 import re
-import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,12 +9,12 @@ import numpy as np
 import pytest
 from tools.sketched import drawn
 
-from photoplan.errors import ResourceError, UsageError
+from photoplan.errors import ResourceError
 from photoplan.kernels.collocation import correlation
 from photoplan.products.dtm.build import BuildReport
 from photoplan.report import dtm as dtm_covariance
 from photoplan.report import dtm as samples
-from photoplan.report.dtm import build_page, draw_covariance, draw_filter_histograms, draw_heights, open_build_report
+from photoplan.report.dtm import build_page, draw_covariance, draw_filter_histograms, draw_heights
 from photoplan.report.page import ReportFile, text
 from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.terrain.build import build_terrain, plan_build
@@ -259,18 +258,12 @@ def test_settings_name_the_grid_that_is_built(document, built):
     assert f"{built.plan.width:g} m, {finest:g} m where breaklines pass" in "".join(Page(document).words)
 
 
-def test_without_matplotlib_the_message_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(UsageError, match=r"pip install 'photoplan\[report\]'"):
-        open_build_report(tmp_path / "model.gpkg", True, False)
-
-
 def test_a_full_disk_leaves_the_old_report(document, tmp_path, monkeypatch):
     import errno
 
     path = tmp_path / "model.report.html"
     path.write_text("old")
-    page = open_build_report(tmp_path / "model.gpkg", None, True)
+    page = ReportFile(path)
 
     def full(self, content):
         raise OSError(errno.ENOSPC, "No space left on device")

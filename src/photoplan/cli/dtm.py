@@ -5,9 +5,18 @@ from __future__ import annotations
 from photoplan.cli.lazy import LazyGroup
 from photoplan.cli.verb import Verb
 
-#: A row for each command; `build` has a module of its own.
 VERBS: dict[str, str | Verb] = {
-    "build": "Predict a terrain model from points and lines.",
+    "build": Verb(
+        "Predict a terrain model from points and lines.",
+        """Predict a terrain model from files of points and lines: text, LAS, LandXML, GeoPackage, Shapefile, DXF.
+
+        Least-squares collocation filters the points; slopes break at breaklines. The same command continues a run that
+        was interrupted while it wrote.
+        """,
+        "requests.terrain:BuildRequest",
+        "products.dtm.build:dtm_build",
+        {"report": "report.dtm:build_report"},
+    ),
     "info": Verb(
         "Show what a model holds.",
         "Show the figures of MODEL: units, lines, accuracy, gross errors. A raster is shown as by `photoplan info`.",

@@ -131,7 +131,11 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
         for path in paths
         for key in (name, name + path.suffix.lower(), f"{name}/")
         if key in verb.draw
-    } | {path: key for key, path in request.drawn.items()}
+    } | {
+        path: key
+        for key, path in request.drawn.items()
+        if dry_run or getattr(request, key, True) is not None or can_draw(True, talk, key)
+    }
     picture = next((name for name in verb.draw if getattr(request, name, None) is True), None)
     if picture and not dry_run and can_draw(True, talk):
         drawn[request.product.with_suffix(".png")] = picture
@@ -147,7 +151,8 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
             if file is not None and (content := load(verb.draw[drawn[path]])(result)) is not None:
                 each = content if isinstance(content, Mapping) else {path: content}
                 made += [replace(file, path=place).write(one) for place, one in each.items()]
-        first = [path for path in made if path in request.drawn.values()]
+        options = type(request).model_fields
+        first = [path for key, path in request.drawn.items() if path in made and key not in options]
         files = [*first, *result.written(), *(path for path in made if path not in first)]
         if record is not None:
             record(files, result)
@@ -159,10 +164,11 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     elif as_json:
         more: dict[str, Any] = {
             name: path if path in made else None
-            for name in type(request).model_fields
-            if isinstance(path := getattr(request, name), Path | None) and name in verb.draw
+            for name, entry in options.items()
+            if name in verb.draw and entry.annotation is not bool
+            for path in [request.drawn.get(name, getattr(request, name))]
         }
-        if request.drawn:
+        if set(request.drawn) - set(options):
             more["files"] = files
         if picture:
             more["picture"] = next((path for path in made if path not in more.values()), None)

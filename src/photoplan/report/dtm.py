@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,10 +13,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import UsageError
+from photoplan.errors import PhotoplanWarning, UsageError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.grid import MapGrid
-from photoplan.io.product import check_output
 from photoplan.kernels.sides import sides_of
 from photoplan.products.dtm.build import BuildReport
 from photoplan.products.dtm.lines import ContourFacts, Profile, Profiles
@@ -29,13 +29,11 @@ from photoplan.report.drawing import (
     axes_of,
     draw_normalised,
     figure_of,
-    has_matplotlib,
-    load_matplotlib,
     mpl,
     png,
     styled,
 )
-from photoplan.report.page import Cell, ReportFile, figure, headline, page, section, table, text
+from photoplan.report.page import Cell, figure, headline, page, section, table, text
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.units import MeasuredTerrain, MemoryUnits
 from photoplan.targets.map import MapTarget
@@ -732,18 +730,12 @@ MOST_ROWS = 2000
 MOST_NOTES = 50
 
 
-def open_build_report(output: Path, wanted: bool | None, overwrite: bool) -> ReportFile | None:
-    """The page beside a model to be, before any work; None: it is not wanted, or left open and matplotlib is
-    missing.
-    """
-    if wanted is False:
-        return None
-    path = output.with_name(f"{output.stem}.report.html")
-    check_output(path, overwrite=overwrite)
-    if wanted is None and not has_matplotlib():
-        return None
-    load_matplotlib("the report", "give `report=False`")
-    return ReportFile(path)
+def build_report(model: BuildReport) -> str:
+    """Return the report of a model; a covariance function that does not fit its points is warned of."""
+    samples = samples_of(model.built, model.measured)
+    if samples.covariance.warning:
+        warnings.warn(f"warning: {samples.covariance.warning}", PhotoplanWarning, stacklevel=2)
+    return build_page(model, model.inputs, samples)
 
 
 def build_page(model: BuildReport, inputs: Sequence[Path], samples: BuildSamples) -> str:

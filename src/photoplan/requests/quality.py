@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator
-
 from photoplan.errors import UsageError
-from photoplan.request import BOUNDS, DRY_RUN, IMAGES, MEMORY, ONE_WORKER, OVERWRITE, Request, arg, opt
+from photoplan.request import BOUNDS, DRY_RUN, IMAGES, MEMORY, ONE_WORKER, OVERWRITE, Request, arg, opt, path_or
 
 REPORT: Any = opt("Report with plots to write.", None, metavar="HTML", writes=True)
 
@@ -78,18 +74,11 @@ class MtfRequest(Request):
         return [*super().files_read(), *table_of(self.linearisation)]
 
 
-def _file_or(word: str, value: Any) -> Any:
-    """Return the path of a file, a word that stands for none, or a value instead of a file."""
-    if not isinstance(value, str | os.PathLike):
-        return value
-    return word if os.fspath(value) == word else Path(value)
-
-
 class RestoreRequest(Request):
     """Options of the restoration of images, and of the measurement of a filter."""
 
     images: tuple[Path, ...] = arg("Images.")
-    filter: Annotated[Path | object | None, BeforeValidator(partial(_file_or, "none"))] = opt(
+    filter: Annotated[Path | object | None, path_or("none")] = opt(
         "Filter: TOML, or one kernel as rows of numbers; none: no filter [measured at edges of the images].", None,
         metavar="FILE|none", section="input",
     )  # fmt: skip
@@ -100,7 +89,7 @@ class RestoreRequest(Request):
     linearisation: str | None = opt("Conversion of grey values into the light that is filtered [linear].", None,
                                     metavar="linear|srgb|TABLE", section="input")  # fmt: skip
     dtype: str = opt("Type of the results: same, float32 or uint16.", "same", metavar="TYPE", section="result")
-    chromatic: Annotated[Path | object | None, BeforeValidator(partial(_file_or, "measure"))] = opt(
+    chromatic: Annotated[Path | object | None, path_or("measure")] = opt(
         "First bring the bands together: by a model, or as measured in each image.", None, metavar="FILE|measure",
         section="input",
     )  # fmt: skip

@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from photoplan.errors import UsageError
-from photoplan.request import BOUNDS, OVERWRITE, WORKERS, Request, arg, crs_option, opt
+from photoplan.request import (
+    BEYOND_AREA,
+    BOUNDS,
+    ONE_WORKER,
+    OVERWRITE,
+    WORKERS,
+    Request,
+    arg,
+    crs_option,
+    opt,
+    path_or,
+)
 from photoplan.terrain.options import ContourOptions, Lighting
 
 
@@ -16,6 +27,80 @@ def _model() -> Path:
 
 
 _SAME = "Declare with `same` that both models have the same height system."
+
+
+class BuildRequest(Request):
+    """Options of a terrain model from measured points and lines."""
+
+    inputs: tuple[Path, ...] = arg("Files of points and lines.", metavar="POINTS…")
+    output: Path = opt("Terrain model to write.", metavar="GPKG", writes=True)
+    grid_width: float | None = opt("Grid width, metres [half the spacing; half of that at breaklines].", None, gt=0,
+                                   metavar="M")  # fmt: skip
+    adapt: float | None = opt(
+        "Widen the grid of a unit while its surface stays within this, metres; 0: never [a quarter of its standard "
+        "deviation].", None, ge=0, metavar="M",
+    )  # fmt: skip
+    unit_meshes: int = opt("Number of meshes along the side of a unit: a power of two.", 64)
+    filters: tuple[str, ...] = opt(
+        "Standard deviation of measurement of mass, spot, breakline, formline, border or hole, metres [mass: "
+        "estimated; others: a share of it].", (), flag="filter", metavar="CLASS=M",
+    )  # fmt: skip
+    covariance: str = opt("Covariance function: auto, gaussian, matern or exponential.", "auto")
+    gross: float = opt("Normalised residual of gross errors; 0: none is sought.", 5.0, ge=0)
+    reach: float | None = opt("Half the width from which on gaps stay open, metres [10 spacings].", None, gt=0,
+                              metavar="M")  # fmt: skip
+    codes: Annotated[Path | object | None, path_or()] = opt(
+        "Codes and layers: TOML, or CSV with code, class, sigma.", None, metavar="FILE", section="input"
+    )
+    columns: str | None = opt("Columns of text files, such as x=East,y=North,z=Height,code=Art or x,y,z,-,code.", None,
+                              section="input")  # fmt: skip
+    delimiter: str | None = opt("Delimiter of text files: comma, semicolon, tab or space [what fits].", None,
+                                section="input")  # fmt: skip
+    decimal_comma: bool = opt("Numbers are written 1,5.", False, section="input")
+    attribute: str | None = opt("Attribute of vector files that holds the code [kind, class or code].", None,
+                                section="input")  # fmt: skip
+    layers: tuple[str, ...] = opt("Layer or surface to read; may be repeated [all].", (), flag="layer", section="input")
+    las_classes: tuple[int, ...] = opt("Class of LAS points to read; may be repeated [2].", (), flag="las-class",
+                                       section="input")  # fmt: skip
+    tin_points: bool = opt("Take the vertices of a LandXML triangulation as points, if it has no others.", False,
+                           section="input")  # fmt: skip
+    nodata: float | None = opt("Height that stands for no height.", None, section="input")
+    crs: str | None = crs_option("files that state none")
+    height_field: str | None = opt(
+        "Attribute of vector files that holds heights, as of contours; of drawings that of blocks, or Text.", None,
+        metavar="NAME", section="input",
+    )  # fmt: skip
+    unit: str | None = opt("Unit of drawings whose header states none or a wrong one [as $INSUNITS states].", None,
+                           section="input")  # fmt: skip
+    height_system: str | None = opt("Height system of files that state none: ellipsoidal or EPSG:nnnn.", None,
+                                    section="input")  # fmt: skip
+    beyond_area: bool = BEYOND_AREA
+    report: bool | None = opt("Write a page with plots beside the model [if matplotlib is there].", None,
+                              section="result")  # fmt: skip
+    dry_run: bool = opt("Read, clean and plan; print it and stop.", False, section="run")
+    workers: int = ONE_WORKER
+    overwrite: bool = OVERWRITE
+
+    def check(self) -> None:
+        """Refuse standard deviations that are no numbers."""
+        _ = self.sigmas
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviations of measurement by class, metres."""
+        found = {}
+        for text in self.filters:
+            name, _, value = text.partition("=")
+            try:
+                found[name.strip()] = float(value)
+            except ValueError:
+                raise UsageError(f"`filter` {text!r} must be a class and a number, such as mass=0.15") from None
+        return found
+
+    @property
+    def drawn(self) -> dict[str, Path]:
+        """The page of the report."""
+        return {} if self.report is False else {"report": self.output.with_name(f"{self.output.stem}.report.html")}
 
 
 class InfoRequest(Request):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import psutil
@@ -18,20 +18,21 @@ from numpy.typing import NDArray
 from photoplan.engine.run import steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result
+from photoplan.findings import Result, noted
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.heights import check_height_system, common_system, height_label
 from photoplan.geometry.units import metric_heights
 from photoplan.io.product import check_output
 from photoplan.io.store import ResultLog, run_key, run_times, together, when_named, write_run_record
+from photoplan.io.tables import Dialect
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.model import GrossError, ModelHeader, ModelReader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
-from photoplan.io.terrain.options import ReadOptions
+from photoplan.io.terrain.options import CodeTable, ReadOptions, read_code_table
 from photoplan.io.vector_layer import read_features
 from photoplan.plain import pick
 from photoplan.project.ground import open_terrain
-from photoplan.requests.terrain import RefineRequest
+from photoplan.requests.terrain import BuildRequest, RefineRequest
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.refined_units import LinedUnits, RasterUnits, refine_units
 from photoplan.surfaces.units import LineElement, MeasuredTerrain, Unit, UnitFigures, unit_range
@@ -42,26 +43,13 @@ from photoplan.terrain.settings import BuildSettings
 
 #: Bytes that a build needs for each point, measured; more than the machine has is refused before any work.
 _BYTES_PER_POINT = 700
-
-
-@dataclass(frozen=True)
-class BuildRequest:
-    """What is asked."""
-
-    inputs: tuple[Path, ...]
-    output: Path
-    options: ReadOptions = field(default_factory=ReadOptions)
-    """How the files are read."""
-    settings: BuildSettings = field(default_factory=BuildSettings)
-    height_system: str | None = None
-    """Declared height system; None: what the files state."""
-    workers: int = 1
-    overwrite: bool = False
+#: Findings, gross errors and notes that are printed; all are in the report, in the model and in the JSON.
+_SHOWN = 10
 
 
 @dataclass(frozen=True, eq=False)
-class BuildReport:
-    """What came out."""
+class BuildReport(Result):
+    """A terrain model that was built."""
 
     path: Path
     figures: dict[str, Any]
@@ -73,9 +61,42 @@ class BuildReport:
     built: Built
     measured: MeasuredTerrain
     """The clean measurements that the model was built from."""
+    inputs: tuple[Path, ...] = ()
+
+    def written(self) -> list[Path]:
+        """Return the model."""
+        return [self.path]
+
+    def messages(self) -> list[str]:
+        """Return the figures of the model, the first gross errors and findings, and the notes."""
+        f = self.figures
+        lines = [
+            f"{f['points']} points in {f['seconds']:.1f} s · {f['units']} units, grid "
+            + ", ".join(f"{width} m ({count})" for width, count in f["grid_widths"].items()),
+            f"covariance {f['covariance']}: signal ±{f['variance'] ** 0.5:.3f} m, half at {f['length']:.2f} m · "
+            f"mass points ±{f['noise']:.3f} m · "
+            + ("posts: none amid data · " if f["sigma"] is None else f"posts ±{f['sigma']:.3f} m · ")
+            + ("too few points for residuals" if f["spread"] is None else f"normalised residuals {f['spread']:.2f}"),
+        ]
+        if f["calibration"]:
+            lines.append(
+                "held-out blocks, errors over stated ±: " + ", ".join(_errors_by_distance(c) for c in f["calibration"])
+            )
+            bends = [f"{_share_by_bend(c)} {c['after']:.2f}" for c in reversed(f["calibration_by_bend"]) if c["enough"]]
+            if bends:
+                lines.append("  the same by curvature of the ground: " + ", ".join(bends))
+        if self.gross:
+            lines.append(f"gross errors, left out: {len(self.gross)}")
+            lines += [f"  {g.name}: {g.residual:+.3f} m, {abs(g.normalised):.1f} σ" for g in self.gross[:_SHOWN]]
+        if self.suspects:
+            lines.append(f"suspects, used all the same: {len(self.suspects)}; look at them in the report or the model")
+        if self.findings:
+            lines.append(f"note: findings in the measurements: {len(self.findings)}")
+            lines += [f"  {finding.kind}: {finding.text}" for finding in self.findings[:_SHOWN]]
+        return [*lines, *_noted(self.measured.notes)]
 
     def json_fields(self) -> dict[str, Any]:
-        """Figures, gross errors, findings and notes."""
+        """Return figures, gross errors, findings and notes."""
         return {
             "model": self.path,
             **self.figures,
@@ -86,20 +107,98 @@ class BuildReport:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class PlannedBuild(Result):
+    """A terrain model that would be built."""
+
+    plan: BuildPlan
+    measured: MeasuredTerrain
+    findings: tuple[Finding, ...]
+    crs: str
+    height_system: str | None
+
+    def summary(self) -> list[str]:
+        """Return the plan, what cleaning found, and the notes."""
+        found = [f"  {finding.kind}: {finding.text}" for finding in self.findings]
+        plan = describe_plan(self.plan, self.measured, self.crs, self.height_system)
+        return [plan, *found, *_noted(self.measured.notes)]
+
+    def json_fields(self) -> dict[str, Any]:
+        """Return points, lines, units and gaps of the plan, findings and notes."""
+        plan, measured = self.plan, self.measured
+        return {
+            "points": measured.count,
+            "lines": dict(Counter(line.kind for line in measured.lines)),
+            "spacing": round(plan.seen.spacing, 4),
+            "grid_width": plan.width,
+            "grid_width_at_breaklines": plan.finest,
+            "units": [plan.layout.columns, plan.layout.rows],
+            "unit_side": plan.layout.side,
+            "bounds": list(plan.layout.bounds),
+            "widest_gap": 2 * plan.reach,
+            "crs": crs_label(self.crs),
+            "height_system": self.height_system,
+            "findings": self.findings,
+            "notes": measured.notes,
+        }
+
+
+def _noted(notes: Sequence[str]) -> list[str]:
+    """Return notes once each, in words that `quiet` does not hide; of many the first ones."""
+    found = [f"  {note}" for note in noted(notes)]
+    more = len(found) - _SHOWN
+    return found[:_SHOWN] + ([f"  note: {more} more notes are in the model's record"] if more > 0 else [])
+
+
+def _share_by_bend(c: dict[str, Any]) -> str:
+    word = "strongest" if c["to"] == 1 else "weakest" if c["from"] == 0 else "next"
+    return f"{word} {100 * (c['to'] - c['from']):.0f} %"
+
+
+def _errors_by_distance(c: dict[str, Any]) -> str:
+    """Return the spread of held-out errors at some distances to data."""
+    where = f"over {c['from']:.3g} m" if c["to"] is None else f"up to {c['to']:.3g} m"
+    return f"{where} {c['after']:.2f}" if c["enough"] else f"{where} too few ({c['blocks']} blocks)"
+
+
+_DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
+
+
+def _reading(request: BuildRequest) -> ReadOptions:
+    codes = read_code_table(request.codes) if isinstance(request.codes, Path) else request.codes
+    return ReadOptions(
+        dialect=Dialect(
+            request.columns, _DELIMITERS.get(request.delimiter or "", request.delimiter), request.decimal_comma
+        ),
+        codes=codes if isinstance(codes, CodeTable) else CodeTable(),
+        layers=request.layers or None,
+        las_classes=request.las_classes or None,
+        **pick(request, "attribute", "tin_points", "nodata", "crs", "beyond_area", "height_field", "unit"),
+    )
+
+
+def _settings(request: BuildRequest) -> BuildSettings:
+    return BuildSettings(
+        family=cast(Any, request.covariance),
+        filters=request.sigmas,
+        **pick(request, "grid_width", "unit_meshes", "adapt", "gross", "reach"),
+    )
+
+
 def load(request: BuildRequest) -> tuple[MeasuredTerrain, tuple[Finding, ...], str, str | None]:
-    """Clean measurements, what cleaning found, their CRS and their height system."""
-    raw = read_measured(request.inputs, replace(request.options, height_system=request.height_system))
+    """Return clean measurements, what cleaning found, their CRS and their height system."""
+    raw = read_measured(request.inputs, replace(_reading(request), height_system=request.height_system))
     if raw.crs is None:
         names = ", ".join(path.name for path in request.inputs)
         raise InputError(f"{names}: no CRS; state it with `crs` EPSG:nnnn, it is not guessed")
     system = _height_system(raw, request.height_system)
     _check_memory(raw)
-    measured, findings = clean(replace(raw, height_system=system), sigmas=request.settings.filters or None)
+    measured, findings = clean(replace(raw, height_system=system), sigmas=request.sigmas or None)
     return measured, findings, raw.crs, system
 
 
-def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
-    """Build a terrain model and write it, with its run record.
+def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport | PlannedBuild:
+    """Build a terrain model and write it, with its run record; in a dry run only plan it.
 
     Raises
     ------
@@ -110,14 +209,17 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
     ResourceError
         The disk is full, or the points need more memory than there is.
     """
-    times = run_times()
-    _check_model(request)
+    times, settings = run_times(), _settings(request)
+    if not request.dry_run:
+        _check_model(request)
     events.begin("reading measurements")
     measured, findings, crs, system = load(request)
-    plan = plan_build(measured, request.settings)
+    plan = plan_build(measured, settings)
+    if request.dry_run:
+        return PlannedBuild(plan, measured, findings, crs, system)
     events.talk(describe_plan(plan, measured, crs, system))
     facts = [input_facts(path) for path in request.inputs]
-    decides = [request.settings, repr(request.options), repr(plan.layout), crs, system]
+    decides = [settings, repr(_reading(request)), repr(plan.layout), crs, system]
     key = run_key("terrain model", decides, request.inputs)
     kept = ResultLog.beside(request.output, key, locked=True)
     with (
@@ -137,7 +239,7 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
             crs=crs,
             height_system=system,
             layout=plan.layout,
-            settings=asdict(request.settings),
+            settings=asdict(settings),
             inputs=tuple(facts),
             family=built.fit.whole.name,
             totals=totals,
@@ -157,6 +259,7 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
                 findings=findings,
                 built=built,
                 measured=measured,
+                inputs=request.inputs,
             )
             write_run_record(
                 request.output,
@@ -165,7 +268,7 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
                 run={"workers": request.workers, **ran},
                 kind="terrain model",
                 product=report.json_fields() | {"findings": dict(Counter(f.kind for f in findings))},
-                settings=request.settings,
+                settings=settings,
             )
     return report
 
@@ -202,27 +305,6 @@ def describe_plan(plan: BuildPlan, measured: MeasuredTerrain, crs: str, system: 
         + f"{layout.columns} × {layout.rows} units of {layout.side:g} m · gaps over {2 * plan.reach:.3g} m stay open · "
         f"{crs_label(crs)}, heights {height_label(system)}"
     )
-
-
-def plan_facts(
-    plan: BuildPlan, measured: MeasuredTerrain, findings: Sequence[Finding], crs: str, system: str | None
-) -> dict[str, Any]:
-    """What will be computed, as plain values."""
-    return {
-        "points": measured.count,
-        "lines": dict(Counter(line.kind for line in measured.lines)),
-        "spacing": round(plan.seen.spacing, 4),
-        "grid_width": plan.width,
-        "grid_width_at_breaklines": plan.finest,
-        "units": [plan.layout.columns, plan.layout.rows],
-        "unit_side": plan.layout.side,
-        "bounds": list(plan.layout.bounds),
-        "widest_gap": 2 * plan.reach,
-        "crs": crs_label(crs),
-        "height_system": system,
-        "findings": findings,
-        "notes": measured.notes,
-    }
 
 
 def _many(count: int, what: str) -> str:
