@@ -403,6 +403,8 @@ def init_project(request: InitRequest, events: Events = SILENT) -> InitResult:
     HeightSystemError
         Height systems are not declared, or the grid that joins them is missing.
     """
+    if request.folder.is_file():
+        raise UsageError(f"{request.folder}: is a file; give the folder of the project")
     if (request.path.exists() or request.path.is_symlink()) and not request.overwrite:
         raise UsageError(f"{request.path} exists; give `overwrite` to replace it, or another folder")
     received(request.folder)
