@@ -114,7 +114,7 @@ class SourceTables(Result):
 
 
 def source_tables() -> SourceTables:
-    """Tables and examples, from the formulas of `photoplan.plan.accuracy`."""
+    """Compute the tables and examples from the formulas of `photoplan.plan.accuracy`."""
     in_image = _PRODUCT * _MAP / _SCALE
     c, height, scale = _FLIGHT
     images = {}
@@ -140,7 +140,7 @@ _ROOM, _OF_DISTANCE = 0.1, 0.02
 
 @dataclass(frozen=True)
 class ImagePolynomials:
-    """What the polynomials of an image leave of its camera, between the places of the fit."""
+    """Residuals of the polynomials of an image, between the places of the fit."""
 
     image: str
     file: Path
@@ -235,7 +235,7 @@ def _fit(project: Project, name: str, path: Path) -> tuple[ImagePolynomials, Pat
 
 
 def _heights(camera: Camera, seen: tuple[float, float]) -> tuple[float, float]:
-    """Heights of the fit: those that are seen, and some room."""
+    """Return the heights of the fit: those that are seen, with a margin."""
     (low, high), top = seen, float(camera.vantage.point[2])
     room = max(_ROOM * (high - low), _OF_DISTANCE * (top - low))
     return max(low - room, camera.vantage.floor), min(high + room, (high + top) / 2)
@@ -342,7 +342,7 @@ def budget_or_tables(request: BudgetRequest, events: Events = SILENT) -> Result:
 
 
 def make_budget(request: BudgetRequest) -> Budget:
-    """Error budget of every image of a project, or of a vertical image that numbers state.
+    """Compute the error budget of every image of a project, or of a vertical image that numbers state.
 
     What a project does not state counts as free of error. Notes say so, how to state it, and what
     a usual error costs.
@@ -377,7 +377,7 @@ def make_budget(request: BudgetRequest) -> Budget:
 
 
 def _completed(project: Project, names: Sequence[str]) -> tuple[Project, dict[str, Any]]:
-    """The project with zeros for what it does not state; which that is, and the project with usual errors instead."""
+    """Return the project with zeros for unstated errors; also their names, and the project with usual errors instead."""
     unknown: dict[str, Any] = {}
     usual = project
     if known_height_errors(project) is None:
@@ -402,7 +402,7 @@ def _completed(project: Project, names: Sequence[str]) -> tuple[Project, dict[st
 
 
 def _of_unknown(unknown: dict[str, Any], usual: ImageBudget, project: Project) -> list[str]:
-    """Notes on what is not stated: that it is not in the total, what a usual error costs, and how to state it."""
+    """Return notes on errors that are not stated: the total lacks them, what usual ones cost, how to state them."""
     notes = ["the total holds only what is stated"]
     middle, _, corner = usual.parts.get(TERRAIN, np.zeros(3))
     if TERRAIN in unknown:
@@ -423,7 +423,7 @@ def _of_unknown(unknown: dict[str, Any], usual: ImageBudget, project: Project) -
 
 
 def _of_numbers(request: BudgetRequest) -> Project:
-    """A project of one vertical image over level ground."""
+    """Return a project of one vertical image over level ground."""
     side = request.pixel / 1000
     size = [max(1, round(mm / side)) for mm in request.format]
     assert request.height is not None
@@ -459,7 +459,7 @@ def _of_numbers(request: BudgetRequest) -> Project:
 
 
 def _stated(project: Project, request: BudgetRequest) -> tuple[Project, list[str]]:
-    """The project with what the request states of accuracies; then orientations are not correlated."""
+    """Return the project with the accuracies of the request; orientations then are not correlated."""
     given = {"sigma_center": request.sigma_center, "sigma_angles": request.sigma_angles}
     given = {name: value for name, value in given.items() if value is not None}
     notes = []
@@ -523,7 +523,7 @@ def _of_image(
 
 
 def _level(camera: Camera, ground: Ground, name: str) -> float:
-    """Height of the ground below an image."""
+    """Return the height of the ground below an image."""
     height = float(ground.bare.heights(camera.vantage.point[:2]))
     if not np.isfinite(height) and ground.bounds is not None:
         low, high = ground.bare.height_range(np.array(ground.bounds))
@@ -538,7 +538,7 @@ def _level(camera: Camera, ground: Ground, name: str) -> float:
 def _level_figures(
     errors: SourceErrors, XY: NDArray[np.float64], level: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Run of the rays per metre of height (n, 2), and the errors of position on level ground (n,), metres."""
+    """Return the run of rays per metre of height (n, 2), and errors of position on level ground (n,), metres."""
     grid = MapGrid(
         left=float(np.nanmin(XY[:, 0])), top=float(np.nanmax(XY[:, 1])), resolution=1.0, width=1, height=1, crs=_CRS
     )

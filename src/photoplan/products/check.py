@@ -1,4 +1,4 @@
-"""What to expect of a project, before more of its pixels are touched than a few windows."""
+"""Check of a project: plausibility, resolution and sensitivity of its images, by a few windows of their pixels."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ def _refused(name: str, error: InputError) -> ImageCheck:
 
 
 def _of_objects(project: Project, ground: Ground, names: Sequence[str]) -> tuple[str, ...]:
-    """What cannot be right of the objects as a whole."""
+    """Return what cannot be right about the objects as a whole."""
     if not project.objects:
         return ()
     told = heights_in_feet(ground.surface, [camera_without_pixels(project, name) for name in names])
@@ -292,14 +292,14 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
 
 
 def _on_terrain(camera: Camera, ground: Ground, seen: Footprint) -> float:
-    """Part of an image that shows terrain: holes may lie anywhere, and its border beyond the edge of a model."""
+    """Return the part of an image that shows terrain, by rays all over it: a model may have holes and an edge."""
     part = (np.arange(_RAYS) + 0.5) / _RAYS
     xy = np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) * camera.size - 0.5
     return float(np.isfinite(intersect(camera, xy, ground.bare, seen.height_range)[:, 0]).mean())
 
 
 def _torn(camera: Camera) -> str | None:
-    """What no aircraft does: lines that lie far from the smooth course, as angles in another unit or sense put them."""
+    """Return a fault if lines lie farther from the smooth course than any aircraft flies: angles are read wrongly."""
     far = max(float(tremor.largest.max()) for tremor in tremors_of(camera))
     if far <= max(_TORN * max(camera.size), _TORN_PIXELS):
         return None
@@ -310,7 +310,7 @@ def _torn(camera: Camera) -> str | None:
 
 
 def _longer(camera: Camera, seen: Footprint) -> float:
-    """How many times longer than wide pixels are on the ground, at the median; 1 for central cameras."""
+    """Return the median ratio of length and width of pixels on the ground; 1 for central cameras."""
     points = seen.outline[np.isfinite(seen.outline).all(axis=1)]
     if camera.vantage.central or not len(points):
         return 1.0
@@ -321,7 +321,7 @@ def _longer(camera: Camera, seen: Footprint) -> float:
 
 
 def _sensitivity(camera: Camera, seen: Footprint) -> tuple[float, float]:
-    """Largest displacement by 1 m of height, and by the earth's curvature, over the footprint; pixels."""
+    """Return the largest displacements by 1 m of height and by the earth's curvature over the footprint, pixels."""
     outline = seen.outline
     points = outline[np.isfinite(outline).all(axis=1)]
     if not len(points):
@@ -336,7 +336,7 @@ def _sensitivity(camera: Camera, seen: Footprint) -> tuple[float, float]:
 
 
 def _choice(project: Project, name: str, ground: Ground, seen: Footprint) -> float:
-    """Largest distance between an image's points by `earth_curvature` none and by strict, over the footprint; pixels.
+    """Return the largest distance between image points by `earth_curvature` none and strict over the footprint, pixels.
 
     Heights are taken as they are: an undulation of 100 m changes the scale by 2e-5.
     """

@@ -70,7 +70,7 @@ class ConvertReport(Result):
     notes: tuple[str, ...]
     """How the file was read."""
     lost: tuple[Loss, ...]
-    """What the target format cannot hold."""
+    """Losses: what the target format cannot hold."""
     dry_run: bool
 
     def json_fields(self) -> dict[str, Any]:
@@ -148,7 +148,7 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
 
 
 def _judged_area(table: OrientationTable, beyond: bool) -> tuple[str, ...]:
-    """Notes on centres a little outside the area of their CRS; those far outside are refused unless they are meant."""
+    """Note centres a little outside the area of their CRS; refuse those far outside unless they are meant."""
     if table.crs is None or table.origin is not None or beyond:
         return ()
     names = [image.name for image in table.images]
@@ -160,7 +160,7 @@ def _judged_area(table: OrientationTable, beyond: bool) -> tuple[str, ...]:
 
 
 def _against_positions(block: OrientationBlock, files: Mapping[str, Path]) -> tuple[str, ...]:
-    """What positions of receivers, in the file or in its images, say against its poses."""
+    """Return contradictions between poses and positions of receivers, in the file or in its images."""
     table = block.table
     stated = stated_positions(table, files)
     if table.origin is not None:
@@ -173,7 +173,7 @@ def _against_positions(block: OrientationBlock, files: Mapping[str, Path]) -> tu
 
 
 def _image_files(block: OrientationBlock) -> dict[str, Path]:
-    """Image files that a file of orientations names, or that lie beside it under the names of its images."""
+    """Return image files that an orientation file names, or that lie next to it under the names of its images."""
     folder = block.table.file if block.table.file.is_dir() else block.table.file.parent
     names = [image.name for image in block.table.images]
     try:
@@ -194,7 +194,7 @@ def read_block(path: Path, form: TableFormat, format: str | None) -> tuple[str, 
 
 
 def with_cameras(block: OrientationBlock, path: Path) -> OrientationBlock:
-    """The block with the cameras of a file."""
+    """Return the block with the cameras of a file."""
     cameras = read_cameras(path)
     table = block.table
     images = tuple(replace(image, camera=camera_name(image, cameras, table.file)) for image in table.images)
@@ -204,7 +204,7 @@ def with_cameras(block: OrientationBlock, path: Path) -> OrientationBlock:
 
 
 def _with_axes(block: OrientationBlock, request: ConvertRequest) -> OrientationBlock:
-    """The block with its rotations brought to our camera axes."""
+    """Return the block with its rotations in our camera axes."""
     F = turn_matrix(request.camera_axes, request.turned)
     if np.array_equal(F, np.eye(3)):
         return block
@@ -222,7 +222,7 @@ def _with_poses(table: OrientationTable, centers: NDArray[np.float64], opk: NDAr
 
 
 def _in_crs(block: OrientationBlock, crs: str | None) -> OrientationBlock:
-    """The block in a CRS, with heights in metres in their own height system."""
+    """Return the block in a CRS, with heights in metres in their own height system."""
     block = replace(block, table=block.table.heights_in_metres(None))
     if crs is None:
         return block
@@ -241,7 +241,7 @@ def _beside(path: Path, name: str, suffix: str) -> Path:
 
 
 def _files_from(block: OrientationBlock, folder: Path) -> OrientationBlock:
-    """The block with paths of image files that exist written from another folder."""
+    """Return the block with paths of existing image files written from another folder."""
     source = block.table.file if block.table.file.is_dir() else block.table.file.parent
     files = {}
     for name, file in block.files.items():
@@ -292,7 +292,7 @@ class ReadingsReport(Result):
     notes: tuple[str, ...]
 
     def options(self, reading: Reading) -> str:
-        """What to give to `photoplan convert` so that it reads the file so."""
+        """Return the options by which `photoplan convert` reads the file so."""
         words = [] if self.matrices else [f"`angle_unit` {reading.angle_unit}", f"`rotation` {reading.rotation}"]
         words.append(f"`rotation_direction` {reading.direction}")
         if reading.camera_axes != Reading.camera_axes:
@@ -375,14 +375,14 @@ def list_readings(request: ConvertRequest, image_points: Path, control: Path) ->
 
 
 def _as_stated(request: ConvertRequest) -> tuple[str, OrientationBlock]:
-    """The file's numbers: read so that no unit or direction is refused; what they are taken for does not matter."""
+    """Read the numbers of a file so that no unit or direction is refused; their meaning is open."""
     # Of all units gon allows the largest numbers.
     form = request.form.replace(angle_unit="gon", rotation="opk", direction="camera-to-ground")
     return read_block(request.orientation, form, request.format)
 
 
 def _cameras(block: OrientationBlock) -> tuple[dict[str, tuple[Interior, Lens]], list[str]]:
-    """Interior orientation and lens of every image, and notes on images without one."""
+    """Return interior orientation and lens of every image, and notes on images without one."""
     found: dict[str, tuple[Interior, Lens]] = {}
     missing = []
     for image in block.table.images:

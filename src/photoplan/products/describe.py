@@ -1,4 +1,4 @@
-"""What a file holds, in words: rasters, rational polynomials, terrain models, projects, plans, filters."""
+"""Descriptions of files: rasters, rational polynomials, terrain models, projects, plans, filters."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ from photoplan.surfaces.units import LineElement, UnitFigures
 
 
 def describe_filter(path: Path) -> dict[str, Any]:
-    """Facts of a filter file by name, as plain values; lists have a line each."""
+    """Return facts of a filter file by name, as plain values; lists have a line each."""
     used = load_filter(path)
     columns, rows = used.margin
     facts: dict[str, Any] = {
@@ -85,7 +85,7 @@ def _kernel(kernel: FilterKernel) -> str:
 
 
 def place_of(kernel: FilterKernel) -> str:
-    """Band and place in the field of a kernel."""
+    """Return the band and the place in the field of a kernel."""
     band = "all bands" if kernel.band is None else f"band {kernel.band}"
     return band if kernel.at is None else f"{band} at {kernel.at[0]:g}, {kernel.at[1]:g}"
 
@@ -119,7 +119,7 @@ def describe_file(request: DescribeRequest, events: Events = SILENT) -> FileFact
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Facts of a file by name, as plain values; lists have a line each."""
+    """Return facts of a file by name, as plain values; lists have a line each."""
     if path.is_dir():
         return _oriented(path)
     if not path.is_file():
@@ -165,7 +165,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _first(path: Path, readers: Sequence[Callable[[Path], dict[str, Any]]]) -> dict[str, Any] | None:
-    """What the first reader that understands a file says of it; None: none does."""
+    """Return facts from the first reader that understands a file; None if none does."""
     for reader in readers:
         try:
             return reader(path)
@@ -175,7 +175,7 @@ def _first(path: Path, readers: Sequence[Callable[[Path], dict[str, Any]]]) -> d
 
 
 def _toml(path: Path) -> dict[str, Any]:
-    """Facts of a TOML file of any kind."""
+    """Return facts of a TOML file of any kind."""
     contents, _ = read_toml(path)
     if "images" in contents:
         try:
@@ -202,7 +202,7 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def readable(value: Any) -> Any:
-    """A value of a file as text; tables and lists of tables have a line for each entry, long ones their first lines."""
+    """Return a value as text; tables and lists of tables have a line for each entry, long ones their first lines."""
     if isinstance(value, dict):
         lines = [f"{name}: {_short(each)}" for name, each in value.items()]
     elif isinstance(value, list):
@@ -215,7 +215,7 @@ def readable(value: Any) -> Any:
 
 
 def _short(value: Any) -> str:
-    """A value in one line."""
+    """Return a value in one line."""
     if isinstance(value, dict):
         text = ", ".join(f"{name} {_short(each)}" for name, each in value.items() if each not in (None, [], {}))
     elif isinstance(value, list):
@@ -351,7 +351,7 @@ def _plan(path: Path) -> dict[str, Any]:
 
 
 def _record(path: Path) -> dict[str, Any] | None:
-    """Facts of a run record; None: the file is another JSON."""
+    """Return facts of a run record; None if the file is another JSON."""
     content = read_json(path)
     if not isinstance(content, dict) or not {"key", "versions"} <= content.keys():
         return None
@@ -390,7 +390,7 @@ def _raster(info: RasterInfo) -> dict[str, Any]:
 
 
 def describe_model(reader: ModelReader) -> dict[str, Any]:
-    """Facts of a terrain model by name, as texts; lists have a line each."""
+    """Return facts of a terrain model by name, as texts; lists have a line each."""
     f = model_figures(reader)
     low, high = f["heights"]
     xmin, ymin, xmax, ymax = f["bounds"]
@@ -424,7 +424,7 @@ def describe_model(reader: ModelReader) -> dict[str, Any]:
 
 
 def model_figures(reader: ModelReader) -> dict[str, Any]:
-    """Figures of a terrain model as plain values; None where there is none.
+    """Return figures of a terrain model as plain values; None where there is none.
 
     Length, signal, noise, sigma and spread are the whole model's, as the build told them. A model without these has
     medians (of lengths) and root mean squares over its units that are not empty, each unit counted once.
@@ -503,7 +503,7 @@ def _rms(values: list[float]) -> float | None:
 
 
 def _spread(units: list[UnitFigures]) -> float | None:
-    """Spread over all units, each weighted with its points."""
+    """Return the spread over all units, each weighted with its points."""
     good = [(u.points, u.spread) for u in units if np.isfinite(u.spread) and u.points > 0]
     if not good:
         return None
@@ -517,7 +517,7 @@ def _number(value: float | None) -> str:
 
 @dataclass(frozen=True)
 class TerrainFacts(Result):
-    """What is known of a terrain file."""
+    """Facts of a terrain file."""
 
     facts: dict[str, Any]
     """In words, by name; lists have a line each."""
@@ -555,7 +555,7 @@ def describe_terrain(request: InfoRequest, events: Events = SILENT) -> TerrainFa
 
 
 def dtm_info(path: Path) -> TerrainFacts:
-    """Facts of a model or of a raster of heights.
+    """Describe a terrain model or a raster of heights.
 
     Raises
     ------

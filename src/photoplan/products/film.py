@@ -325,7 +325,7 @@ def _locate(request: FiducialsRequest, job: _Job, pixel_mm: float | None, in_pro
 
 
 def _entries(project: Project, result: ImageFiducials) -> dict[str, object]:
-    """What is written for an image."""
+    """Return the entries of an image in the project."""
     image = project.image(result.name)
     marks = {m.name: [round(m.x, 4), round(m.y, 4)] for m in result.found.marks}
     entries: dict[str, object] = {"fiducials": marks}
@@ -448,7 +448,7 @@ class InteriorResult(Result):
 
 
 def interior_orientations(request: InteriorRequest, events: Events = SILENT) -> InteriorResult:
-    """Interior orientation of every film scan of a project whose marks are measured.
+    """Compute the interior orientation of every film scan of a project whose marks are measured.
 
     Scans with marks that cannot be right are listed in the result, the others are computed all the same; the project
     file is changed only if none fails.
@@ -624,7 +624,7 @@ def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectRes
 
 
 def _overridden(project: Project, request: ResectRequest) -> Project:
-    """The project with the measurements that options name."""
+    """Return the project with the measurements that options name."""
     changes: dict[str, Any] = {
         "image_points": tuple(str(p.absolute()) for p in request.image_points),
         "control": tuple(str(p.absolute()) for p in request.control),
@@ -791,7 +791,7 @@ def _rounded(values: Array, decimals: int) -> list[float]:
 
 
 def control_rows(inputs: AdjustInputs, name: str) -> list[tuple[int, int]]:
-    """Measurements of control with three known coordinates in an image: (measurement, ground point)."""
+    """Return the measurements of control with three known coordinates in an image: (measurement, ground point)."""
     points, ground = inputs.points, inputs.ground
     if name not in points.images:
         return []
@@ -860,7 +860,7 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
 
 
 def _calibration(project: Project, image: Image, found: Resected) -> tuple[Calibrated, dict[str, Any]]:
-    """What an image says of its camera, and the entries that the description gets."""
+    """Return the calibrated camera of an image, and the entries that its description gets."""
     described = project.cameras[image.camera]
     start = block_camera(image.camera, described, interior_of(described, image))
     adjusted = AdjustedCamera(
@@ -882,7 +882,7 @@ def _notes(of_angles: Array) -> Sequence[str]:
 
 
 def measured_control(inputs: AdjustInputs, rows: list[tuple[int, int]]) -> MeasuredPoints:
-    """The points of `control_rows`."""
+    """Return the points of `control_rows`."""
     points, ground = inputs.points, inputs.ground
     k, g = np.array(rows, np.int64).reshape(-1, 2).T
     covariance = np.zeros((len(g), 3, 3))
@@ -896,7 +896,7 @@ def measured_control(inputs: AdjustInputs, rows: list[tuple[int, int]]) -> Measu
 def resected(
     project: Project, image: Image, points: MeasuredPoints, interior: Interior, lens: Lens, settings: ResectSettings
 ) -> Resected:
-    """Resection with the earth curvature and refraction of the project."""
+    """Resect an image with the earth curvature and refraction of the project."""
     orientation = project.orientation
     curvature, refraction = orientation.earth_curvature, orientation.refraction
     camera_of = partial(oriented_camera, crs=project.crs, earth_curvature=curvature, refraction=refraction)

@@ -61,7 +61,7 @@ class Unoriented:
 
 
 def image_files(patterns: tuple[str, ...]) -> list[Path]:
-    """Files of all patterns, each once, in the order of the patterns and sorted within."""
+    """Return the files of all patterns, each once, in the order of the patterns and sorted within."""
     found: dict[Path, None] = {}
     for pattern in patterns:
         check_input_name(pattern)
@@ -79,7 +79,7 @@ def image_files(patterns: tuple[str, ...]) -> list[Path]:
 def match_images(
     files: list[Path], table: OrientationTable
 ) -> tuple[list[tuple[Path, OrientedImage | Unoriented]], list[Path], list[str]]:
-    """Image files with their orientation, files without, and names without a file.
+    """Match image files with orientations; return these pairs, files without, and names without a file.
 
     See `photoplan.io.files.ImageNames` for how names are compared.
     """
@@ -134,14 +134,14 @@ def camera_name(image: OrientedImage, cameras: CameraFile, table: Path) -> str:
 
 
 def some(names: list[str]) -> str:
-    """The first names, and how many more there are."""
+    """Return the first names, and how many more there are."""
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return ", ".join(names[:SHOWN]) + more
 
 
 @dataclass(frozen=True)
 class TerrainSource:
-    """What a terrain file states of its systems."""
+    """Coordinate systems that a terrain file states."""
 
     path: Path
     crs: str | None
@@ -157,7 +157,7 @@ def _terrain_facts(file: Path) -> TerrainSource:
 
 
 def terrain_entry(request: InitRequest) -> tuple[StatedTerrain | None, TerrainSource | None]:
-    """The terrain entry (height system still open) and the facts of its file."""
+    """Return the terrain entry (height system still open) and the facts of its file."""
     if request.terrain is None:
         return None, None
     text = request.terrain.strip()
@@ -186,7 +186,7 @@ def project_crs(
     terrain: TerrainSource | None,
     place: tuple[float, float] | None = None,
 ) -> tuple[str, str]:
-    """The project's CRS and where it comes from; `place` is the latitude and longitude of a satellite image,
+    """Return the project's CRS and its origin; `place` is the latitude and longitude of a satellite image,
     degrees.
     """
     if request.crs is not None:
@@ -209,7 +209,7 @@ def project_crs(
 
 
 def _map_of(terrain: TerrainSource | None) -> tuple[str, str] | None:
-    """The CRS of a terrain file, if products can be in it."""
+    """Return the CRS of a terrain file, if products can be in it."""
     if terrain is None or terrain.crs is None:
         return None
     crs = _horizontal(terrain.crs)
@@ -228,7 +228,7 @@ def _horizontal(text: str) -> str:
 def height_systems(
     request: InitRequest, table: OrientationTable | None, terrain: TerrainSource | None, ellipsoidal: bool = False
 ) -> tuple[str | None, str]:
-    """Height systems of terrain and orientation (with that of control): as declared, else as the files state.
+    """Return the height systems of terrain and of orientation and control: as declared, else as the files state.
 
     That of images which bring their geometry along is `ellipsoidal`.
     """
@@ -262,7 +262,7 @@ def height_systems(
 
 
 def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS."""
+    """Return projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS."""
     if table.origin is not None:
         with named_by(table.file):
             centers, axes = topocentric_poses(table.origin, crs, table.centers)
@@ -286,7 +286,7 @@ def placed(table: OrientationTable, crs: str) -> tuple[NDArray[np.float64], NDAr
 def in_declared_unit(
     request: InitRequest, table: OrientationTable | None, others: Sequence[Path]
 ) -> OrientationTable | None:
-    """The orientation with heights in metres, by the unit of its file or of the height system declared for it."""
+    """Return the orientation with heights in metres, by the unit of its file or of its declared height system."""
     own = None if table is None else table.height_system
     declared = request.orientation_height_system or (request.height_system if own is None else None)
     if declared is not None and declared.strip().casefold() not in ("same", "ellipsoidal"):
@@ -302,7 +302,7 @@ def in_declared_unit(
 
 
 def check_joined(terrain: str | None, images: str, crs: str, centers: NDArray[np.float64]) -> None:
-    """Fail now, not in every later command, if the height systems cannot be joined here."""
+    """Refuse height systems that cannot be joined here, now and not in every later command."""
     if terrain is None:
         return
     bounds = (centers[:, 0].min(), centers[:, 1].min(), centers[:, 0].max(), centers[:, 1].max())
@@ -340,7 +340,7 @@ def project_names(files: Sequence[Path]) -> dict[Path, str]:
 
 
 def own_geometry(files: Iterable[Path], folder: Path, names: Mapping[Path, str]) -> dict[Path, OwnGeometry]:
-    """Those of the files that have rational polynomials; tags and files beside the image must agree."""
+    """Return the files that have rational polynomials; tags and files next to the image must agree."""
     found = {}
     for file in files:
         rpc, beside = rpc_in(file), None
@@ -491,7 +491,7 @@ def make_project(request: InitRequest, events: Events = SILENT) -> InitResult:
 
 
 def _readable(files: Sequence[Path]) -> tuple[dict[Path, RasterInfo], list[str]]:
-    """Facts of the images that can be opened, and why others cannot."""
+    """Return facts of the images that can be opened, and why others cannot."""
     infos: dict[Path, RasterInfo] = {}
     unusable: list[str] = []
     for file in files:
@@ -555,7 +555,7 @@ def _judge_area(
 
 
 def _described(request: InitRequest, pairs: Sequence[tuple[Path, object]]) -> CameraFile:
-    """Cameras of the images that need one."""
+    """Read the cameras of the images that need one."""
     if request.camera is not None:
         return read_cameras(request.camera)
     if pairs:
@@ -572,7 +572,7 @@ def _cameras(
     infos: dict[Path, RasterInfo],
     table: Path | None,
 ) -> dict[str, tuple[str, CameraEntry]]:
-    """Camera (name and description) of every image name; sizes agree with the files'."""
+    """Return the camera (name and description) of every image name; sizes must agree with the files'."""
     used: dict[str, tuple[str, CameraEntry]] = {}
     sizes: dict[str, tuple[int, int]] = {}
     for file, image in pairs:
@@ -602,7 +602,7 @@ def _checked(
     cameras: dict[str, CameraEntry],
     images: Sequence[ImageEntry],
 ) -> Project:
-    """The project, checked as if it had been read."""
+    """Return the project, checked as if it had been read."""
     orientation = {
         "height_system": height_system,
         "earth_curvature": request.earth_curvature,
@@ -626,7 +626,7 @@ def _checked(
 
 
 def _observations(request: InitRequest) -> dict[str, Any]:
-    """Entries of [observations]; the files have to be there."""
+    """Return the entries of [observations]; the files must exist."""
     entries: dict[str, Any] = {}
     for key, files in (("image_points", request.image_points), ("control", request.control)):
         if files:
@@ -637,7 +637,7 @@ def _observations(request: InitRequest) -> dict[str, Any]:
 
 
 def _present(file: Path, folder: Path, *, or_folder: bool = False) -> str:
-    """Path from the project; positions may be a folder, of images that state them."""
+    """Return a path from the project; positions may be a folder, of images that state them."""
     check_input_name(str(file))
     if not (file.is_file() or (or_folder and file.is_dir())):
         raise InputError(f"{file}: no such file; give the measurements that exist, or add them to the project later")
@@ -653,7 +653,7 @@ def _summary(
     without_file: list[str],
     table: OrientationTable | None,
 ) -> list[str]:
-    """What was found, in a few lines, of images with a camera and of so many with polynomials."""
+    """Return a few lines on images with a camera and on those with polynomials."""
     parts = [f"{len(pairs)} images" + ("" if table else " without orientation")] if pairs else []
     parts += [f"{own} images with rational polynomials (RPC)"] if own else []
     for name, camera in dict(used.values()).items():

@@ -80,7 +80,7 @@ _FRAME = 0.02
 
 
 class Placing(Projection, Rays, Protocol):
-    """What tells where an image lies: a central camera, or the map."""
+    """Geometry by which an image is placed: a central camera, or the map."""
 
     @property
     def center(self) -> NDArray[np.float64]:
@@ -112,7 +112,7 @@ class TieImage:
         return self.camera is not None and bool(np.isfinite(self.level))
 
     def on_ground(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where rays of image points (n, 2) meet the level of the ground, (n, 3); NaN for those that do not."""
+        """Return where rays of image points (n, 2) meet the level of the ground, (n, 3); NaN if they do not."""
         assert self.camera is not None
         origin, direction = self.camera.rays(xy, self.level)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -121,7 +121,7 @@ class TieImage:
 
 
 def open_images(project_: Project, names: Sequence[str], use_orientation: bool) -> tuple[list[TieImage], list[str]]:
-    """The images of a project, and notes on what is not known of some."""
+    """Open images of a project; return notes on what is unknown about some, too."""
     images = [project_.image(name) for name in names]
     positions = _positions(project_, use_orientation)
     cameras, levels = _placed(project_, images) if use_orientation else ([None] * len(images), [np.nan] * len(images))
@@ -156,7 +156,7 @@ def _calibration(project_: Project, image: Image, size: tuple[int, int]) -> Cali
 
 
 def _area(image: Image, size: tuple[int, int]) -> tuple[float, float, float, float] | None:
-    """Inside of the fiducial marks of a scan."""
+    """Return the area inside the fiducial marks of a scan."""
     if not image.fiducials:
         return None
     xy = np.array(list(image.fiducials.values()), float)
@@ -168,7 +168,7 @@ def _area(image: Image, size: tuple[int, int]) -> tuple[float, float, float, flo
 
 
 def _positions(project_: Project, use: bool) -> dict[str, NDArray[np.float64]]:
-    """Observed positions by the images' names."""
+    """Return observed positions by the names of images."""
     if not use or project_.observations.positions is None:
         return {}
     orientation = project_.orientation
@@ -184,7 +184,7 @@ def _positions(project_: Project, use: bool) -> dict[str, NDArray[np.float64]]:
 
 
 def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[CentralCamera | None], list[float]]:
-    """Cameras of the oriented images, and the height of the ground below each."""
+    """Return the cameras of oriented images, and the height of the ground below each."""
     cameras: list[CentralCamera | None] = [None] * len(images)
     levels = np.full(len(images), np.nan)
     if project_.terrain is None:
@@ -203,7 +203,7 @@ def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[CentralCam
 
 
 def chosen_pairs(images: Sequence[TieImage], how: str) -> tuple[list[tuple[int, int]] | None, str]:
-    """Pairs to look at and how they were chosen; None: the features must tell."""
+    """Return the pairs to compare, or None if features must decide, and how they were chosen."""
     if how == "all":
         return all_pairs(len(images)), "all pairs"
     if how != "auto":
@@ -256,7 +256,7 @@ def _listed(images: Sequence[TieImage], path: Path) -> list[tuple[int, int]]:
 
 
 def guide_of(a: TieImage, b: TieImage, xy: NDArray[np.float64]) -> Guide | None:
-    """Where features of a are to be expected in b by approximate orientation; None if that is not known."""
+    """Return where features of a are expected in b by approximate orientation; None if that is unknown."""
     if not (a.placed and b.placed):
         return None
     assert b.camera is not None
@@ -308,7 +308,7 @@ class FeatureStore:
 
 
 def find_features(store: FeatureStore, which: Sequence[int], run: Steps) -> list[Features]:
-    """Features of some images, without their descriptors; the others have none."""
+    """Find features of some images, without their descriptors; the others have none."""
     found = run(
         lambda i: extract_features(i.grey, store.settings),
         [store.images[k] for k in which],
@@ -323,7 +323,7 @@ def find_features(store: FeatureStore, which: Sequence[int], run: Steps) -> list
 
 
 def further_pairs(images: Sequence[TieImage], weak: Sequence[int]) -> set[tuple[int, int]]:
-    """Pairs of weakly connected images with the others: all of a small block, else twice the usual neighbours."""
+    """Return pairs of weakly connected images: with all of a small block, else with more neighbours than usual."""
     if len(images) <= FEW_IMAGES:
         return {(min(i, j), max(i, j)) for i in weak for j in range(len(images)) if i != j}
     places = [image.position for image in images]
@@ -338,7 +338,7 @@ def further_pairs(images: Sequence[TieImage], weak: Sequence[int]) -> set[tuple[
 
 
 def like_pairs(store: FeatureStore) -> list[tuple[int, int]]:
-    """Pairs that share large features."""
+    """Return pairs that share large features."""
     coarse = []
     for k in range(len(store.images)):
         f = store[k]
@@ -349,7 +349,7 @@ def like_pairs(store: FeatureStore) -> list[tuple[int, int]]:
 def find_pairs(
     store: FeatureStore, pairs: Sequence[tuple[int, int]], settings: VerifySettings, run: Steps
 ) -> list[PairMatches]:
-    """Verified matches of the pairs; those that are not verified have none."""
+    """Find verified matches of the pairs; those that are not verified have none."""
     order = {first: number for number, first in enumerate(dict.fromkeys(i for i, _ in pairs))}
     # Pairs with a common first image follow each other: its features are in memory then.
     pairs = sorted(pairs, key=lambda pair: order[pair[0]])
@@ -360,7 +360,7 @@ def find_pairs(
 
 
 def _place(image: TieImage) -> str:
-    """What guides the matching."""
+    """Return the approximate orientation that guides the matching, as text."""
     if not image.placed or image.camera is None:
         return ""
     corners = image.on_ground(np.array([[0.0, 0.0], [image.grey.size[0], image.grey.size[1]]]))
@@ -368,7 +368,7 @@ def _place(image: TieImage) -> str:
 
 
 def _pair(store: FeatureStore, i: int, j: int, settings: VerifySettings) -> tuple[NDArray[np.int64], int]:
-    """Verified matches of a pair as indices of features, and the number of matches before."""
+    """Return verified matches of a pair as indices of features, and the number of matches before."""
     a, b = store[i], store[j]
     one, other = store.images[i], store.images[j]
     matches = match_features(a, b, guide=guide_of(one, other, a.xy))
@@ -399,7 +399,7 @@ class RectifiedPixels:
         return self.grid.width, self.grid.height
 
     def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-        """Pixels of a window inside the image, shape (bands, height, width), and their validity."""
+        """Read a window inside the image, shape (bands, height, width), and its validity."""
         bands, dtype = self.scene.reader.bands, self.scene.reader.dtype
         values = np.zeros((bands, window.height, window.width), dtype)
         valid = np.zeros((window.height, window.width), bool)
@@ -428,7 +428,7 @@ class RectifiedPixels:
         return made.values, made.valid
 
     def carried(self, uv: _Floats) -> tuple[_Floats, _Floats]:
-        """Image points (n, 2) of points on the map (n, 2), and the derivatives (n, 2, 2); NaN where there are none."""
+        """Return image points (n, 2) of points on the map (n, 2), and derivatives (n, 2, 2); NaN if there are none."""
         half = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
         at = uv[:, None] + half
         g = self.grid
@@ -462,11 +462,11 @@ class MapView:
         return np.array([(xmin + xmax) / 2, (ymin + ymax) / 2, 1.0])
 
     def project_homogeneous(self, XYZ: ArrayLike) -> _Floats:
-        """Ground (..., 3) to (x, y, 1)."""
+        """Return (x, y, 1) of ground points (..., 3)."""
         return MapProjection(self.grid.placement).project_homogeneous(XYZ)
 
     def rays(self, xy: ArrayLike, height: float | None = None) -> tuple[_Floats, _Floats]:
-        """Straight down, from a metre above the zero of heights."""
+        """Return rays straight down, from a metre above the zero of heights."""
         xy, g = np.asarray(xy, float), self.grid
         X, Y = g.left + (xy[..., 0] + 0.5) * g.resolution, g.top - (xy[..., 1] + 0.5) * g.resolution
         down = np.broadcast_to([0.0, 0.0, -1.0], (*X.shape, 3))
@@ -474,7 +474,7 @@ class MapView:
 
 
 def open_rectified(project_: Project, names: Sequence[str], use_orientation: bool) -> tuple[list[TieImage], list[str]]:
-    """The images of a project on the map, at the coarsest of their resolutions, and a note of that."""
+    """Open images of a project on the map at the coarsest of their resolutions, and note that."""
     if not use_orientation:
         raise UsageError("satellites and strips are matched on the map, by the orientation that they come with; use it")
     scenes = [open_scene(project_, name) for name in names]
@@ -502,7 +502,7 @@ def open_rectified(project_: Project, names: Sequence[str], use_orientation: boo
 
 
 def carried_back(tracks: Tracks, images: Sequence[TieImage], points: ImagePoints) -> ImagePoints:
-    """Points that were found on the map, where they lie in the images; tracks that keep fewer than two places go."""
+    """Return points found on the map as points in the images; tracks with fewer than two of them are dropped."""
     xy, sigma = np.full_like(points.xy, np.nan), np.full_like(points.xy, np.nan)
     good = np.zeros(len(points), bool)
     for k in np.unique(tracks.image):
@@ -749,7 +749,7 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
 
 
 def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
-    """The output, and everything that can be refused before any work."""
+    """Return the output; refuse before any work what can be refused."""
     if len(names) < 2:
         raise UsageError(f"{len(names)} image; tie points need two images at least")
     opencv()
@@ -785,7 +785,7 @@ class _Level:
         return self.store.settings.factor
 
     def tried(self, names: Sequence[str]) -> Iterator[TriedPair]:
-        """Every pair, with the reason where it is not verified."""
+        """Yield every pair, with the reason if it is not verified."""
         for p in self.pairs:
             alike = p.tried < VerifySettings().least
             reason = "too few features look alike" if alike else "features that look alike fit no common geometry"
@@ -852,7 +852,7 @@ def _write_pairs(path: Path, tried: Sequence[TriedPair]) -> None:
 
 
 def _advice(request: TieRequest, report: TieReport, tried: Sequence[TriedPair]) -> str:
-    """What failed of the images that are not connected, and what to change."""
+    """Return why images are not connected, and what to change."""
     if not report.unconnected:
         return ""
     lost = set(report.unconnected)
@@ -890,7 +890,7 @@ def _refuse_nothing(
 def _refine(
     request: TieRequest, parts: Sequence[tuple[int, Tracks]], images: Sequence[TieImage], run: Steps
 ) -> tuple[Tracks, Refined | None, Loops | None]:
-    """Tracks with standard deviations; first at the scale of their features, then at full resolution.
+    """Refine tracks at the scale of their features, then at full resolution; they get standard deviations.
 
     `parts` are the tracks of each scale, with its reduction. Tracks of weakly connected images that noise hides at full
     resolution get the place that they have in reduced images.
@@ -933,14 +933,14 @@ def _refine(
 
 
 def _rays_in(tracks: Tracks, others: Tracks) -> NDArray[np.int64]:
-    """How many points of each track belong to any of other tracks, which were made from the same features."""
+    """Count the points of each track that belong to other tracks, made from the same features."""
     known = set(zip(others.image.tolist(), others.angle.tolist()))
     there = [key in known for key in zip(tracks.image.tolist(), tracks.angle.tolist())]
     return np.bincount(tracks.track[np.array(there, bool)], minlength=tracks.count)
 
 
 def _scaled(tracks: Tracks, by: float) -> Tracks:
-    """Tracks in another scale of the images; standard deviations are not carried over."""
+    """Return tracks in another scale of the images, without standard deviations."""
     return replace(tracks, xy=(tracks.xy + 0.5) * by - 0.5, scale=tracks.scale * by)
 
 

@@ -49,7 +49,7 @@ _STRIPS = (BLUE, GREEN, PURPLE, SKY, "#7a5c00", INK)
 
 @styled
 def draw_network(facts: AdjustReport) -> bytes:
-    """Image centres by strip, tie points, control and check points."""
+    """Draw image centres by strip, tie points, control and check points."""
     fig, axes = _map(facts)
     step = max(1, -(-len(facts.tie_XY) // _DOTS))
     dots = facts.tie_XY[::step]
@@ -76,7 +76,7 @@ def draw_network(facts: AdjustReport) -> bytes:
 
 @styled
 def draw_control(facts: AdjustReport, check: bool) -> tuple[bytes, str]:
-    """Residual vectors of control or check points with the 95 % ellipses of the adjusted points, and the scale.
+    """Draw residual vectors and 95 % ellipses of control or check points; return the scale, too.
 
     What was taken out has no arrow: its residual would set the scale, and the others could not be seen.
     """
@@ -115,7 +115,7 @@ def draw_control(facts: AdjustReport, check: bool) -> tuple[bytes, str]:
 
 @styled
 def draw_sigmas(facts: AdjustReport) -> bytes:
-    """Standard deviations of the projection centres: in the horizontal, and of the height."""
+    """Draw standard deviations of the projection centres, horizontal and height."""
     fig = figure_of(_WIDTH, _height(facts, half=True) + 0.9)
     panels = fig.subplots(1, 2, sharex=True, sharey=True)
     at = np.array([image.center for image in facts.images])
@@ -138,7 +138,7 @@ def draw_sigmas(facts: AdjustReport) -> bytes:
 
 @styled
 def draw_field(field: ResidualField) -> tuple[bytes, str]:
-    """Mean residual vectors over the image format, and how many times they are enlarged."""
+    """Draw mean residual vectors over the image format; return how many times they are enlarged, too."""
     xmin, ymin, xmax, ymax = field.frame
     ratio = (ymax - ymin) / (xmax - xmin)
     fig, axes = axes_of(_WIDTH, float(np.clip(5.6 * ratio, 2.4, 7.0)) + 0.8)
@@ -237,7 +237,7 @@ def _frame(axes: Any, facts: AdjustReport) -> None:
 
 
 def _arrow(axes: Any, x: float, y: float, dx: float, dy: float, colour: str) -> None:
-    """An arrow whose head is smaller where it is short, so that its length can be seen."""
+    """Draw an arrow whose head is smaller if it is short, so that its length can be seen."""
     head = {"headwidth": 4.5, "headlength": 5.0, "headaxislength": 5.0, "minshaft": 1.5, "minlength": 0.3}
     axes.quiver(
         x,
@@ -300,7 +300,7 @@ Row = list[str | Cell]
 
 
 def measurement_table(some: Sequence[NamedMeasurement]) -> str:
-    """Observations with their residuals."""
+    """Return a table of observations with their residuals."""
     rows: list[Row] = [
         [m.what, cell(m.residual.replace("-", "−")), cell(plain(m.normalised, 1, sign=True))] for m in some[:MOST_ROWS]
     ]
@@ -309,7 +309,7 @@ def measurement_table(some: Sequence[NamedMeasurement]) -> str:
 
 
 def ground_table(ground: Sequence[GroundFigures], normalised: bool) -> str:
-    """Residuals and standard deviations of control or check points."""
+    """Return a table of residuals and standard deviations of control or check points."""
     rows: list[Row] = []
     for g in ground[:MOST_ROWS]:
         row: Row = [g.name, cell(number(g.rays) if g.rays else "–")]
@@ -327,7 +327,7 @@ def ground_table(ground: Sequence[GroundFigures], normalised: bool) -> str:
 
 
 def camera_parts(camera: Calibrated) -> list[str]:
-    """Calibrated parameters of a camera and their correlations."""
+    """Return calibrated parameters of a camera and their correlations."""
     rows: list[Row] = []
     for k, name in enumerate(camera.parameters):
         change = float(camera.after[k] - camera.before[k])
@@ -368,7 +368,7 @@ def camera_parts(camera: Calibrated) -> list[str]:
 
 
 def position_parts(facts: AdjustReport) -> list[str]:
-    """Residuals of observed positions by strip; drift, lever arm, boresight."""
+    """Return residuals of observed positions by strip; drift, lever arm, boresight."""
     rows: list[Row] = []
     for s in facts.strips[:MOST_ROWS]:
         row: Row = [s.name, cell(number(s.count)), cell(number(s.rejected))]
@@ -398,7 +398,7 @@ def position_parts(facts: AdjustReport) -> list[str]:
 
 
 def image_parts(facts: AdjustReport) -> list[str]:
-    """Residuals and standard deviations image by image."""
+    """Return residuals and standard deviations image by image."""
     order = sorted(facts.images, key=lambda i: -_or_zero(float(np.hypot(*i.rms))))
     rows: list[Row] = []
     for image in order[:MOST_ROWS]:
@@ -439,7 +439,7 @@ def image_parts(facts: AdjustReport) -> list[str]:
 
 
 def left_out_parts(facts: AdjustReport) -> list[str]:
-    """What could not take part, by reason."""
+    """Return what could not take part, by reason."""
     reasons: dict[str, list[str]] = {}
     for name, reason in facts.left_out:
         reasons.setdefault(reason, []).append(name)
@@ -451,12 +451,12 @@ def left_out_parts(facts: AdjustReport) -> list[str]:
 
 
 def paragraph(words: str) -> str:
-    """A paragraph of escaped text."""
+    """Return a paragraph of escaped text."""
     return f"<p>{text(words)}</p>"
 
 
 def warning(words: str) -> str:
-    """A warning that cannot be overlooked."""
+    """Return a warning that cannot be overlooked."""
     return f"<p><strong>Warning:</strong> {text(words)}.</p>"
 
 
@@ -465,12 +465,12 @@ def _more(count: int) -> str:
 
 
 def cell(words: str) -> Cell:
-    """A cell with a number."""
+    """Return a cell with a number."""
     return Cell(words, number=True)
 
 
 def to_unit(radians: float, unit: str) -> float:
-    """Radians in an angle unit."""
+    """Return radians in an angle unit."""
     return radians * {"deg": 180.0 / np.pi, "gon": 200.0 / np.pi, "rad": 1.0}[unit]
 
 
@@ -479,12 +479,12 @@ def _or_zero(value: float) -> float:
 
 
 def number(value: int) -> str:
-    """With thin spaces between thousands."""
+    """Return a number with thin spaces between thousands."""
     return f"{value:,}".replace(",", "\u202f")
 
 
 def plain(value: float, digits: int | None = None, sign: bool = False) -> str:
-    """With that number of digits, None: millimetres and two figures at least; a dash where there is no value."""
+    """Return a number with so many digits, by default millimetres and two figures at least; a dash without a value."""
     if not np.isfinite(value):
         return "–"
     digits = two_figures(value) if digits is None else digits
@@ -492,12 +492,12 @@ def plain(value: float, digits: int | None = None, sign: bool = False) -> str:
 
 
 def figures(value: float) -> str:
-    """Three figures."""
+    """Return a number with three figures."""
     return f"{value:.3g}".replace("-", "−") if np.isfinite(value) else "–"
 
 
 def _exact(value: float, sigma: float) -> str:
-    """With two figures of the standard deviation."""
+    """Return a number with two figures of its standard deviation."""
     if not (np.isfinite(sigma) and sigma > 0):
         return f"{value:.8g}".replace("-", "−")
     digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 15))
@@ -505,7 +505,7 @@ def _exact(value: float, sigma: float) -> str:
 
 
 def correction_parts(corrections: tuple[CorrectionFigures, ...]) -> list[str]:
-    """Residuals and corrections image by image; of strips, over time too."""
+    """Return residuals and corrections image by image, of strips also over time."""
     rows: list[Row] = []
     for image in corrections:
         row: Row = [image.name, image.group, cell(number(image.measurements)), cell(number(image.rejected))]
@@ -578,7 +578,7 @@ def _over_time(image: CorrectionFigures) -> bytes:
 
 
 def adjust_page(facts: AdjustReport) -> str:
-    """The report as one HTML document without links to anything outside it.
+    """Return the report as one HTML document without links to anything outside it.
 
     Names and texts are escaped; what they contain is shown and never obeyed.
     """

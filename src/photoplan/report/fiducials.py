@@ -34,7 +34,7 @@ def draw_marks(report: FiducialsReport) -> dict[Path, bytes]:
 
 
 def marks_picture(image: ImageFiducials) -> bytes:
-    """The marks of an image as PNG; the scan is opened again."""
+    """Draw the marks of an image; the scan is opened again."""
     found, scan = image.found, ScanImage(image.file, image.band)
     marks: list[LocatedMark | MissingMark] = [*found.marks, *found.missing]
     across = min(_ACROSS, len(marks))
@@ -50,7 +50,7 @@ def marks_picture(image: ImageFiducials) -> bytes:
 
 
 def unfound_picture(image: UnfoundFiducials) -> bytes:
-    """A scan on which marks were not found, as PNG: the places looked at, each enlarged, beside what was sought."""
+    """Draw a scan on which marks were not found: places that were searched, enlarged, next to what was searched."""
     scan, layout, sought = ScanImage(image.file, image.band), image.layout, image.sought
     px_per_mm = float(np.ptp([(m.x, m.y) for m in sought], axis=0).max()) / layout.extent
     rows = max(2, len(sought))
@@ -104,7 +104,7 @@ def _show_template(panel: Any, template: Template, corner: tuple[float, float]) 
 def _panels(
     panels: Any, scan: Scan, layout: MarkLayout, found: FiducialResult, mark: LocatedMark | MissingMark
 ) -> None:
-    """One mark: the scan, and what was sought there."""
+    """Draw one mark: the scan, and what was searched there."""
     pattern = layout.patterns[layout.names.index(mark.name)]
     matrix = found.fit.transformation.derivative(np.zeros(2))
     template = draw(pattern, matrix, negative=found.negative, blur_px=found.blur_px)

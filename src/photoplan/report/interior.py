@@ -31,7 +31,7 @@ _LENGTH = 0.25
 
 
 def vector_scale(scans: Sequence[ImageInterior]) -> float:
-    """One round scale for all panels: how much longer vectors are drawn than they are."""
+    """Return one round scale for all panels: how much longer vectors are drawn than they are."""
     longest = max(float(np.linalg.norm(p.residuals_um, axis=1).max()) for p in scans) / 1000
     side = max(float(np.ptp(p.plane_mm, axis=0).max()) for p in scans)
     return round_down(_LENGTH * side / max(longest, 1e-5), _STEPS)
@@ -39,7 +39,7 @@ def vector_scale(scans: Sequence[ImageInterior]) -> float:
 
 @styled
 def draw_residuals(scans: Sequence[ImageInterior]) -> bytes:
-    """Residual vectors of all scans, one panel each at the same scale, and all in one; PNG.
+    """Draw residual vectors of all scans, one panel each at the same scale, and all in one.
 
     Of more than 24 scans those with the longest vectors have a panel.
     """

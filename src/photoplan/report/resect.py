@@ -20,7 +20,7 @@ _PICTURES = 60
 
 @styled
 def draw_residuals(image: ResectedImage) -> tuple[bytes, float]:
-    """Residual vectors at the measured points, and the factor by which they are enlarged."""
+    """Draw residual vectors at the measured points; return the factor by which they are enlarged, too."""
     (width, height), found = image.size, image.found
     xy, names = image.points.xy, image.points.names
     used = ~found.rejected & np.isfinite(found.residuals).all(axis=1)
@@ -51,7 +51,7 @@ def draw_residuals(image: ResectedImage) -> tuple[bytes, float]:
 
 
 def _key(axes: Any, size: tuple[int, int], scale: float, typical: float) -> None:
-    """A bar with the length of a residual."""
+    """Draw a bar with the length of a residual."""
     length = round_down(typical)
     x, y = 0.03 * size[0], 0.96 * size[1]
     axes.plot([x, x + scale * length], [y, y], color=INK, linewidth=2.2, solid_capstyle="butt", zorder=4)
@@ -111,7 +111,7 @@ def _image(image: ResectedImage, drawn: bool) -> str:
 
 
 def _orientation(image: ResectedImage) -> list[tuple[str, str, str]]:
-    """Name, value and standard deviation of each parameter."""
+    """Return name, value and standard deviation of each parameter."""
     sign = image.angle_sign
     rows = [
         (name, shown_metres(value, sigma), f"± {shown_metres(sigma, sigma)}")

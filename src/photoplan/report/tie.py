@@ -85,13 +85,13 @@ def _view(axes: Any, image: TieImage, tracks: Tracks, number: int) -> None:
 
 
 def _spread(points: NDArray[np.int64], most: int = 4) -> list[int]:
-    """Images to show: spread over those that have points."""
+    """Choose images to show, spread over those that have points."""
     some = np.flatnonzero(points)
     return sorted({int(some[int(i)]) for i in np.linspace(0, some.size - 1, min(most, some.size))})
 
 
 def _common(tracks: Tracks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of images with common tracks, and their number."""
+    """Return pairs of images with common tracks, and the number of these."""
     incidence = coo_matrix((np.ones(len(tracks), np.int64), (tracks.image, tracks.track))).tocsr()
     both = (incidence @ incidence.T).tocoo()
     upper = both.row < both.col
@@ -99,7 +99,7 @@ def _common(tracks: Tracks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _places(count: int, joined: NDArray[np.int64], common: NDArray[np.int64]) -> NDArray[np.float64]:
-    """A plane drawing in which images lie the closer the more they share (classical scaling of path lengths)."""
+    """Place images in the plane, the closer the more they share (classical scaling of path lengths)."""
     length = 1.0 / np.sqrt(np.maximum(common, 1))
     graph = coo_matrix((length, (joined[:, 0], joined[:, 1])), shape=(count, count)).tocsr()
     distance = shortest_path(graph, directed=False)
@@ -111,7 +111,7 @@ def _places(count: int, joined: NDArray[np.int64], common: NDArray[np.int64]) ->
 
 
 def _small(image: TieImage) -> tuple[NDArray[np.uint8], int]:
-    """A small copy, read in strips, and how many pixels along a side are one of it."""
+    """Read a small copy in strips; return it, and how many pixels along a side are one of it."""
     width, height = image.grey.size
     factor = max(1, -(-max(width, height) // _SIDE))
     columns, rows = width // factor, height // factor

@@ -273,7 +273,7 @@ _LEAST = 4
 
 
 def residual_fields(result: MapResult, used: NDArray[np.bool_]) -> tuple[ResidualField, ...]:
-    """Fields of all cameras that have enough measurements.
+    """Compute the fields of all cameras that have enough measurements.
 
     Residuals are turned from pixels into the image plane (x right, y up), where the images of a film camera agree, and
     scaled back so that their length stays in pixels.
@@ -296,7 +296,7 @@ def residual_fields(result: MapResult, used: NDArray[np.bool_]) -> tuple[Residua
 
 
 def _in_plane(image: BlockImage, xy: _Floats, residuals: _Floats) -> tuple[_Floats, _Floats]:
-    """Places in the image plane, and residuals along its axes in pixels."""
+    """Return places in the image plane, and residuals along its axes in pixels."""
     transformation = image.plane_to_pixel
     at = transformation.inverse(xy)
     ends = transformation.inverse(xy + residuals)
@@ -336,7 +336,7 @@ def _field(result: MapResult, name: str, at: _Floats, residuals: _Floats) -> Res
 
 
 def _frame(result: MapResult, name: str) -> tuple[float, float, float, float]:
-    """Corners of the camera's image format in the image plane: of its first image."""
+    """Return the corners of the camera's image format in the image plane, by its first image."""
     project = result.prepared.inputs.project
     image = next(i for i in result.prepared.block.images if i.camera == name)
     width, height = image_size(project.cameras[name], project.image(image.name))
@@ -347,7 +347,7 @@ def _frame(result: MapResult, name: str) -> tuple[float, float, float, float]:
 
 
 def point_layers(result: MapResult, facts: AdjustReport) -> list[PointLayer]:
-    """Layers of the GeoPackage: adjusted points, projection centres, and residuals of control and check points."""
+    """Return layers of the GeoPackage: adjusted points, projection centres, residuals of control and check points."""
     adjusted = result.adjusted
     role = {g.name: "check" if g.check else "control" for g in facts.ground}
     sigma = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
@@ -393,7 +393,7 @@ def _xyz(name: str, values: _Floats) -> dict[str, _Floats]:
 
 
 def block_json(figures: AdjustReport, result: MapResult) -> dict[str, Any]:
-    """All figures by their keys."""
+    """Return all figures by their keys."""
     inputs = result.prepared.inputs
     own = ("sigma0", "redundancy", "unknowns", "iterations", "seconds", "measurements", "points", "notes")
     group = ("name", "count", "redundancy", "rms", "unit")
@@ -492,7 +492,7 @@ _SOUND, _CONTRADICTED = 30.0, 1.4
 
 
 def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: float) -> AdjustReport:
-    """The figures of a block."""
+    """Return the figures of a block."""
     prepared, adjusted = result.prepared, result.adjusted
     inputs, project = prepared.inputs, prepared.inputs.project
     used = np.isfinite(adjusted.residuals).all(axis=1) & ~adjusted.rejected
@@ -542,7 +542,7 @@ def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: 
 
 
 def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
-    """What to look at: stated accuracies that the observations contradict, images that hang on nothing but GNSS."""
+    """Return advice: stated accuracies that observations contradict, images that only GNSS holds."""
     points, adjusted = result.prepared.inputs.points, result.adjusted
     out = []
     for group in adjusted.groups:
@@ -584,7 +584,7 @@ def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
 
 
 def _control_out(result: MapResult) -> list[str]:
-    """Control of which as much is taken out as is left: then the wrong half may have been kept."""
+    """Return advice on control that contradicts itself: if half is taken out, the wrong half may be kept."""
     adjusted, ground = result.adjusted, result.prepared.inputs.ground
     known = np.isfinite(adjusted.ground_residuals) & ~ground.check[:, None]
     out = []
@@ -652,7 +652,7 @@ def _images(result: MapResult, used: NDArray[np.bool_]) -> tuple[ImageFigures, .
 
 
 def _corrections(result: MapResult, used: NDArray[np.bool_]) -> tuple[CorrectionFigures, ...]:
-    """Images without poses that took part."""
+    """Return figures of the images without poses that took part."""
     adjusted, points = result.adjusted, result.prepared.inputs.points
     out = []
     for name, kind, found in result.corrections:
@@ -685,7 +685,7 @@ def _rms(values: _Floats) -> float:
 
 
 def ground_facts(result: MapResult) -> tuple[GroundFigures, ...]:
-    """Control and check points, in the order of their files."""
+    """Return figures of control and check points, in the order of their files."""
     ground, adjusted = result.prepared.inputs.ground, result.adjusted
     row = {name: k for k, name in enumerate(adjusted.points)}
     unknown = ~np.isfinite(ground.XYZ)
@@ -752,7 +752,7 @@ def _boresight(result: MapResult) -> tuple[Triple, Triple] | None:
 
 
 def _gross(result: MapResult) -> tuple[NamedMeasurement, ...]:
-    """All gross errors, the largest first."""
+    """Return all gross errors, the largest first."""
     adjusted, inputs = result.adjusted, result.prepared.inputs
     out = [_measurement_summary(result, int(k), True) for k in np.flatnonzero(adjusted.rejected)]
     for k, axis in zip(*np.nonzero(adjusted.ground_rejected)):

@@ -149,7 +149,7 @@ def _judge_places(project: Project, path: Path, what: str, names: Sequence[str],
 def _control(
     project: Project, notes: list[str]
 ) -> tuple[list[GroundPoints], list[tuple[Path, ImagePoints]], list[Path]]:
-    """Ground points of all files, and the measurements that come with a gcp_list.txt."""
+    """Read the ground points of all files, and the measurements that come with a gcp_list.txt."""
     grounds, points, files = [], [], []
     for file in project.observations.control:
         path = project.resolve(file)
@@ -204,7 +204,7 @@ def _image_points(
 
 
 def _inside(project: Project, points: ImagePoints, notes: list[str]) -> ImagePoints:
-    """The measurements in their images; a few outside (half a pixel beyond the border) are set aside by name.
+    """Return the measurements in their images; a few outside (half a pixel beyond the border) are set aside by name.
 
     Many are of images of another size, or columns and rows are exchanged.
     """
@@ -269,7 +269,7 @@ def _ground(project: Project, parts: list[GroundPoints]) -> GroundPoints:
 def _datum(
     project: Project, images: Sequence[Image], sigma_attitude: float | None, notes: list[str]
 ) -> tuple[ObservedPositions, ObservedAttitudes]:
-    """The orientations that the project states, as what places the block."""
+    """Return the orientations that the project states as observations that place the block."""
     if project.observations.positions is not None:
         raise InputError(
             "`datum` is set to orientations, and the project has observed positions, which place the block already; "
@@ -344,7 +344,7 @@ _SIGHT = 50e3
 
 
 def known_poses(inputs: AdjustInputs) -> dict[str, Pose]:
-    """Orientations (map poses) that the project states, or observed positions together with attitudes."""
+    """Return the map poses that the project states, or observed positions together with attitudes."""
     found: dict[str, Pose] = {}
     table = inputs.table
     row = {} if table is None or table.R_ground_camera is None else {n: k for k, n in enumerate(table.images)}
@@ -359,7 +359,7 @@ def known_poses(inputs: AdjustInputs) -> dict[str, Pose]:
 
 @dataclass(frozen=True, eq=False)
 class EarlierResult:
-    """What an adjustment found, as the beginning of another."""
+    """Result of an adjustment with which another one begins."""
 
     poses: Mapping[str, Pose]
     """Map poses of the images that took part."""
@@ -370,7 +370,7 @@ class EarlierResult:
 def started(
     inputs: AdjustInputs, *, known: bool = True, earlier: EarlierResult | None = None
 ) -> tuple[AdjustInputs, dict[str, Pose]]:
-    """A map pose for every image; images that cannot be oriented are taken out, with a note that names them.
+    """Return a map pose for every image; images that cannot be oriented are taken out, with a note that names them.
 
     Without `known`, orientations that are stated are not used; with `earlier`, its poses and cameras are used instead.
     """
@@ -398,7 +398,7 @@ def started(
 
 
 def _refuse_far(inputs: AdjustInputs, known: Mapping[str, Pose]) -> None:
-    """Control beyond the sight of an image that measures it: of another place, CRS or unit."""
+    """Refuse control beyond the sight of an image that measures it: of another place, CRS or unit."""
     ground, points = inputs.ground, inputs.points
     row = {name: k for k, name in enumerate(ground.names)}
     for image, point in zip(points.image, points.point):
@@ -502,7 +502,7 @@ class MapResult:
 
 
 def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Prepared:
-    """The block of a project in its Cartesian system."""
+    """Return the block of a project in its Cartesian system."""
     project = inputs.project
     centers = np.array([starts[image.name].center for image in inputs.images]).reshape(-1, 3)
     frame = block_frame(project, np.concatenate([centers, _about(inputs), inputs.ground.XYZ]))
@@ -550,7 +550,7 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
 
 
 def _sighted(inputs: AdjustInputs, projections: Sequence[BlockProjection]) -> AdjustInputs:
-    """The inputs without measurements whose rays no geometry knows; the first of them is named."""
+    """Return the inputs without measurements whose rays are unknown; the first of them is named."""
     points, lost = inputs.points, np.zeros(len(inputs.points), bool)
     for p in projections:
         mine = np.flatnonzero(points.image == (points.images.index(p.name) if p.name in points.images else -1))
@@ -569,7 +569,7 @@ def _sighted(inputs: AdjustInputs, projections: Sequence[BlockProjection]) -> Ad
 
 
 def _about(inputs: AdjustInputs) -> _Floats:
-    """About where images without poses look, (n, 3), for a system of its own; without one nothing asks."""
+    """Return about where images without poses look, (n, 3), for the system of the block."""
     strict = inputs.project.orientation.earth_curvature == "strict"
     return np.array([place_of(inputs.project, image) for image in inputs.projected if strict]).reshape(-1, 3)
 
@@ -609,7 +609,7 @@ def _places(
 def _places_by_projections(
     inputs: AdjustInputs, projections: Sequence[BlockProjection], frame: BlockFrame, near: _Floats
 ) -> None:
-    """Places, in `near` (g, 3), of ground points with a height only that images without poses alone have measured."""
+    """Set the places, in `near` (g, 3), of ground points with only a height that images without poses alone measure."""
     points, number = inputs.points, {name: k for k, name in enumerate(inputs.points.points)}
     for k in np.flatnonzero(~np.isfinite(inputs.ground.XYZ[:, 0])):
         for p in projections:
@@ -629,7 +629,7 @@ def _places_by_projections(
 def adjust_prepared(
     prepared: Prepared, settings: AdjustSettings, adjuster: Adjuster = adjust_block
 ) -> tuple[Prepared, Adjusted]:
-    """Adjust, again where a control point with an unknown coordinate lies elsewhere than was thought."""
+    """Adjust; do so again if a control point with an unknown coordinate lies elsewhere than expected."""
     adjusted = adjuster(prepared.block, settings)
     ground = prepared.inputs.ground
     partial = ~np.isfinite(ground.XYZ).all(axis=1)
@@ -656,7 +656,7 @@ def adjust_prepared(
 
 
 def map_result(prepared: Prepared, adjusted: Adjusted) -> MapResult:
-    """The adjusted block in map coordinates."""
+    """Return the adjusted block in map coordinates."""
     frame, project = prepared.frame, prepared.inputs.project
     poses = tuple(frame.map_pose(pose) for pose in adjusted.poses)
     centers = np.array([pose.center for pose in poses]).reshape(-1, 3)
@@ -685,7 +685,7 @@ def map_result(prepared: Prepared, adjusted: Adjusted) -> MapResult:
 
 
 def _joint(prepared: Prepared, adjusted: Adjusted, cameras: Sequence[Calibrated], k: int, T: _Floats) -> _Floats:
-    """Covariance of an image and its camera; T takes the block's position and small rotations to the project's."""
+    """Return the covariance of an image and its camera; T takes position and small rotations to the project's."""
     name = prepared.inputs.project.image(adjusted.images[k]).camera
     pose = T @ adjusted.pose_covariance[k] @ T.T
     found = next((c for c in cameras if c.name == name), None)
@@ -725,7 +725,7 @@ def _cameras(project: Project, block: Block, adjusted: Adjusted) -> tuple[Calibr
 
 
 def stated_accuracy(covariance: _Floats) -> dict[str, list[float] | None]:
-    """Entries of an image in the project for its covariance (6 + k, 6 + k); None where nothing is known.
+    """Return entries of an image in the project for its covariance (6 + k, 6 + k); None where it is unknown.
 
     Position and angles may be correlated to one part in 100 000 and less; what then is left of their effects on the
     ground needs the digits.
@@ -748,6 +748,6 @@ def _figures(values: _Floats) -> list[float]:
 
 
 def decimals_of(sigma: _Floats) -> int:
-    """Decimals of a position with these standard deviations, metres: 5, and more where they are below 0.1 mm."""
+    """Return decimals of a position with these standard deviations, metres: 5, and more below 0.1 mm."""
     least = float(np.nanmin(sigma)) if np.isfinite(sigma).any() else 1.0
     return int(min(max(5, 2 - math.floor(math.log10(least))), 15)) if least > 0 else 15

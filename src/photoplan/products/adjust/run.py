@@ -123,7 +123,7 @@ def refuse_cause(causes: Sequence[Cause]) -> None:
 
 
 def cause_notes(causes: Sequence[Cause], result: MapResult) -> tuple[str, ...]:
-    """What may be behind observations that do not fit, the likeliest first."""
+    """Return likely causes of observations that do not fit, the likeliest first."""
     if causes:
         words = ("likeliest cause of what does not fit", "next")
         return tuple(
@@ -142,7 +142,7 @@ def cause_notes(causes: Sequence[Cause], result: MapResult) -> tuple[str, ...]:
 
 
 def _hint(result: MapResult) -> str:
-    """What would fit, tried at the image with most control."""
+    """Return what would fit, tried at the image with most control."""
     inputs = result.prepared.inputs
     rows = {image.name: control_rows(inputs, image.name) for image in inputs.images}
     image = max(inputs.images, key=lambda image: len(rows[image.name]))
@@ -217,7 +217,7 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
 
 
 def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events: Events) -> tuple[Prepared, Adjusted]:
-    """The block adjusted from wherever it can begin, with the images that only its calibration orients."""
+    """Adjust the block from any start that works, with the images that only its calibration orients."""
 
     def iterated(number: int, rms: float) -> None:
         events.begin(f"iteration {number} · weighted residuals {rms:.4g}")
@@ -247,7 +247,7 @@ def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events
 def _begun(
     inputs: AdjustInputs, tried: Callable[[bool], tuple[Prepared, Adjusted]], settings: AdjustSettings, events: Events
 ) -> tuple[Prepared, Adjusted]:
-    """The block adjusted from its approximate orientations; if that fails, from control and tie points alone."""
+    """Adjust the block from its approximate orientations; if that fails, from control and tie points alone."""
     first: tuple[Prepared, Adjusted] | None = None
     why = "many measurements do not fit them"
     try:
@@ -273,7 +273,7 @@ def _begun(
 
 
 def _used_of(adjusted: Adjusted) -> int:
-    """Measurements that take part."""
+    """Count the measurements that take part."""
     return int((np.isfinite(adjusted.residuals[:, 0]) & ~adjusted.rejected).sum())
 
 
@@ -359,7 +359,7 @@ def _write(request: AdjustRequest, project: Project, result: MapResult, report: 
 
 
 def _changes(result: MapResult, lost: Sequence[tuple[str, str]]) -> ProjectChanges:
-    """Entries of the project file: orientations with their accuracy, calibrated cameras, what stays approximate."""
+    """Return entries of the project file: orientations with accuracy, calibrated cameras, what stays approximate."""
     project, block = result.prepared.inputs.project, result.prepared.block
     images: dict[str, dict[str, Any]] = {}
     for k, name in enumerate(result.adjusted.images):

@@ -42,7 +42,7 @@ _Floats = NDArray[np.float64]
 
 
 def block_frame(project: Project, XYZ: _Floats) -> BlockFrame:
-    """The system of a project's block."""
+    """Return the Cartesian system of a project's block."""
     if project.orientation.earth_curvature != "strict":
         same = height_step("same", "same", project.crs)
         return BlockFrame(project.crs, None, same, same)
@@ -62,7 +62,7 @@ def block_frame(project: Project, XYZ: _Floats) -> BlockFrame:
 
 
 def orientation_system(project: Project) -> str:
-    """Height system of orientations and control."""
+    """Return the height system of orientations and control."""
     stated = project.height_system
     if stated is None:
         raise HeightSystemError(
@@ -79,7 +79,7 @@ def orientation_system(project: Project) -> str:
 
 
 def nadir_heights(project: Project, XY: _Floats, otherwise: float) -> _Floats:
-    """Height of the ground below stations (n, 2), metres: the terrain's, or `otherwise` where there is none."""
+    """Return the height of the ground below stations (n, 2), metres: the terrain's, or `otherwise` without one."""
     if project.terrain is None:
         return np.full(len(XY), otherwise)
     heights = np.asarray(ground_of(project).bare.heights(XY), float)
@@ -98,7 +98,7 @@ class FoundParameter:
 
 @dataclass(frozen=True, eq=False)
 class FoundCorrection:
-    """What came out for an image."""
+    """Correction that was found for an image."""
 
     entries: Mapping[str, Any]
     """Of its table in the project; None takes one out."""
@@ -174,7 +174,7 @@ Free = dict[str, dict[str, float | None]]
 
 
 def parse_calibrate(options: Sequence[str], cameras: Sequence[str]) -> Free:
-    """Free parameters from options ``CAMERA=c:5,x0,y0,k1``; the name may be left out where there is one camera.
+    """Read free parameters from options ``CAMERA=c:5,x0,y0,k1``; a single camera need not be named.
 
     A number after a colon is the standard deviation with which the parameter is known beforehand.
     """
@@ -212,7 +212,7 @@ def _prior(option: str, colon: str, text: str) -> float | None:
 def block_camera(
     name: str, camera: CameraEntry, interior: Interior, free: Mapping[str, float | None] | None = None
 ) -> BlockCamera:
-    """A camera of the block."""
+    """Return a camera of the block."""
     free = free or {}
     lens = lens_of(camera)
     own = [p for p in free if p not in INTERIOR]
@@ -240,7 +240,7 @@ def block_camera(
 
 
 def calibrated(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -> Calibrated:
-    """The result of a camera that had free parameters."""
+    """Return the result of a camera that had free parameters."""
     lens = found.lens
     names, units, before, after, scales = [], [], [], [], []
     unit, to_row = _unit(camera)
@@ -275,7 +275,7 @@ def calibrated(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -
 
 
 def camera_entries(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -> dict[str, Any]:
-    """Entries of the camera in the project file after the adjustment: they give the adjusted camera exactly."""
+    """Return entries of the camera in the project file that give the adjusted camera exactly."""
     if not found.free:
         return {}
     _, new = _interior(camera, start, found)
@@ -301,7 +301,7 @@ def _constant_in_pixels_of_mm(camera: CameraEntry) -> bool:
 
 
 def _unit(camera: CameraEntry) -> tuple[dict[str, str], float]:
-    """Unit of c, x0, y0 in the project, and what turns y0 into rows."""
+    """Return the unit of c, x0, y0 in the project, and the factor that turns y0 into rows."""
     if not camera.states_pixels or camera.pixels is None:
         return dict.fromkeys(INTERIOR, "mm"), 1.0
     fx, fy = camera.pixels.focal
@@ -312,7 +312,7 @@ def _unit(camera: CameraEntry) -> tuple[dict[str, str], float]:
 def _interior(
     camera: CameraEntry, start: BlockCamera, found: AdjustedCamera
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """c, x0, y0 before and after, as the project states them: principal point as column and row, or in millimetres."""
+    """Return c, x0, y0 before and after as the project states them: principal point in pixels or millimetres."""
     if not camera.states_pixels or camera.pixels is None:
         return (start.c, *start.principal_point), (found.c, *found.principal_point)
     col, row = camera.pixels.point
@@ -328,7 +328,7 @@ def _interior(
 
 
 def _lens_entry(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -> dict[str, Any] | None:
-    """The lens as the project file states it; None where its entry stays right."""
+    """Return the lens as the project file states it; None if its entry stays right."""
     lens = camera.lens
     own = [p for p in found.free if p not in INTERIOR]
     if own and isinstance(found.lens, Brown | OpenCV):
@@ -351,7 +351,7 @@ def _lens_entry(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) 
 
 
 def _stated(lens: Brown | OpenCV) -> dict[str, Any]:
-    """A lens by its coefficients; those that are 0 are left out."""
+    """Return a lens by its coefficients, without those that are 0."""
     values = dataclasses.asdict(lens).items()
     return {"type": "brown" if isinstance(lens, Brown) else "opencv", **{k: v for k, v in values if v}}
 
@@ -422,7 +422,7 @@ def _found(image: CorrectableLine, sets: Mapping[str, AdjustedCorrections]) -> F
 
 
 def _angles(image: CorrectableLine, correction: LineCorrection) -> tuple[_Floats, _Floats]:
-    """Times and ω, φ, κ of the camera at lines spread over the image, against east, north and up in its middle."""
+    """Return times and ω, φ, κ of the camera at lines over the image, against east, north and up in its middle."""
     track = correction.track(image.plain.track)
     first, last = track.oriented
     rows = np.unique(np.linspace(np.ceil(first), np.floor(last), _DRAWN).round())
@@ -483,7 +483,7 @@ _REACH = 1000.0
 
 
 def geometry_of(image: ImageEntry) -> Geometry:
-    """The geometry of an image's entry; InputError where it is none that can be corrected."""
+    """Return the geometry of an image's entry; InputError if it cannot be corrected."""
     if type(image) not in GEOMETRIES:
         raise InputError(
             f"image {image.name!r}: its orientation stands in {image.geometry_file}, and is not corrected by an "
@@ -495,18 +495,18 @@ def geometry_of(image: ImageEntry) -> Geometry:
 def block_projections(
     project: Project, images: Sequence[ImageEntry], frame: BlockFrame, level: float | None
 ) -> tuple[BlockProjection, ...]:
-    """The images without poses of a block."""
+    """Return the images without poses of a block."""
     return tuple(_projection(project, image, frame, level) for image in images)
 
 
 def place_of(project: Project, image: ImageEntry) -> _Floats:
-    """About where an image looks, (3,), metres."""
+    """Return about where an image looks, (3,), metres."""
     geometry = geometry_of(image).correctable(project, image, _ground(project), size_of(project, image))
     return geometry.camera({each.key: each.values for each in geometry.corrections}).vantage.point
 
 
 def _ground(project: Project) -> Ground:
-    """Whatever cameras are made over: the height system of control."""
+    """Return level ground in the height system of control, over which cameras are made."""
     system = orientation_system(project)
     return Ground(
         surface=LevelSurface(0.0),
@@ -544,7 +544,7 @@ def _projection(project: Project, image: ImageEntry, frame: BlockFrame, level: f
 
 
 def _level(project: Project, camera: Camera) -> float:
-    """Height of the ground about where a camera looks."""
+    """Return the height of the ground about where a camera looks."""
     if project.terrain is not None:
         height = float(ground_of(project).bare.heights(camera.vantage.point[:2]))
         if np.isfinite(height):
@@ -555,7 +555,7 @@ def _level(project: Project, camera: Camera) -> float:
 
 
 def on_map(frame: BlockFrame) -> OnMap | None:
-    """Where projections see points of a block."""
+    """Return where projections see points of a block."""
     if frame.local is None:
         return None
 
@@ -569,7 +569,7 @@ def on_map(frame: BlockFrame) -> OnMap | None:
 def found_corrections(
     project: Project, block: Block, adjusted: Adjusted
 ) -> Iterator[tuple[str, Geometry, FoundCorrection]]:
-    """Each image without a pose whose corrections came out: it took part, or shares all of them with one that did."""
+    """Return each image without a pose whose corrections were found: it, or one with all of them, took part."""
     sets = {each.key: each for each in adjusted.corrections}
     for projection in block.projections:
         keys = {each.key for each in projection.geometry.corrections}
