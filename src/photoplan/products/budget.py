@@ -377,7 +377,7 @@ def make_budget(request: BudgetRequest) -> Budget:
 
 
 def _completed(project: Project, names: Sequence[str]) -> tuple[Project, dict[str, Any]]:
-    """Return the project with zeros for unstated errors; also their names, and the project with usual errors instead."""
+    """Return the project with zeros for unstated errors; also their names, and it with usual errors instead."""
     unknown: dict[str, Any] = {}
     usual = project
     if known_height_errors(project) is None:
