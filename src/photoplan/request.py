@@ -29,12 +29,13 @@ _LIMITS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at 
 def opt(help: str, default: Any = ..., **how: Any) -> Any:
     """Declare a field that is an option of the command line; without a default it is required.
 
-    Beside limits: `section`, `metavar`, `flag` (its name), `off` (it turns off what the field states), `writes`,
-    `listed` (values with commas), `choices` (words, or a mapping from words to values), `folder`, `project`, `size`;
-    and `draws` for a dry run that draws what is asked all the same.
+    Beside limits: `section`, `metavar`, `flag` (its name), `off` (it turns off what the field states), `other` (name of
+    the opposite flag), `writes`, `listed` (values with commas, perhaps with the words of a message), `choices` (words,
+    or a mapping from words to values), `folder`, `project`, `size`, `infinite` and `nan` (numbers that are not refused
+    here); and `draws` for a dry run that draws what is asked all the same.
     """
     limits = {name: how.pop(name) for name in _LIMITS if name in how}
-    if how.pop("infinite", False):
+    if how.pop("infinite", False) or how.get("nan"):
         limits["allow_inf_nan"] = True
     return Field(default, description=help, json_schema_extra=how, **limits)
 
@@ -69,7 +70,11 @@ class Request(BaseModel):
         named = dict(zip(fields, values)) | named
         for name in set(named).intersection(fields):
             annotation = declared[name].annotation
-            named[name] = fitted(_parsed(named[name], annotation), annotation, f"`{name}`")
+            value, how = _parsed(named[name], annotation), how_of(declared[name])
+            odd = isinstance(value, float) and value != value and how.get("nan")
+            named[name] = value if odd else fitted(value, annotation, f"`{name}`")
+            if how.get("project") and (named[name] / "project.toml").is_file():
+                named[name] = named[name] / "project.toml"
         try:
             super().__init__(**named)
         except ValidationError as error:
@@ -156,8 +161,10 @@ def _message(error: Any, kind: type[Request]) -> str:
         return f"`{name}` is required"
     meaning = re.sub(r"\s*\[.*", "", field.description or "").rstrip(".")
     where = f"`{name}`" + "".join(f"[{part}]" for part in inner if isinstance(part, int))
-    bounds = [f"{word} {getattr(each, key):g}" for each in field.metadata for key, word in _LIMITS.items()
-              if hasattr(each, key)]  # fmt: skip
+    limits = {key: getattr(each, key) for each in field.metadata for key in _LIMITS if hasattr(each, key)}
+    bounds = [f"{_LIMITS[key]} {limit:g}" for key, limit in limits.items()]
+    if set(limits) == {"ge", "le"}:
+        bounds = [f"from {limits['ge']:g} to {limits['le']:g}"]
     match error["type"]:
         case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal" if bounds:
             accepted = " and ".join(bounds)

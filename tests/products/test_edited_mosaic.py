@@ -130,7 +130,8 @@ def test_masks_and_losses(small: Block, capsys: pytest.CaptureFixture[str]) -> N
 
 def test_keys_of_tiles_know_what_decides_them(small: Block) -> None:
     from photoplan import load_project, plan_mosaic
-    from photoplan.products.orthophoto.plan import Choice, tile_keys
+    from photoplan.products.orthophoto.plan import tile_keys
+    from photoplan.requests.ortho import Choice
 
     def keys(**choice: object) -> list[str | None]:
         project, chosen = load_project(small.project), Choice(**choice)

@@ -33,7 +33,7 @@ from tools.small_block import (
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose
 from photoplan.io.vector_layer import VectorLayer, write_geopackage
-from photoplan.products.orthophoto.plan import OrthoSettings
+from photoplan.requests.ortho import OrthoSettings
 
 GROUND, FROM_IMAGE, FROM_SURROUNDINGS = 100.0, 32768, 65535
 CENTRES = {"one": (-48, -10, 200.0), "two": (-44, 15, 200.0), "three": (45, -8, 200.0)}

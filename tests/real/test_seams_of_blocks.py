@@ -16,8 +16,9 @@ from photoplan.io.project.file import load_project
 from photoplan.products.balance import BalanceRequest, balance_project
 from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.products.orthophoto.mosaic import plan_mosaic
-from photoplan.products.orthophoto.plan import Choice, plan_orthophotos, render
+from photoplan.products.orthophoto.plan import plan_orthophotos, render
 from photoplan.products.seams import SeamsRequest, make_seams
+from photoplan.requests.ortho import Choice
 
 #: The pavilion of the drone block.
 PAVILION = shapely.Point(576687.7, 5188131.8).buffer(2.5)

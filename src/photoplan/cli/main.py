@@ -153,8 +153,29 @@ VERBS: dict[str, str | Verb] = {
         "products.seams:make_seams",
         {"picture": "report.maps:seams_picture"},
     ),
-    "ortho": "Make orthophotos.",
-    "mosaic": "Make one orthophoto of many images.",
+    "ortho": Verb(
+        "Make orthophotos.",
+        """Make an orthophoto of each image: NAME_ortho.tif (a cloud-optimised GeoTIFF) and its run record.
+
+        The same command continues a run that was interrupted.
+        """,
+        "requests.ortho:OrthoRequest",
+        "products.orthophoto.make:make_orthophotos",
+        each="report.products:draw_product",
+        figures_first=True,
+    ),
+    "mosaic": Verb(
+        "Make one orthophoto of many images.",
+        """Make one orthophoto of all images: each pixel from the best of those that see it.
+
+        The area that no image sees is left empty and reported in square metres. The same command continues a run that
+        was interrupted.
+        """,
+        "requests.ortho:MosaicRequest",
+        "products.orthophoto.make:make_mosaic",
+        each="report.products:draw_product",
+        figures_first=True,
+    ),
     "illumination": Verb(
         "Take the light on slopes, and haze, out of an orthophoto.",
         """Take the light on slopes, and haze, out of PICTURE, an orthophoto.
@@ -166,7 +187,18 @@ VERBS: dict[str, str | Verb] = {
         "products.illumination:correct_illumination",
         {"preview": "report.illumination:draw_light"},
     ),
-    "object": "Make a product of each object alone.",
+    "object": Verb(
+        "Make a product of each object alone.",
+        """Make a product of each object in POLYGONS alone: NAME_object.tif, its pixels and no others.
+
+        POLYGONS holds polygons with heights (GeoPackage, GeoJSON, Shapefile, DXF), CityJSON, or a mesh. Each pixel is
+        taken from the best image that sees it. The same command continues a run that was interrupted.
+        """,
+        "requests.ortho:ObjectRequest",
+        "products.orthophoto.make:make_objects",
+        each="report.products:draw_product",
+        figures_first=True,
+    ),
     "surface": Verb(
         "Heights and grey values from all images at once.",
         """Compute heights and grey values from all images at once, each with its standard deviation.
@@ -192,7 +224,16 @@ VERBS: dict[str, str | Verb] = {
         "products.register:register",
         {"picture": "report.register:draw_vectors"},
     ),
-    "run": "Execute a plan written by `ortho --plan`.",
+    "run": Verb(
+        "Execute a plan written by `ortho --plan`.",
+        """Execute PLAN, a GeoPackage written by `photoplan ortho PROJECT --plan PLAN`.
+
+        Inputs that have changed since it was written are refused.
+        """,
+        "requests.ortho:RunRequest",
+        "products.orthophoto.make:run_plan",
+        each="report.products:draw_product",
+    ),
     "dtm": "Terrain models: build, sample, contours, volumes …",
     "view": "Perspective views, with the ground of every pixel.",
     "monoplot": Verb(
@@ -274,7 +315,16 @@ VERBS: dict[str, str | Verb] = {
         "products.describe:describe_file",
         {"picture": "report.restore:draw_filter"},
     ),
-    "demo": "Make the orthophotos of the included real block.",
+    "demo": Verb(
+        "Make the orthophotos of the included real block.",
+        """Copy the included drone block (18 reduced images of Brighton Beach) to FOLDER and make its orthophotos.
+
+        Every step is the command that you would call yourself; it is printed before it runs. A project, images or
+        products in FOLDER that differ from those of the demo stay as they are, unless --overwrite is given.
+        """,
+        "requests.ortho:DemoRequest",
+        "products.orthophoto.make:make_demo",
+    ),
 }
 
 

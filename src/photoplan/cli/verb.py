@@ -37,8 +37,8 @@ class Verb:
     """The function that draws a file from the result, by option, option and ending such as ``outputs.png``, or key of
     `Request.drawn`. That of a folder, such as ``pictures/``, returns pictures by place; `make` has checked places."""
     each: str = ""
-    """Function that draws a part of the result as soon as it is announced to the events, from it, the request and a
-    function that reports whether pictures can be drawn if they are wanted; it returns what there is to say."""
+    """Function that draws a part of the result as soon as it is announced to the events, and the result, from it, the
+    request and a function that reports whether pictures can be drawn if they are wanted; it returns messages."""
     record: str = ""
     """Kind of the run record, for operations that write none themselves."""
     one_by_one: bool = False
@@ -112,18 +112,20 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
             events.talk(line)
         shown.add(line)
 
+    def draw(part: object) -> None:
+        for line in load(verb.each)(part, request, lambda wanted: can_draw(wanted, once)) if verb.each else ():
+            once(line)
+
     def announced(part: object) -> None:
         """Print files and messages of a part of the result that is complete; a group gets its names at the end."""
-        files = part.written() if isinstance(part, Result) else ()
-        for path in () if grouped else files:
-            if not as_json and path not in shown:
-                show(path)
-            shown.add(path)
-        for line in part.messages() if isinstance(part, Result) else ():
-            once(line)
-        draws = load(verb.each) if verb.each and files else lambda *_: ()
-        for line in draws(part, request, lambda wanted: can_draw(wanted, once)):
-            once(line)
+        if isinstance(part, Result):
+            for path in () if grouped else part.written():
+                if not as_json and path not in shown:
+                    show(path)
+                shown.add(path)
+            for line in part.messages():
+                once(line)
+            draw(part)
 
     drawn = {
         path: key
@@ -146,6 +148,8 @@ def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     with recorded as record, together() if grouped else nullcontext():
         with Telling(quiet, announced) as events:
             result = load(verb.make)(request, events)
+            if all(part is not result for part in events.results):
+                draw(result)
         made: list[Path] = []
         for path, file in opened.items():
             if file is not None and (content := load(verb.draw[drawn[path]])(result)) is not None:
@@ -243,12 +247,16 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
             more["multiple"] = True
             if how.get("listed"):
                 more["callback"] = partial(_numbers, how["listed"]) if hint in (int, float) else _words
+    parsed = False
     if hasattr(hint, "parse"):
         # A value of a class that reads itself from text.
-        hint = str
+        hint, parsed = str, True
         if how.get("listed") and "multiple" not in more:
             more |= {"multiple": True, "callback": lambda context, parameter, given: ",".join(given) or None}
-    choices = how.get("choices") or ([str(each) for each in get_args(hint)] if get_origin(hint) is Literal else None)
+    choices = how.get("choices")
+    if get_origin(hint) is Literal and not choices:
+        # With a name of its own the request alone judges the value.
+        choices, hint = None if "metavar" in how else [str(each) for each in get_args(hint)], str
     if isinstance(choices, Mapping):
         more["callback"] = partial(_value_of, choices)
     kind: Any = click.Choice(choices) if choices else BYTES if how.get("size") else hint
@@ -265,8 +273,8 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     if hint is bool and not choices:
         if how.get("off") or flag[2:].startswith("no-"):
             return click.Option([name, flag], is_flag=True, flag_value=False, default=True, help=entry.description)
-        both = (bool(default) or optional) and "/" not in flag
-        names = [name, flag + (f"/--{'no'}-{flag[2:]}" if both else "")]
+        other = how.get("other") or (f"no-{flag[2:]}" if default or optional else "")
+        names = [name, flag + (f"/--{other}" if other else "")]
         return click.Option(names, is_flag=True, default=None if optional else default, help=entry.description)
     if name == "workers":
         more["callback"], kind, default = all_cores, click.IntRange(1), None
@@ -274,6 +282,7 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     if isinstance(choices, Mapping):
         default = next((word for word, value in choices.items() if value == default), None)
     shown = default is not None and default != () and "[" not in (entry.description or "")
+    shown = shown and not parsed
     default = default if shown else None  # what is stated in words is left to the request
     needed = entry.is_required() or bool(how.get("required"))
     return click.Option(

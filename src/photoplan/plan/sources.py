@@ -16,6 +16,7 @@ from photoplan.kernels.choose import add_penalties, between_nodes
 from photoplan.kernels.pyramid import pyramid_of
 from photoplan.kernels.visibility import BEYOND, HIDDEN, SEEN, find_behind, find_hidden, quiet_blocks
 from photoplan.plan.ground import TileGround
+from photoplan.plan.options import Weights
 from photoplan.surfaces.base import Lattice, Surface, Terrain
 from photoplan.surfaces.objects import ObjectSurface, RaisedSurface, without_objects
 from photoplan.targets.base import Target
@@ -328,23 +329,6 @@ _AROUND = 24
 _DRAWN, _RIMMED = 1e6, 1e7
 
 
-@dataclass(frozen=True)
-class Weights:
-    """What each penalty counts."""
-
-    slant: float = 1.0
-    coarseness: float = 1.0
-    border: float = 1.0
-    occlusion: float = 0.5
-    sharpness: float = 0.0
-
-    def __post_init__(self) -> None:
-        odd = [f"{name}={value:g}" for name, value in vars(self).items() if not 0 <= value <= 1000]
-        if odd or not any(vars(self).values()):
-            what = f"weight {', '.join(odd)}" if odd else "all weights are 0"
-            raise UsageError(f"score: {what}; allowed are numbers from 0 to 1000, not all of them 0")
-
-
 class Drawn(Protocol):
     """Regions that somebody has given to images."""
 
@@ -363,7 +347,7 @@ class BestImage:
 
     levels: tuple[float, float]
     """Lowest and highest ground of the product, metres: between them positions are interpolated."""
-    weights: Weights = Weights()
+    weights: Weights = field(default_factory=Weights)
     ranks: tuple[float, ...] = ()
     """A penalty of each source, by row: the user's own ranking, and its blur; none if empty."""
     drawn: Drawn | None = None

@@ -126,9 +126,9 @@ def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:
     return path
 
 
-def surface_drawn(result: SurfaceResult, request: SurfaceRequest, can_draw: Callable[[bool], bool]) -> Iterator[str]:
+def surface_drawn(result: Any, request: SurfaceRequest, can_draw: Callable[[bool], bool]) -> Iterator[str]:
     """Draw a surface as a PNG beside it if that is wanted, and say so; replaces an older one."""
-    if can_draw(request.quicklook):
+    if isinstance(result, SurfaceResult) and can_draw(request.quicklook):
         picture = result.path.with_suffix(".png")
         write_atomically(picture, draw_surface(result.path, result.plan.axes))
         yield f"  drawn in {picture}"

@@ -56,12 +56,7 @@ from photoplan.project.steps import RestoreStep
 _BANDS = ImageForm(descriptions=tuple(name for name, _ in BANDS), units=tuple(unit for _, unit in BANDS))
 
 
-def execute(
-    plan: OrthoPlan,
-    output: Path | str,
-    run: Run | None = None,
-    then: Callable[[list[ProductResult]], None] = lambda results: None,
-) -> list[ProductResult]:
+def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list[ProductResult]:
     """Make all products of a plan.
 
     Parameters
@@ -71,8 +66,6 @@ def execute(
         Folder for `NAME_ortho.tif`, its run record, and the preview of all products; made if it does not exist.
     run : Run, optional
         Workers, memory, overwriting, progress.
-    then : callable, optional
-        Makes more files of the products; the run is not complete before.
 
     Returns
     -------
@@ -93,8 +86,23 @@ def execute(
     ResourceError
         Disk or memory ran out.
     """
-    run = run or Run()
-    folder = Path(output)
+    results = execute_all(plan, Path(output), run or Run())
+    refuse_failed(results)
+    return results
+
+
+def refuse_failed(results: Sequence[ProductResult]) -> None:
+    """Raise TilesFailed with the products that lack tiles, if there are any."""
+    failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]
+    if failed:
+        raise TilesFailed(
+            "finished, but these products lack tiles and were not written; the same command tries the tiles again:\n  "
+            + "\n  ".join(failed)
+        )
+
+
+def execute_all(plan: OrthoPlan, folder: Path, run: Run) -> list[ProductResult]:
+    """Make all products of a plan; those whose tiles failed are among the results. For errors see `execute`."""
     each = tile_bytes(plan.settings.tolerance, plan.settings.tile)
     run.check(each)
     picture = overview_path(plan, folder) if run.quicklook else None
@@ -133,14 +141,8 @@ def execute(
         write_overview([r.path for r in results if not r.failed], picture, plan.command)
     for path in index:
         (write_index if in_sheets else write_stack)(plan, path, [r for r in results if not r.failed])
-    failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]
-    if failed:
-        raise TilesFailed(
-            "finished, but these products lack tiles and were not written; the same command tries the tiles again:\n  "
-            + "\n  ".join(failed)
-        )
-    then(results)
-    marker.end()
+    if not any(r.failed for r in results):
+        marker.end()
     return results
 
 

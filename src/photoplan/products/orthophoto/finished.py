@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from photoplan.engine.execute import OutputName
 from photoplan.errors import UsageError
+from photoplan.findings import Result
 from photoplan.io.files import file_in, safe_stem
 from photoplan.io.store import is_unfinished, record_path, recorded_result, refuse_foreign_record, tidy
 from photoplan.plain import pick
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, OrthoSettings
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
+from photoplan.requests.ortho import OrthoSettings
 
 
 @dataclass(frozen=True)
-class ProductResult:
-    """What became of one product."""
+class ProductResult(Result):
+    """Files and figures of one product."""
 
     path: Path
     others: tuple[Path, ...]
@@ -51,8 +53,12 @@ class ProductResult:
     reason: str = ""
     """Why the first of them failed."""
 
+    def written(self) -> Sequence[Path]:
+        """Return the product and what belongs to it; nothing if tiles failed."""
+        return () if self.failed else (self.path, *self.others)
+
     def json_fields(self) -> dict[str, Any]:
-        """Figures without the reason of a failure."""
+        """Return figures without the reason of a failure."""
         own = ("path", "seconds", "valid_share", "cells", "tiles")
         images = {"image": self.images[0]} if self.bare is None else {"images": self.images, "outside_m2": self.bare}
         more = {"worst_anchor_residual_px": "residual", "resumed_tiles": "resumed", "failed_tiles": "failed"}
@@ -151,7 +157,7 @@ def _without_seams(settings: OrthoSettings) -> OrthoSettings:
     """Settings without the names of files of seams and of sheets: their content decides, which is part of the key."""
     if settings.choice is None:
         return settings
-    return replace(settings, choice=replace(settings.choice, seams=None, sheets=None))
+    return settings.replace(choice=settings.choice.replace(seams=None, sheets=None))
 
 
 def _is_there(path: Path) -> bool:
@@ -165,7 +171,7 @@ def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult
         return None
 
     def result(made: dict[str, Any], recorded: dict[str, Any]) -> ProductResult | None:
-        if _without_seams(OrthoSettings.from_dict(recorded)) != _without_seams(plan.settings):
+        if _without_seams(OrthoSettings(**recorded)) != _without_seams(plan.settings):
             return None
         return ProductResult(
             path=path,

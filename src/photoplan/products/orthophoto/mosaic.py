@@ -22,11 +22,9 @@ from photoplan.plan.anchors import AnchorRule
 from photoplan.plan.footprint import ImageExtent, Tile, Tiles, covered_tiles
 from photoplan.plan.product import ProductPlan
 from photoplan.products.orthophoto.plan import (
-    Choice,
     Looked,
     OrthoPlan,
     OrthoProduct,
-    OrthoSettings,
     check_storable,
     chosen_settings,
     extent_text,
@@ -40,6 +38,7 @@ from photoplan.products.orthophoto.plan import (
 )
 from photoplan.products.orthophoto.sheets import Sheet, drawn_sheets, sheets_of
 from photoplan.quality.mtf_curve import BLOCK, blur_of, detail_energies, detail_quotients
+from photoplan.requests.ortho import Choice, OrthoSettings
 from photoplan.surfaces.objects import Faces, ObjectSurface, SingleObject, painted_surface
 from photoplan.surfaces.polygon_faces import LEAST_AREA
 from photoplan.targets.map import MapTarget
@@ -220,7 +219,7 @@ def drawn_regions(
     """Regions of the choice's file; None: it has none. Those of `known` images that are no sources are left out."""
     if settings.choice is None or settings.choice.seams is None:
         return None
-    return read_regions(project.resolve(settings.choice.seams), images, grid, known)
+    return read_regions(project.resolve(str(settings.choice.seams)), images, grid, known)
 
 
 def with_preferred(
@@ -233,7 +232,7 @@ def with_preferred(
     apart = [name for name in order if name not in names]
     if apart:
         raise UsageError(f"image {apart[0]!r} is preferred, but not among the images of the mosaic")
-    return names, replace(chosen, choice=replace(chosen.choice, prefer=tuple(dict.fromkeys(order))))
+    return names, chosen.replace(choice=chosen.choice.replace(prefer=tuple(dict.fromkeys(order))))
 
 
 def refuse_mixed(looked: Sequence[Looked]) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from photoplan import __version__
 from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.grid import MOST_TILES, MapGrid
 from photoplan.io.disk import disk_error, library_error
 from photoplan.io.files import file_in
@@ -28,9 +30,10 @@ from photoplan.plain import pick, plain
 from photoplan.plan.footprint import Footprint, Tiles
 from photoplan.plan.product import compile_tile
 from photoplan.products.orthophoto.mosaic import drawn_regions
-from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, OrthoSettings, keyed, product_plan
-from photoplan.products.orthophoto.quadtree import PlanSquares
-from photoplan.project.scene import input_files
+from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, keyed, product_plan
+from photoplan.products.orthophoto.quadtree import PlanSquares, plan_squares
+from photoplan.project.scene import input_files, refuse_unusable
+from photoplan.requests.ortho import OrthoSettings, ProductRequest
 from photoplan.surfaces.objects import SingleObject
 
 
@@ -81,6 +84,54 @@ class PlanFigures:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class PlanReport(Result):
+    """A plan that was not executed, with the figures of its tiles."""
+
+    plan: OrthoPlan
+    figures: PlanFigures
+    path: Path | None = None
+    """File of the plan, if it was written."""
+    squares: PlanSquares | None = None
+    """Objects as squares, if they were asked for."""
+    unusable: Mapping[str, str] = field(default_factory=dict)
+    """Images that are left out since their files cannot be used, and why."""
+    asked: int = 0
+    """Number of images that were asked for."""
+
+    def json_fields(self) -> dict[str, Any]:
+        """Return figures of the plan and of each of its products."""
+        more = {} if self.squares is None else {"quadtree": self.squares.counts}
+        return {**self.figures.json_of(self.plan), "plan": self.path, **more}
+
+    def summary(self) -> Sequence[str]:
+        """Return the plan, sums over its tiles, images that are left out, and squares."""
+        plan, figures = self.plan, self.figures
+        worst = f"worst anchor residual {figures.residual:.3g} px"
+        return [
+            str(plan),
+            f"plan: {plan.what}, {figures.tiles} tiles, {figures.cells} cells, "
+            + (worst if plan.settings.tolerance else plan.settings.exactness),
+            *(f"  left out: {line}" for line in plan.blind),
+            *([] if self.squares is None else [f"quadtree: {len(self.squares.bounds)} squares", *self.squares.lines]),
+        ]
+
+    def raise_failures(self) -> None:
+        """Name the images that could not be used."""
+        refuse_unusable(self.unusable, self.asked)
+
+
+def show_plan(plan: OrthoPlan, request: ProductRequest, events: Events, **left: Any) -> PlanReport:
+    """Compile the geometry of every tile, and write the plan if asked for, with objects as squares if asked for."""
+    squares, path = plan_squares(plan) if request.show_quadtree else None, request.plan_file
+    if path is not None:
+        check_plan_path(path, plan, request.overwrite)
+    figures = compile_figures(plan, events)
+    if path is not None:
+        write_plan(path, plan, figures, request.folder, request.overwrite, squares)
+    return PlanReport(plan, figures, path, squares, **left)
+
+
 def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
     """Compile relief and anchors of every tile, keep the figures, forget the rest."""
     counts = [len(p.plan.tiles) for p in plan.products]
@@ -118,7 +169,7 @@ def write_plan(
         "project": plan.project.model_dump(mode="json", exclude_none=True),
         "folder": os.path.relpath(plan.project.folder.resolve(), path.resolve().parent),
         "output": os.path.relpath(output.resolve(), path.resolve().parent),
-        "settings": asdict(plan.settings),
+        "settings": plain(plan.settings),
         "blind": list(plan.blind),
         "products": [_product_header(p, count) for p, count in zip(plan.products, counts.tolist())],
     }
@@ -199,7 +250,7 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path | None]:
         header, tiles = read_plan_tables(path)
         folder = (path.resolve().parent / header["folder"]).resolve()
         project = parse_project(header["project"], folder, str(path))
-        settings = OrthoSettings.from_dict(header["settings"])
+        settings = OrthoSettings(**header["settings"])
         listed: dict[str, dict[int, tuple[int, ...]]] = {}
         for name, index, rows in zip(*(tiles[column].tolist() for column in ("product", "tile", "sources"))):
             listed.setdefault(name, {})[index] = tuple(map(int, rows.split()))
