@@ -121,7 +121,8 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
             f"the poses are in true metres, and {target.name} does not say so: use them with earth_curvature strict "
             "(`photoplan init` with `earth_curvature`)",
         )
-    output = request.output or _beside(request.orientation, target.name, target.suffix)
+    source_file = request.orientation
+    output = request.output or source_file.with_name(f"{source_file.stem}_{target.name}{target.suffix}")
     block = _files_from(block, output if not target.suffix else output.parent)
     block, lost = _without_lost_lenses(block, target.losses(block), request)
     inputs = [p for p in (request.orientation, request.camera) if p is not None and not p.is_dir()]
@@ -236,10 +237,6 @@ def _in_crs(block: OrientationBlock, crs: str | None) -> OrientationBlock:
     return replace(block, table=replace(table, crs=crs, crs_file=None, origin=None, true_metres=block.table.cartesian))
 
 
-def _beside(path: Path, name: str, suffix: str) -> Path:
-    return path.with_name(f"{path.stem}_{name}{suffix}")
-
-
 def _files_from(block: OrientationBlock, folder: Path) -> OrientationBlock:
     """Return the block with paths of existing image files written from another folder."""
     source = block.table.file if block.table.file.is_dir() else block.table.file.parent
@@ -335,7 +332,9 @@ class ReadingsReport(Result):
 
 def list_readings(request: ConvertRequest, image_points: Path, control: Path) -> ReadingsReport:
     """Judge all readings of an orientation file by measured points."""
-    name, block = _as_stated(request)
+    # So that no unit or direction is refused, whatever they are; gon allows the largest numbers.
+    form = request.form.replace(angle_unit="gon", rotation="opk", direction="camera-to-ground")
+    name, block = read_block(request.orientation, form, request.format)
     if request.camera is not None:
         block = with_cameras(block, request.camera)
     if not block.cameras:
@@ -372,13 +371,6 @@ def list_readings(request: ConvertRequest, image_points: Path, control: Path) ->
         others=tuple(others),
         notes=tuple(notes),
     )
-
-
-def _as_stated(request: ConvertRequest) -> tuple[str, OrientationBlock]:
-    """Read the numbers of a file so that no unit or direction is refused; their meaning is open."""
-    # Of all units gon allows the largest numbers.
-    form = request.form.replace(angle_unit="gon", rotation="opk", direction="camera-to-ground")
-    return read_block(request.orientation, form, request.format)
 
 
 def _cameras(block: OrientationBlock) -> tuple[dict[str, tuple[Interior, Lens]], list[str]]:

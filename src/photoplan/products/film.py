@@ -597,7 +597,18 @@ def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectRes
     with recording("resect", request, [request.project, *inputs.files]) as record:
         counts = {name: len(control_rows(inputs, name)) for name in names}
         wanted = [n for n in names if request.images or counts[n] >= _LEAST]
-        _refuse(inputs, wanted, counts, settings)
+        if not wanted:
+            most = max(counts.items(), key=lambda item: item[1])
+            raise UsageError(
+                f"none of the {len(counts)} images has {_LEAST} control points with three known coordinates; the most, "
+                f"{most[1]}, has image {most[0]!r}. Check that points are called the same in image points and control"
+            )
+        camera, count = Counter(project.image(n).camera for n in wanted).most_common(1)[0]
+        if free and count > 1:
+            raise UsageError(
+                f"{', '.join(free)} of camera {camera!r} cannot be found for {count} images one by one, as each gives "
+                "another value; name one with `images`, or free the parameters in `photoplan adjust`"
+            )
         done: list[ResectedImage] = []
         failed: dict[str, str] = {}
         for name in wanted:
@@ -608,17 +619,18 @@ def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectRes
                 failed[name] = text if repr(name) in text else f"image {name!r}: {text}"
             events.done()
         written = bool(done) and not request.dry_run
-        left = tuple(n for n in names if n not in wanted)
         result = ResectResult(
             project=request.project,
             images=tuple(done),
             failed=failed,
-            left_out=left,
+            left_out=tuple(n for n in names if n not in wanted),
             changed=written,
             notes=inputs.notes,
         )
         if written:
-            edit_project(request.project, _changes(done))
+            images = {r.image.name: r.image_entries for r in done}
+            cameras = {r.image.camera: r.camera_entries for r in done if r.camera_entries}
+            edit_project(request.project, ProjectChanges(images=images, cameras=cameras))
             record([request.project], result)
     return result
 
@@ -637,35 +649,11 @@ def _overridden(project: Project, request: ResectRequest) -> Project:
     return project.model_copy(update={"observations": project.observations.model_copy(update=kept)})
 
 
-def _refuse(inputs: AdjustInputs, wanted: Sequence[str], counts: dict[str, int], settings: ResectSettings) -> None:
-    if not wanted:
-        most = max(counts.items(), key=lambda item: item[1])
-        raise UsageError(
-            f"none of the {len(counts)} images has {_LEAST} control points with three known coordinates; the most, "
-            f"{most[1]}, has image {most[0]!r}. Check that points are called the same in image points and control"
-        )
-    if settings.free:
-        project = inputs.project
-        count = Counter(project.image(n).camera for n in wanted)
-        camera, images = count.most_common(1)[0]
-        if images > 1:
-            raise UsageError(
-                f"{', '.join(settings.free)} of camera {camera!r} cannot be found for {images} images one by one, as "
-                "each gives another value; name one with `images`, or free the parameters in `photoplan adjust`"
-            )
-
-
-def _changes(done: Sequence[ResectedImage]) -> ProjectChanges:
-    return ProjectChanges(
-        images={r.image.name: r.image_entries for r in done},
-        cameras={r.image.camera: r.camera_entries for r in done if r.camera_entries},
-    )
-
-
 Array = NDArray[np.float64]
 
 #: Decimals of angles that are written.
 _ANGLE_DECIMALS = 10
+_SINGULAR = "the angles are near a singular position of their order, only their combination is determined"
 _DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 _GREEK = {"o": "ω", "p": "φ", "k": "κ"}
 
@@ -855,7 +843,7 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
         angle_unit=orientation.angle_unit,
         calibrated=camera,
         camera_entries=entries,
-        notes=(*found.notes, *_notes(of_angles)),
+        notes=(*found.notes, *([_SINGULAR] if np.sqrt(np.diag(of_angles)).max() > 0.5 else [])),
     )
 
 
@@ -873,12 +861,6 @@ def _calibration(project: Project, image: Image, found: Resected) -> tuple[Calib
     )
     camera = calibrated(described, start, adjusted)
     return camera, {**camera_entries(described, start, adjusted), "sigma": camera.sigmas}
-
-
-def _notes(of_angles: Array) -> Sequence[str]:
-    if np.sqrt(np.diag(of_angles)).max() > 0.5:
-        return ["the angles are near a singular position of their order, only their combination is determined"]
-    return []
 
 
 def measured_control(inputs: AdjustInputs, rows: list[tuple[int, int]]) -> MeasuredPoints:

@@ -673,7 +673,8 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     # What frames alone took is matched as it is; anything else is brought onto the map first.
     on_map = not all(isinstance(project.any_image(name), Image) for name in names)
     images, notes = (open_rectified if on_map else open_images)(project, names, request.use_orientation)
-    factor = _factor(request, images)
+    longest = max(max(image.grey.size) for image in images)
+    factor = max(1, -(-longest // _LONGEST)) if request.scale is None else round(1 / request.scale)
     pairs, chosen = chosen_pairs(images, request.pairs)
     if request.dry_run:
         count = 0 if pairs is None else len(pairs)
@@ -694,7 +695,13 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
         verified = len({(p.first, p.second) for level in levels for p in level.pairs if len(p)})
         tried = tuple(t for level in levels for t in level.tried(names))
         pairs = sorted({(p.first, p.second) for level in levels for p in level.pairs})
-        _refuse_nothing(request, verified, len(pairs), names, levels)
+        if not verified:
+            kinds = ", ".join(f"{k.store.settings.count} features at scale 1/{k.factor}" for k in levels)
+            raise GeometryError(
+                f"{request.project}: none of {len(pairs)} pairs of {len(names)} images ({some(names)}) could be "
+                f"verified ({kinds}): no overlap, or too little texture. Choose other images with `images`, or set "
+                "`pairs` to all, more `features`, or another `scale`"
+            )
         sizes = [image.grey.size for image in images]
         every = joined_tracks([level.found.tracks for level in levels])
         of = np.repeat([level.factor for level in levels], [level.found.tracks.count for level in levels])
@@ -735,7 +742,8 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
             found=tracks,
         )
         report = replace(report, advice=_advice(request, report, tried))
-        _write_pairs(request.pairs_table, tried)
+        columns = [each.name for each in fields(TriedPair)]
+        write_table(request.pairs_table, columns, (astuple(each) for each in tried))
         write_run_record(
             output,
             key=key,
@@ -762,13 +770,6 @@ def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
         for file in (output, request.pairs_table):
             check_output(file, inputs, overwrite=request.overwrite)
     return output
-
-
-def _factor(request: TieRequest, images: Sequence[TieImage]) -> int:
-    if request.scale is not None:
-        return round(1 / request.scale)
-    longest = max(max(image.grey.size) for image in images)
-    return max(1, -(-longest // _LONGEST))
 
 
 @dataclass(frozen=True, eq=False)
@@ -846,11 +847,6 @@ def _climb(request: TieRequest, levels: list[_Level], run: Steps, events: Events
         levels.append(_matched(store, features, pairs, VerifySettings(threshold=2.0 * reduced), run, events))
 
 
-def _write_pairs(path: Path, tried: Sequence[TriedPair]) -> None:
-    """Write a table of all pairs at all levels."""
-    write_table(path, [field.name for field in fields(TriedPair)], (astuple(each) for each in tried))
-
-
 def _advice(request: TieRequest, report: TieReport, tried: Sequence[TriedPair]) -> str:
     """Return why images are not connected, and what to change."""
     if not report.unconnected:
@@ -873,18 +869,6 @@ def _advice(request: TieRequest, report: TieReport, tried: Sequence[TriedPair]) 
         f"features tried: {shown}. {why or 'No pair of them was chosen'}. Set " + ", ".join(ways) + ", measure points "
         "by hand in these images, or leave them out with `images`"
     )
-
-
-def _refuse_nothing(
-    request: TieRequest, verified: int, tried: int, names: Sequence[str], levels: Sequence[_Level]
-) -> None:
-    if not verified:
-        kinds = ", ".join(f"{k.store.settings.count} features at scale 1/{k.factor}" for k in levels)
-        raise GeometryError(
-            f"{request.project}: none of {tried} pairs of {len(names)} images ({some(list(names))}) could be verified "
-            f"({kinds}): no overlap, or too little texture. Choose other images with `images`, or set `pairs` to all, "
-            "more `features`, or another `scale`"
-        )
 
 
 def _refine(

@@ -399,7 +399,7 @@ def position_parts(facts: AdjustReport) -> list[str]:
 
 def image_parts(facts: AdjustReport) -> list[str]:
     """Return residuals and standard deviations image by image."""
-    order = sorted(facts.images, key=lambda i: -_or_zero(float(np.hypot(*i.rms))))
+    order = sorted(facts.images, key=lambda i: -np.nan_to_num(np.hypot(*i.rms), posinf=0.0))
     rows: list[Row] = []
     for image in order[:MOST_ROWS]:
         row: Row = [
@@ -472,10 +472,6 @@ def cell(words: str) -> Cell:
 def to_unit(radians: float, unit: str) -> float:
     """Return radians in an angle unit."""
     return radians * {"deg": 180.0 / np.pi, "gon": 200.0 / np.pi, "rad": 1.0}[unit]
-
-
-def _or_zero(value: float) -> float:
-    return value if np.isfinite(value) else 0.0
 
 
 def number(value: int) -> str:

@@ -505,7 +505,10 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
     """Return the block of a project in its Cartesian system."""
     project = inputs.project
     centers = np.array([starts[image.name].center for image in inputs.images]).reshape(-1, 3)
-    frame = block_frame(project, np.concatenate([centers, _about(inputs), inputs.ground.XYZ]))
+    # About where images without poses look, for a system of the block's own.
+    strict = project.orientation.earth_curvature == "strict"
+    about = np.array([place_of(project, image) for image in inputs.projected if strict]).reshape(-1, 3)
+    frame = block_frame(project, np.concatenate([centers, about, inputs.ground.XYZ]))
     cameras: dict[str, BlockCamera] = {}
     images = []
     for image in inputs.images:
@@ -566,12 +569,6 @@ def _sighted(inputs: AdjustInputs, projections: Sequence[BlockProjection]) -> Ad
     if lost.all():
         raise InputError(note)
     return replace(inputs, points=points.where(~lost), notes=(*inputs.notes, note))
-
-
-def _about(inputs: AdjustInputs) -> _Floats:
-    """Return about where images without poses look, (n, 3), for the system of the block."""
-    strict = inputs.project.orientation.earth_curvature == "strict"
-    return np.array([place_of(inputs.project, image) for image in inputs.projected if strict]).reshape(-1, 3)
 
 
 def _mean_height(ground: GroundPoints) -> float:

@@ -19,7 +19,7 @@ from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
-from photoplan.io.project.model import Image, ImageEntry, Project, interior_of, lens_of
+from photoplan.io.project.model import Image, Project, interior_of, lens_of
 from photoplan.io.store import recording, stated_json, write_atomically
 from photoplan.io.vector_layer import write_point_layers, write_residuals
 from photoplan.orientation.bundle.adjust import Cause, adjust_block, weighed_causes
@@ -295,15 +295,13 @@ def _check_outputs(request: AdjustRequest, project: Project) -> None:
     if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
         raise UsageError(f"{request.folder}: cannot be made, as {there} cannot be written into; give another `output`")
     # What an earlier run has written of corrections is written again.
-    written = [request.folder.resolve() / n for i in project.images if (n := _correction_file(project, i)) is not None]
+    corrected = [image for image in project.images if not isinstance(image, Image)]
+    files = [geometry_of(image).output(project.stems[image.name]) for image in corrected]
+    written = [request.folder.resolve() / file for file in files if file is not None]
     inputs = [file for file in input_files(project) if file.resolve() not in written]
     _refuse_inputs(request, [request.project, *inputs])
     for file in written:
         check_output(file, inputs, overwrite=request.overwrite)
-
-
-def _correction_file(project: Project, image: ImageEntry) -> str | None:
-    return None if isinstance(image, Image) else geometry_of(image).output(project.stems[image.name])
 
 
 def _refuse_inputs(request: AdjustRequest, inputs: Sequence[Path]) -> None:

@@ -431,11 +431,8 @@ def _angles(image: CorrectableLine, correction: LineCorrection) -> tuple[_Floats
     return track.time(rows), np.stack([angles_from_rotation(each) for each in map_axes(track).T @ R])
 
 
-def _output(stem: str) -> str:
-    return f"{stem}.correction.toml"
-
-
-LINES = Geometry(group="lines", away=lambda image: image.away, correctable=_correctable, found=_found, output=_output)
+LINES = Geometry(group="lines", away=lambda image: image.away, correctable=_correctable, found=_found,
+                 output="{}.correction.toml".format)  # fmt: skip
 
 
 #: A satellite is about so far away, metres.
@@ -462,16 +459,14 @@ def _found_by_rpc(image: CorrectableRpc, sets: Mapping[str, AdjustedCorrections]
     entries = {
         "shift": [round(v, 6) + 0.0 for v in shift_drift[:2]],
         "drift": [float(f"{v:.9g}") for v in shift_drift[2:]] if count > 2 else None,
-        "covariance": _triangle(whole),
+        "covariance": [float(f"{v:.6g}") for v in whole[np.tril_indices(len(whole))]]
+        if np.isfinite(whole).all()
+        else None,
     }
     sigma = np.sqrt(np.diag(Q))
     return FoundCorrection(
         entries, tuple(FoundParameter(*row, "px") for row in zip(_CALLED_BY_RPC, values.tolist(), sigma.tolist()))
     )
-
-
-def _triangle(Q: np.ndarray) -> list[float] | None:
-    return [float(f"{v:.6g}") for v in Q[np.tril_indices(len(Q))]] if np.isfinite(Q).all() else None
 
 
 POLYNOMIALS = Geometry("rational polynomials", lambda image: _AWAY, _correctable_by_rpc, _found_by_rpc)
