@@ -1,12 +1,280 @@
-"""Results of operations: what a command prints, writes as JSON and shows in a report."""
+"""Results and findings of operations: what a command prints, writes as JSON and tables, and shows in a report."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from photoplan.errors import InputError, TilesFailed
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+#: Side of a picture, pixels, to which larger ones are reduced.
+MOST_PIXELS = 900
+
+
+def number(value: float, sigma: float = math.nan) -> str:
+    """Format a number with the digits that its standard deviation allows (two of it), else with four or more."""
+    if not math.isfinite(value):
+        return "–"
+    if not (math.isfinite(sigma) and sigma > 0) or value == 0:
+        return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else _plain(value, 4)
+    digits = min(max(math.floor(math.log10(abs(value))) - math.floor(math.log10(sigma)) + 2, 2), 9)
+    text = _plain(value, digits)
+    if "e" in text or len(text.lstrip("-").replace(".", "").lstrip("0")) >= digits:
+        return text
+    # Zeros at the end show how well a number is known.
+    return f"{value:.{max(digits - 1 - math.floor(math.log10(abs(value))), 0)}f}"
+
+
+def _plain(value: float, digits: int) -> str:
+    """Format a number with so many digits; powers of ten only if it would be very long."""
+    rounded = float(f"{value:.{digits}g}")
+    return f"{rounded:.10g}" if 1e-4 <= abs(rounded) < 1e7 or rounded == 0 else f"{value:.{digits}g}"
+
+
+def with_sigma(value: float, sigma: float, unit: str = "", signed: bool = False) -> str:
+    """Format a value, its standard deviation unless that is NaN, and its unit: ``0.5230 ± 0.0012 px``."""
+    sign = "+" if signed and value > 0 else ""
+    return " ".join(filter(None, [sign + number(value, sigma), sigma_text(sigma), unit]))
+
+
+def sigma_text(sigma: float) -> str:
+    """Format a standard deviation: ``± 0.0012``; nothing if it is NaN."""
+    return f"± {_plain(sigma, 2)}" if math.isfinite(sigma) else ""
+
+
+def columns(rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return lines in which the cells of a column stand below each other."""
+    listed = list(rows)
+    wide = [max(map(len, column)) for column in zip(*listed)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, wide)).rstrip() for row in listed]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One number that was found."""
+
+    name: str
+    """As in JSON: small letters with the unit, such as ``read_noise_e``."""
+    value: float
+    sigma: float = math.nan
+    """Its standard deviation; NaN if none can be stated."""
+    label: str = ""
+    """Its name for people."""
+    unit: str = ""
+    plane: str = ""
+    """Colour plane; empty if there is one plane, or it holds for all."""
+    at: str = ""
+    """Condition, if there are several: ``500 nm``."""
+    remark: str = ""
+    """Such as its source."""
+    stated: float | None = None
+    """Value that is stated elsewhere, to compare."""
+
+    @property
+    def row(self) -> tuple[str, str, str]:
+        """Its name, value and remark as they are printed."""
+        where = spaced(self.plane, self.at)
+        stated = "" if self.stated is None else f"  (stated: {number(self.stated)})"
+        name = f"{self.label} ({where})" if where else self.label
+        return name, with_sigma(self.value, self.sigma, self.unit), self.remark + stated
+
+    def json_fields(self) -> dict[str, Any]:
+        """Return the fields; keys that say nothing are left out."""
+        more = {key: value for key in ("plane", "at", "remark", "label") if (value := getattr(self, key))}
+        return {"name": self.name, "value": self.value, "sigma": self.sigma, "unit": self.unit, **more}
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One series of a chart."""
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    label: str = ""
+    style: Literal["points", "line", "line and points", "dashed", "steps"] = "points"
+    sigma: NDArray[np.float64] | None = None
+    """Standard deviation of y, drawn as bars."""
+    colour: int | None = None
+    """Number of a colour; None: the next."""
+    vectors: NDArray[np.float64] | None = None
+    """From each point, shape (n, 2): drawn enlarged by what the legend says."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Curves over one axis."""
+
+    title: str
+    caption: str
+    x_label: str
+    y_label: str
+    curves: tuple[Trace, ...]
+    log_x: bool = False
+    log_y: bool = False
+    marks: tuple[tuple[float, str], ...] = ()
+    """Vertical lines: where, and what they mean."""
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Values by name, as bars; the last is their total."""
+
+    title: str
+    caption: str
+    values: Mapping[str, float]
+    label: str
+    """Of the values, with their unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An image with a scale, and positions in it."""
+
+    title: str
+    caption: str
+    values: NDArray[Any]
+    """Shape (h, w)."""
+    label: str
+    """Of the scale."""
+    points: tuple[tuple[float, float], ...] = ()
+    """(x, y) in pixels of `values`; drawn as circles."""
+    limits: tuple[float, float] | None = None
+    """Of the scale; None: 0.5 % and 99.5 % of the values."""
+    factor: int = 1
+    """Side of the block of pixels of which each value is the mean, see `shrunk`; positions count whole pixels."""
+    extent: tuple[float, float, float, float] | None = field(default=None)
+    """Left, right, bottom, top of the axes where they are no pixels of `values`."""
+
+
+def shrunk(values: NDArray[Any]) -> tuple[NDArray[np.float64], int]:
+    """Return an image as small as a report shows it anyway, and the side of the blocks that were averaged."""
+    factor = max(1, -(-max(values.shape) // MOST_PIXELS))
+    height, width = (side // factor for side in values.shape)
+    blocks = values[: height * factor, : width * factor].astype("float64").reshape(height, factor, width, factor)
+    return blocks.mean(axis=(1, 3)), factor
+
+
+def spaced(*parts: str) -> str:
+    """Parts that say something, with spaces between them."""
+    return " ".join(filter(None, parts))
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Of what figures are: a colour plane and a condition, either of which may be empty."""
+
+    plane: str = ""
+    at: str = ""
+
+    def figure(self, name: str, value: float, sigma: float, label: str, unit: str = "", remark: str = "") -> Estimate:
+        """A figure of it."""
+        return Estimate(
+            name=name, value=value, sigma=sigma, label=label, unit=unit, plane=self.plane, at=self.at, remark=remark
+        )
+
+    def under(self, condition: str) -> Subject:
+        """The same under one more condition."""
+        return Subject(self.plane, spaced(self.at, condition))
+
+    def named(self, *words: str) -> str:
+        """Words and what it is, as a title or the key of a refusal."""
+        return spaced(*words, self.plane, self.at)
+
+    def key(self, word: str) -> str:
+        """The same as a name among the details."""
+        return self.named(word).replace(" ", "_")
+
+
+def known(*figures: Estimate) -> tuple[Estimate, ...]:
+    """Those whose value is known, not NaN."""
+    return tuple(figure for figure in figures if math.isfinite(figure.value))
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of figures; written as CSV and shown in the report."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str | float | int, ...], ...]
+    caption: str = ""
+    printed: bool = False
+    """It is short and part of the text for people."""
+
+    def texts(self) -> list[list[str]]:
+        """Return head and rows as they are printed, without columns that are empty."""
+        rows = [[cell if isinstance(cell, str) else f"{cell:.5g}" if cell == cell else "–" for cell in row]
+                for row in self.rows]  # fmt: skip
+        shown = [k for k in range(len(self.head)) if any(row[k] for row in rows)]
+        return [[row[k] for k in shown] for row in (self.head, *rows)]
+
+    @classmethod
+    def of(cls, caption: str, **columns: Any) -> Table:
+        """Rows of columns by their heads; a text or a number stands in every row, yes and no become 1 and 0."""
+        lists = {head: v.tolist() if hasattr(v, "tolist") else v for head, v in columns.items()}
+        count = next(len(v) for v in lists.values() if isinstance(v, list | tuple))
+        filled = (v if isinstance(v, list | tuple) else [v] * count for v in lists.values())
+        cells = ([int(v) if isinstance(v, bool) else v for v in column] for column in filled)
+        return cls(tuple(columns), tuple(zip(*cells)), caption)
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """Estimates that belong together, and what goes with them; its fields are the keys of JSON."""
+
+    figures: tuple[Estimate, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
+    """Figures that the data do not allow, and why, one sentence each."""
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    """By the stem of their CSV file."""
+    plots: tuple[Chart | Bars | Picture, ...] = ()
+    notes: tuple[str, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+    """More plain values for JSON."""
+    files: Mapping[str, bytes | Table | NDArray[Any]] = field(default_factory=dict)
+    """More files by name, written beside the tables: contents, a table, or an image of type float32."""
+    title: str = ""
+
+    def lines(self) -> list[str]:
+        """Return figures, what is not known, and short tables for people."""
+        tables = [columns(table.texts()) for table in self.tables.values() if table.printed]
+        lines = [
+            *columns(figure.row for figure in self.figures),
+            *(f"not known: {what}: {why}" for what, why in self.refused.items()),
+            *(line for table in tables for line in table),
+        ]
+        return [self.title, *(f"  {line}" for line in lines)] if self.title else lines
+
+    def json_fields(self) -> dict[str, Any]:
+        """Return figures, what is not known, notes, details and tables."""
+        tables = {name: {"head": table.head, "rows": table.rows} for name, table in self.tables.items()}
+        return {"figures": self.figures, "refused": self.refused, "notes": self.notes, "details": self.details,
+                "tables": tables}  # fmt: skip
+
+
+def joined(outcomes: Sequence[Findings]) -> Findings:
+    """Several outcomes (of planes, of wavelengths) as one; later tables of one name are put below earlier ones."""
+    tables: dict[str, Table] = {}
+    for outcome in outcomes:
+        for name, table in outcome.tables.items():
+            known = tables.get(name)
+            rows = table.rows if known is None else known.rows + table.rows
+            tables[name] = Table(table.head, rows, table.caption)
+    return Findings(
+        figures=tuple(f for o in outcomes for f in o.figures),
+        refused={key: why for o in outcomes for key, why in o.refused.items()},
+        tables=tables,
+        plots=tuple(p for o in outcomes for p in o.plots),
+        notes=tuple(dict.fromkeys(n for o in outcomes for n in o.notes)),
+        details={key: value for o in outcomes for key, value in o.details.items()},
+        files={name: content for o in outcomes for name, content in o.files.items()},
+    )
 
 
 class Result:
@@ -17,9 +285,13 @@ class Result:
         values: dict[str, Any] = vars(self)
         return [value for value in values.values() if isinstance(value, Path)]
 
+    def outcome(self) -> Sequence[Findings]:
+        """Return what was found."""
+        return ()
+
     def summary(self) -> Sequence[str]:
         """Return the figures for people, printed on stdout after the files."""
-        return ()
+        return [line for each in self.outcome() for line in each.lines()]
 
     def raise_failures(self) -> None:
         """Raise if a part of the inputs failed, after the rest is written."""

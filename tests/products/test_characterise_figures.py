@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tools.camera_model import Sensor, write_frame
 
-from photoplan.products.characterise.result import Figure, Listing
+from photoplan.findings import Table, with_sigma
 from photoplan.products.characterise.run import CharacteriseRequest, characterise
 
 
@@ -25,14 +25,12 @@ from photoplan.products.characterise.run import CharacteriseRequest, characteris
     ],
 )
 def test_digits_follow_the_standard_deviation(value: float, sigma: float, text: str):
-    assert str(Figure("x", value, sigma, "x")) == f"x: {text}"
+    assert with_sigma(value, sigma) == text
 
 
 def test_columns_become_rows() -> None:
-    table = Listing.of(
-        "of them", plane="R", mean_dn=np.array([1.5, 2.5]), used=np.array([True, False]), name=["a", "b"]
-    )
-    assert table == Listing(("plane", "mean_dn", "used", "name"), (("R", 1.5, 1, "a"), ("R", 2.5, 0, "b")), "of them")
+    table = Table.of("of them", plane="R", mean_dn=np.array([1.5, 2.5]), used=np.array([True, False]), name=["a", "b"])
+    assert table == Table(("plane", "mean_dn", "used", "name"), (("R", 1.5, 1, "a"), ("R", 2.5, 0, "b")), "of them")
 
 
 def test_defects_come_from_the_levels_with_most_frames(tmp_path: Path) -> None:

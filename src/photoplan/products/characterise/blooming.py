@@ -7,10 +7,10 @@ from math import isfinite, nan
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, known
 from photoplan.io.series import Plane
 from photoplan.products.characterise.common import SettingsRun, black_of, exposure_runs, no_run, tried
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, known
 from photoplan.quality.camera.drift import Blooming, find_blooming
 
 _LEAST = 4
@@ -54,7 +54,7 @@ def _plane(data: SeriesData, run: SettingsRun, plane: Plane, images: list[np.nda
     longest = f"at {found.extent_exposure:g} {run.unit}"
     rows, columns = (n * plane.step if blooms else nan for n in (found.extent_rows, found.extent_columns))
     why = f"none up to an object of {found.last_without:.4g} DN (by its response): the neighbours grow as expected"
-    table = Listing.of(
+    table = Table.of(
         "Neighbours of the bright object",
         plane=of.plane,
         run=of.at,

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.findings import Findings, Subject, Trace, joined
 from photoplan.io.series import Plane
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Findings, Subject, Trace, joined
 from photoplan.quality.camera.dark_signal import Level
 from photoplan.quality.camera.photon_transfer import Saturation, find_saturation
 

@@ -7,10 +7,10 @@ from math import sqrt
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined
 from photoplan.io.series import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
 from photoplan.quality.camera.dark_signal import DarkCurrent, Level, dark_current, doubling_temperature
 
 _LEAST = 3
@@ -67,7 +67,7 @@ def _current(settings: list[Setting], levels: list[Level], of: Subject) -> Findi
         of.figure("dark_noise_dn", noise, of_noise, "temporal dark noise", "DN", remark),
     )
     means = np.array([level.mean for level in levels])
-    table = Listing.of(
+    table = Table.of(
         "Dark frames",
         plane=of.plane,
         temperature=of.at,

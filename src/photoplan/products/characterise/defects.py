@@ -8,20 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.series import Plane
-from photoplan.products.characterise.common import MOST_SATURATED, no_pair, tried
-from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import (
+from photoplan.findings import (
     Chart,
     Findings,
-    Listing,
-    Plate,
+    Picture,
     Subject,
+    Table,
     Trace,
     joined,
     known,
     shrunk,
 )
+from photoplan.io.series import Plane
+from photoplan.products.characterise.common import MOST_SATURATED, no_pair, tried
+from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.quality.camera.dark_signal import (
     DefectList,
     FrameStack,
@@ -107,7 +107,7 @@ def _setting(data: SeriesData, setting: Setting, plane: Plane, kinds: tuple[Kind
     defects = [d for part in lists.values() for d in part.defects]
     places = [plane.to_image(setting.first.group.window, d.col, d.row) for d in defects]
     columns, rows = (["" if isnan(v) else int(v) for v in axis] for axis in list(zip(*places)) or ((), ()))
-    table = Listing.of(
+    table = Table.of(
         "Defect elements, the strongest first; positions are those of the image",
         plane=of.plane,
         setting=of.at,
@@ -150,7 +150,7 @@ def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList)
     note = (
         f"{overfull} hot pixels are full at {exposures[-1]:g} ms; charge that runs over makes their neighbours hot, too"
     )
-    table = Listing.of(
+    table = Table.of(
         "Grey values of the hottest pixels at each dark exposure",
         plane=of.plane,
         column=[place[0] for place in places],
@@ -178,7 +178,7 @@ def _rate(seconds: NDArray[np.float64], values: NDArray[np.float64], usable: NDA
     return float(np.polyfit(seconds[usable], values[usable], 1)[0]) if usable.sum() > 1 else nan
 
 
-def _plots(found: DefectList, stack: FrameStack, of: Subject) -> tuple[Chart | Plate, ...]:
+def _plots(found: DefectList, stack: FrameStack, of: Subject) -> tuple[Chart | Picture, ...]:
     assert found.deviation is not None
     bars = log_histogram(found.deviation[np.isfinite(found.deviation)], found.scatter)
     seen = bars.count > 0
@@ -197,7 +197,7 @@ def _plots(found: DefectList, stack: FrameStack, of: Subject) -> tuple[Chart | P
     )
     points = tuple((d.col, d.row) for d in found.defects[:_FOLLOWED])
     small, factor = shrunk(stack.mean)
-    shown = Plate(
+    shown = Picture(
         title=f"Defect pixels, {of.named()}",
         caption=f"Mean image; the {len(points)} strongest of {found.count} are circled. Positions are those of the "
         "plane.",

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, spaced
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, central_window, frame_groups, window_means
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, spaced
 from photoplan.quality.camera.drift import LEAST_MEASUREMENTS, BrightnessDrift, brightness_drift
 
 #: Side of the window in the middle of the image (Behr 1989, §4.2.4).
@@ -64,8 +64,8 @@ def _outcome(found: BrightnessDrift, of: Subject, side: int) -> Findings:
         )
     v, label = found.variation, spaced(of.at, of.plane)
     caption = "Mean grey value of the window"
-    series = Listing.of(caption, series=label, time_s=found.times, mean_dn=found.values)
-    lapses = Listing.of(
+    series = Table.of(caption, series=label, time_s=found.times, mean_dn=found.values)
+    lapses = Table.of(
         "Variation over lapses of time",
         series=label,
         lapse_s=v.lapse,

@@ -7,11 +7,11 @@ from math import hypot, isfinite, nan
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Estimate, Findings, Subject, Table, Trace, joined, known
 from photoplan.io.series import ReducedPoint
 from photoplan.products.characterise import dark, pattern
 from photoplan.products.characterise.common import SettingsRun, exposure_runs, of_one_temperature, tried, used_and_rest
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined, known
 from photoplan.products.characterise.transfer import reduced_level
 from photoplan.quality.camera.dark_signal import Level, cut_off, dark_current
 from photoplan.quality.camera.photon_transfer import EmvaPoints, EmvaSheet, emva_sheet
@@ -69,18 +69,18 @@ def _of_reduced(data: SeriesData) -> Findings:
     return joined([found, tried("dark current", _dark_current, timed, gain), no_images])
 
 
-def _dark_current(timed: list[tuple[float, Level]], gain: Figure) -> Findings:
+def _dark_current(timed: list[tuple[float, Level]], gain: Estimate) -> Findings:
     found = dark_current([exposure for exposure, _ in timed], [level for _, level in timed])
     in_electrons = _in_electrons(found.current_dn_s, found.current_dn_s_sigma, gain)
-    return Findings((Figure("dark_current_e_s", *in_electrons, "dark current", "e/s"),))
+    return Findings((Estimate("dark_current_e_s", *in_electrons, "dark current", "e/s"),))
 
 
-def _in_electrons(value: float, sigma: float, gain: Figure) -> tuple[float, float]:
+def _in_electrons(value: float, sigma: float, gain: Estimate) -> tuple[float, float]:
     """Grey values and their standard deviation in electrons."""
     return value / gain.value, hypot(sigma, value * gain.sigma / gain.value) / gain.value
 
 
-def _taken(others: Findings, gain: Figure, of: Subject) -> Findings:
+def _taken(others: Findings, gain: Estimate, of: Subject) -> Findings:
     """Figures of other analyses in the units of the sheet, and those that they refused."""
     figures, refused = [], {}
     for there, here, words, unit, divided in _TAKEN:
@@ -124,7 +124,7 @@ def _sheet(bright: list[_Point], darks: list[_Point], of: Subject, step: float) 
     ]
     points = EmvaPoints(*np.array(rows, float).reshape(-1, 7).T).sorted()
     found = emva_sheet(points, step)
-    table = Listing.of(
+    table = Table.of(
         "Levels of the sheet",
         plane=of.plane,
         at=of.at,
@@ -145,7 +145,7 @@ def _sheet(bright: list[_Point], darks: list[_Point], of: Subject, step: float) 
     )
 
 
-def _figures(s: EmvaSheet, of: Subject) -> tuple[Figure, ...]:
+def _figures(s: EmvaSheet, of: Subject) -> tuple[Estimate, ...]:
     efficiency, of_efficiency = s.quantum_efficiency_percent, s.quantum_efficiency_percent_sigma
     noise, of_noise = s.temporal_dark_noise_e, s.temporal_dark_noise_e_sigma
     line = s.linearity

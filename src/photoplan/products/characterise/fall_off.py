@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Estimate, Findings, Picture, Subject, Table, Trace, joined
 from photoplan.geometry.grid import Window
 from photoplan.io.quality_files import FallOffEntry, TermEntry, fall_off_text
 from photoplan.io.series import Plane
 from photoplan.products.characterise.common import black_of, dark_like
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.groups import FrameGroup
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Plate, Subject, Trace, joined
 from photoplan.quality.camera.fall_off import FallOff, FallOffSettings, fit_fall_off
 from photoplan.quality.camera.fall_off_model import gain_image
 
@@ -137,7 +137,7 @@ def _outcome(found: FallOff, of: Plane, setting: Setting) -> Findings:
             f"({found.neighbour_correlation:.2f}): structure is left that the model does not "
             "describe; standard deviations are enlarged for it"
         )
-    corners = Listing.of(
+    corners = Table.of(
         "Brightness lost in the corners",
         plane=plane,
         corner=[c.name for c in found.corners],
@@ -146,13 +146,13 @@ def _outcome(found: FallOff, of: Plane, setting: Setting) -> Findings:
         natural_percent=["" if c.natural is None else 100 * c.natural for c in found.corners],
         artificial_percent=["" if c.artificial is None else 100 * c.artificial for c in found.corners],
     )
-    terms = Listing.of(
+    terms = Table.of(
         "Terms r^n cos(m θ) of the polynomial",
         plane=plane,
         **{name: [getattr(t, name) for t in found.terms] for name in ("n", "m", "coefficient", "sigma")},
     )
     places = [_place(of, d.x, d.y) for d in found.dirt]
-    dirt = Listing.of(
+    dirt = Table.of(
         "Dust and stains",
         plane=plane,
         x=[x for x, _ in places],
@@ -180,7 +180,7 @@ def _place(plane: Plane, x: float, y: float) -> tuple[float, float]:
     return plane.col + plane.step * x, plane.row + plane.step * y
 
 
-def _figures(found: FallOff, plane: Plane) -> tuple[Figure, ...]:
+def _figures(found: FallOff, plane: Plane) -> tuple[Estimate, ...]:
     """Lengths in pixels of the image, of which a colour has every second one."""
     nan, of, step = math.nan, Subject(plane.name), plane.step
     figures = [of.figure("centre_dn", found.level, found.sigma_level, "grey value at the principal point", "DN")]
@@ -206,7 +206,7 @@ def _figures(found: FallOff, plane: Plane) -> tuple[Figure, ...]:
     return (*figures, of.figure("dirt", len(found.dirt), nan, "places with dust or stains"))
 
 
-def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Plate, ...]:
+def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Picture, ...]:
     assert found.blocks is not None and found.residuals is not None
     blocks, model = found.blocks, found.model
     of = f", {plane.name}" if plane.name else ""
@@ -216,7 +216,7 @@ def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Plate, ...]:
     dirt = tuple(_place(plane, d.x, d.y) for d in found.dirt[:30])
     relative = blocks.values / found.level
     return (
-        Plate(
+        Picture(
             f"Brightness{of}",
             "Mean of the flat frames in blocks, relative to the principal point (Behr 1989, fig. 4.9).",
             100 * relative,
@@ -225,7 +225,7 @@ def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Plate, ...]:
             extent=extent,
         ),
         _profile(found, of, plane.step),
-        Plate(
+        Picture(
             f"After correction{of}",
             f"What the model leaves; {len(found.dirt)} places with dust or stains (circles) did not count.",
             100 * found.residuals,

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, known, spaced
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups, window_means
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, known, spaced
 from photoplan.quality.camera.drift import LEAST_VALUES
 from photoplan.quality.camera.video import GainControl, compare_transitions, gain_control
 
@@ -95,7 +95,7 @@ def _outcome(found: GainControl, pixel: tuple[float, float], of: Subject, step: 
         curves=(Trace(t, found.values, "measured", "points"), Trace(curve, a.at(curve), "adjusted", "line")),
         marks=((0.0, "step"),),
     )
-    table = Listing.of(caption, series=found.name, time_s=found.times, mean_dn=found.values)
+    table = Table.of(caption, series=found.name, time_s=found.times, mean_dn=found.values)
     return Findings(known(*figures), refused, {"series": table}, (chart,))
 
 

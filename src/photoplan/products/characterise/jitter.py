@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Estimate, Findings, Subject, Table, Trace, joined
 from photoplan.geometry.grid import Window
 from photoplan.io.series import EdgeEntry, SeriesFrame, frame_pixels
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined
 from photoplan.quality.camera.straight_lines import EdgeLines, correlate_edge, fit_edge
 from photoplan.quality.camera.video import LineJitter, above_control, compare_edges, line_jitter, mean_correlation
 from photoplan.quality.sensor import jitter_grey
@@ -184,7 +184,7 @@ def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: li
     entry, jitters = edges[0].entry, [e.jitter for e in edges]
     of = Subject(at=f"{group.label}, {entry.name}" if len(frame_groups(data, "plumb")) > 1 else entry.name)
     lines = [len(j.line) for j in jitters]
-    figures: list[Figure] = []
+    figures: list[Estimate] = []
 
     def add(name: str, values: list[float], label: str, unit: str = "px") -> None:
         """A standard deviation over the lines of each frame, whose own accuracy follows from their number."""
@@ -222,7 +222,7 @@ def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: li
     return Findings(tuple(figures), refused, notes=_curved(edges, of.at))
 
 
-def _periodic(data: SeriesData, edges: list[Edge], at: str) -> list[Figure]:
+def _periodic(data: SeriesData, edges: list[Edge], at: str) -> list[Estimate]:
     """Of the first frame in which there is one; the table holds all frames."""
     edge = next((e for e in edges if e.jitter.harmonics), None)
     if edge is None:
@@ -275,10 +275,10 @@ def _pair(group: FrameGroup, first: list[Edge], second: list[Edge]) -> Findings:
     return Findings(tuple(figures), notes=(note,) if note else ())
 
 
-def _table(edges: Sequence[Edge]) -> Listing:
+def _table(edges: Sequence[Edge]) -> Table:
     jitters = [e.jitter for e in edges]
     first = [j.harmonics[0] if j.harmonics else None for j in jitters]
-    return Listing.of(
+    return Table.of(
         "Edges by frame",
         edge=[e.entry.name for e in edges],
         frame=[e.frame.file.name for e in edges],
@@ -299,7 +299,7 @@ def _table(edges: Sequence[Edge]) -> Listing:
     )
 
 
-def _lines(edges: Sequence[Edge]) -> Listing:
+def _lines(edges: Sequence[Edge]) -> Table:
     """Every line of every edge."""
     rows = [
         (e.entry.name, e.frame.file.name, e.first_line + int(line), f"{p:.5f}", f"{d:.5f}", f"{r:.5f}", int(used))
@@ -308,4 +308,4 @@ def _lines(edges: Sequence[Edge]) -> Listing:
             e.jitter.line, e.jitter.position, e.jitter.deviation, e.jitter.regular, e.jitter.used
         )
     ]
-    return Listing(("edge", "frame", "line", "position_px", "deviation_px", "regular_px", "used"), tuple(rows))
+    return Table(("edge", "frame", "line", "position_px", "deviation_px", "regular_px", "used"), tuple(rows))

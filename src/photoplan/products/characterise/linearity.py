@@ -7,6 +7,7 @@ from math import hypot
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Findings, Subject, Table, Trace
 from photoplan.io.series import Plane
 from photoplan.products.characterise.common import (
     MOST_SATURATED,
@@ -18,7 +19,6 @@ from photoplan.products.characterise.common import (
     used_and_rest,
 )
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace
 from photoplan.quality.camera.dark_signal import check_level, cut_off
 from photoplan.quality.camera.photon_transfer import HIGH, Linearity, linearity
 
@@ -76,8 +76,8 @@ def _run(data: SeriesData, run: SettingsRun, plane: Plane, of: Subject) -> Findi
     )
 
 
-def _table(found: Linearity, run: SettingsRun, of: Subject) -> Listing:
-    return Listing.of(
+def _table(found: Linearity, run: SettingsRun, of: Subject) -> Table:
+    return Table.of(
         f"Signal and response; slopes in DN/{run.unit}",
         plane=of.plane,
         run=of.at,

@@ -6,8 +6,8 @@ from math import sqrt
 
 import numpy as np
 
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
 from photoplan.quality.camera.dark_signal import Level
 
 #: What stands still: between frames of other kinds the scene or its brightness changes.
@@ -38,7 +38,7 @@ def _plane(data: SeriesData, name: str, labelled: list[tuple[str, Level]]) -> Fi
         of_sigma = np.where(sigma > 0, [level.variance_sigma for level in levels] / (2 * sigma), 0.0)
     clipped = np.array([max(level.zero_share, level.saturated_share) > 0.005 for level in levels], bool)
     sound = np.flatnonzero((sigma > 0) & ~clipped)
-    table = Listing.of(
+    table = Table.of(
         "Mean grey value and standard deviation of a pixel (Behr 1989, table 4.2)",
         plane=name,
         mean_dn=mean,

@@ -8,11 +8,11 @@ from math import isfinite, nan
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined
 from photoplan.io.series import Plane
 from photoplan.plain import plain
 from photoplan.products.characterise.common import black_of, dark_like, no_pair, of_one_temperature, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
 from photoplan.quality.camera.dark_signal import (
     FrameStack,
     PatternVariance,
@@ -128,7 +128,7 @@ def _spectra(stack: FrameStack, plane: Plane, what: str) -> Findings:
     of = Subject(plane.name)
     along = {way: _of_image(spectrogram(stack.mean, axis), plane.step) for way, axis in (("rows", 1), ("columns", 0))}
     tables = [
-        Listing.of(
+        Table.of(
             "Spectrograms", image=of.named(what), along=way, frequency_cycles_px=s.frequency, amplitude_dn=s.amplitude
         )
         for way, s in along.items()

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
+from photoplan.findings import Findings
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Findings
 
 
 @dataclass(frozen=True)

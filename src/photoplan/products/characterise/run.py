@@ -10,7 +10,7 @@ from typing import Any
 
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result, raise_failed
+from photoplan.findings import Estimate, Findings, Result, Table, raise_failed
 from photoplan.io.product import check_output
 from photoplan.io.raster import write_whole_image
 from photoplan.io.series import Plane, Series, grey_step, largest_of_steps, read_series
@@ -20,7 +20,6 @@ from photoplan.plain import pick, plain
 from photoplan.products.characterise.common import SettingsRun, exposure_runs
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.registry import ANALYSES, Analysis
-from photoplan.products.characterise.result import Figure, Findings, Listing
 from photoplan.quality.camera.photon_transfer import FullWell, full_well
 from photoplan.requests.quality import CharacteriseRequest
 
@@ -101,10 +100,7 @@ class AnalysisRun:
         """Without plots and files."""
         found: dict[str, Any] = {**pick(self.analysis, "name", "title"), "state": self.state}
         found |= {"reason": self.missing or self.failed} if self.missing or self.failed else {}
-        if self.outcome is not None:
-            found |= pick(self.outcome, "figures", "refused", "notes", "details")
-            found["tables"] = {name: pick(table, "head", "rows") for name, table in self.outcome.tables.items()}
-        return found
+        return found if self.outcome is None else found | self.outcome.json_fields()
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,16 +136,10 @@ class CharacteriseReport(Result):
         """Return tables and what goes with them."""
         return self.tables
 
-    def summary(self) -> list[str]:
-        """Return the figures of each analysis, and what is not known."""
-        lines: list[str] = []
-        for run in self.runs:
-            if run.state == "possible":
-                lines.append(f"{run.analysis.name}: possible")
-            if run.outcome is not None:
-                lines += [run.analysis.title, *(f"  {figure}" for figure in run.outcome.figures)]
-                lines += [f"  not known: {what}: {why}" for what, why in run.outcome.refused.items()]
-        return lines
+    def outcome(self) -> list[Findings]:
+        """Return the findings of each analysis; in a dry run, which are possible."""
+        possible = [Findings(title=f"{run.analysis.name}: possible") for run in self.runs if run.state == "possible"]
+        return [*possible, *(replace(run.outcome, title=run.analysis.title) for run in self.runs if run.outcome)]
 
     def remarks(self) -> list[str]:
         """Return the notes on all analyses, then those on each."""
@@ -262,14 +252,14 @@ def _write_tables(request: CharacteriseRequest, series: Series, runs: Sequence[A
         check_output(path, list(series.inputs), overwrite=request.overwrite)
         if isinstance(content, bytes):
             write_atomically(path, content)
-        elif isinstance(content, Listing):
+        elif isinstance(content, Table):
             write_table(path, content.head, content.rows)
         else:
             write_whole_image(path, content)
     return [*(request.csv / f"{name}.csv" for name in tables), *files]
 
 
-def _figure_table(figures: Sequence[tuple[str, Figure]]) -> Listing:
+def _figure_table(figures: Sequence[tuple[str, Estimate]]) -> Table:
     names = ("name", "plane", "at", "value", "sigma", "unit", "remark")
     rows = ((name, *(plain(v) for v in pick(figure, *names).values())) for name, figure in figures)
-    return Listing(("analysis", *names), tuple(tuple("" if v is None else v for v in row) for row in rows))
+    return Table(("analysis", *names), tuple(tuple("" if v is None else v for v in row) for row in rows))

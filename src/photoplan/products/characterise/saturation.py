@@ -6,10 +6,10 @@ from math import nan
 
 import numpy as np
 
+from photoplan.findings import Chart, Findings, Subject, Trace, known
 from photoplan.io.series import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, SettingsRun, no_run, of_runs
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Chart, Findings, Subject, Trace, known
 from photoplan.quality.camera.dark_signal import check_level
 
 _KINDS = ("flat", "scene")

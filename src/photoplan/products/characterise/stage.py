@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
 from photoplan.products.characterise.targets import locate_targets
 from photoplan.quality.camera.stage import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
 
@@ -108,7 +108,7 @@ def _outcome(found: StageCalibration, given: _Points, number: int) -> Findings:
     figures.append(of.figure("m0_px", found.sigma0, found.sigma0 / math.sqrt(2 * found.redundancy), "M0", "px"))
     both = [[float(getattr(t, f"a{k}")) for k in range(1, 7)] for t in (found.to_image, found.to_stage)]
     elements = dict(zip(("a1", "a2", "a3", "b1", "b2", "b3"), zip(*both)))
-    points = Listing.of(
+    points = Table.of(
         "Points, residuals measured minus transformed",
         series=at,
         point=found.names,
@@ -117,7 +117,7 @@ def _outcome(found: StageCalibration, given: _Points, number: int) -> Findings:
         **dict(zip(("residual_x_px", "residual_y_px"), found.residuals.T)),
         remark=["gross error" if name in found.gross else "" for name in found.names],
     )
-    matrices = Listing.of("Affine matrices", series=at, way=("stage to image", "image to stage"), **elements)
+    matrices = Table.of("Affine matrices", series=at, way=("stage to image", "image to stage"), **elements)
     return Findings(
         tuple(figures),
         tables={"matrices": matrices, "points": points},

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, known
 from photoplan.io.series import Plane, ReducedPoint
 from photoplan.products.characterise.common import dark_levels, tried, used_and_rest
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, known
 from photoplan.quality.camera.dark_signal import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
 
@@ -75,7 +75,7 @@ def _plane(name: str, bright: list[Level], dark: list[Level], exposures: list[fl
         lost, words = f.compression_percent, "signal lost by a response that bends, brightest level used"
         figures += (of.figure("compression_percent", lost, f.compression_percent_sigma, words, "%"),)
     caption = "Levels and whether the line uses them"
-    table = Listing.of(caption, plane=name, mean_dn=f.mean, variance_dn2=f.variance, used=f.used)
+    table = Table.of(caption, plane=name, mean_dn=f.mean, variance_dn2=f.variance, used=f.used)
     key = f"photon_transfer{name and f'_{name}'}"
     notes = tuple(f"{name}: {note}".lstrip(": ") for note in f.notes)
     return Findings(

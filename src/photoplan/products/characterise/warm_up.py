@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Estimate, Findings, Subject, Table, Trace, joined, known
 from photoplan.io.series import MeasuredPositions
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined, known
 from photoplan.products.characterise.targets import locate_targets
 from photoplan.quality.camera.drift import LEAST_VALUES, Course, WarmUp, warm_up
 
@@ -127,7 +127,7 @@ def _of_table(table: MeasuredPositions) -> _Input:
 
 def _outcome(found: WarmUp, given: _Input) -> Findings:
     at, nan, of = given.label, math.nan, Subject(at=given.label)
-    figures: list[Figure] = []
+    figures: list[Estimate] = []
     refused: dict[str, str] = {}
     for axis, sigma in zip("xy", found.repeat_sigma or ()):
         words = f"standard deviation of a single measurement in {axis}"
@@ -153,13 +153,13 @@ def _outcome(found: WarmUp, given: _Input) -> Findings:
     )
     values = {f"{c.name}{s}": v for c in found.courses for s, v in (("", c.values), ("_sigma", c.sigmas))}
     caption = "Parameters by epoch (shifts px, scales in parts, angles rad)"
-    table = Listing.of(caption, series=at, time_s=found.times, **values)
+    table = Table.of(caption, series=at, time_s=found.times, **values)
     return Findings(
         figures=known(*figures), refused=refused, tables={"epochs": table}, plots=_charts(found, at), notes=notes
     )
 
 
-def _course(course: Course, of: Subject, bound: float) -> tuple[list[Figure], dict[str, str]]:
+def _course(course: Course, of: Subject, bound: float) -> tuple[list[Estimate], dict[str, str]]:
     """Size, time constant and time until warm of one parameter."""
     factor, unit = _UNITS[course.unit]
     label, name = _LABELS[course.name], course.name

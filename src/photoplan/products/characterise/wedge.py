@@ -8,11 +8,11 @@ from math import nan
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, spaced
 from photoplan.geometry.grid import Window
 from photoplan.io.series import Plane, SeriesFrame, plane_pixels
 from photoplan.products.characterise.common import black_of, saturation_of, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, spaced
 from photoplan.quality.camera.dark_signal import Level, StackSums
 from photoplan.quality.camera.straight_lines import GreyWedge, grey_wedge
 
@@ -85,7 +85,7 @@ def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, of: Subject) -
     sigma = [patch.level.sigma_of_mean(data.step) for patch in patches]
     full = saturation_of(data, plane, [patch.level for patch in patches]) - blacks[0].mean
     found = grey_wedge([patch.density for patch in patches], signal, sigma, full)
-    table = Listing.of(
+    table = Table.of(
         "Patches of the wedge",
         plane=of.plane,
         at=of.at,
