@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from math import degrees, radians
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result
+from photoplan.findings import Bars, Chart, Estimate, Findings, Result, Trace
 from photoplan.io.product import check_output
 from photoplan.io.quality_files import (
     ChargeTransfer,
@@ -34,33 +37,27 @@ class SensorReport(Result):
     """Figures of a sensor."""
 
     described: SensorDescription
-    figures: tuple[SensorFigure, ...]
+    sections: tuple[Findings, ...]
+    """Of each table of the description."""
     csv: Path | None
     """Table that was written."""
+
+    @property
+    def figures(self) -> list[dict[str, Any]]:
+        """The figures with the keys of JSON and table."""
+        return [
+            {"section": each.title, **pick(f, "name", "value", "unit", "stated", meaning="label", source="remark")}
+            for each in self.sections
+            for f in each.figures
+        ]
 
     def json_fields(self) -> dict[str, object]:
         """Return the name and the figures."""
         return {"name": self.described.name, "figures": self.figures}
 
-    def summary(self) -> list[str]:
-        """Return the figures by section."""
-        lines, section = [self.described.name], ""
-        wide = max(len(figure.meaning) for figure in self.figures)
-        for figure in self.figures:
-            if figure.section != section:
-                section = figure.section
-                lines.append(f"[{section}]")
-            value = f"{short_number(figure.value)} {figure.unit}".rstrip()
-            stated = "" if figure.stated is None else f"  (stated: {short_number(figure.stated)})"
-            lines.append(f"  {figure.meaning:<{wide}}  {value:<18}  {figure.source}{stated}")
-        return lines
-
-
-def short_number(value: float) -> str:
-    """Format a number with four digits, without an exponent if that is short."""
-    if value == 0.0 or 1e-4 <= abs(value) < 1e4:
-        return f"{value:.4g}"
-    return f"{value:,.0f}".replace(",", " ") if 1e4 <= abs(value) < 1e9 else f"{value:.3e}"
+    def outcome(self) -> list[Findings]:
+        """Return the name, then the figures of each table of the description."""
+        return [Findings(title=self.described.name), *self.sections]
 
 
 def describe_sensor(request: SensorRequest, events: Events = SILENT) -> SensorReport:
@@ -76,16 +73,16 @@ def describe_sensor(request: SensorRequest, events: Events = SILENT) -> SensorRe
     if request.csv is not None:
         check_output(request.csv, [request.file], overwrite=request.overwrite)
     described = read_sensor(request.file)
-    figures = sensor_figures(described, str(request.file))
-    for figure in figures:
-        if figure.stated is not None and abs(figure.value - figure.stated) > 0.01 * abs(figure.stated):
-            events.talk(f"{figure.name}: {figure.value:.4g} by {figure.source}; {figure.stated:g} is stated")
-    written = None if request.dry_run else request.csv
-    if written is not None:
+    sections = sensor_figures(described, str(request.file))
+    for f in (figure for each in sections for figure in each.figures):
+        if f.stated is not None and abs(f.value - f.stated) > 0.01 * abs(f.stated):
+            events.talk(f"{f.name}: {f.value:.4g} by {f.remark}; {f.stated:g} is stated")
+    report = SensorReport(described, sections, None if request.dry_run else request.csv)
+    if report.csv is not None:
         head = ("section", "name", "value", "unit", "stated", "meaning", "source")
-        rows = (pick(figure, *head).values() for figure in figures)
-        write_table(written, head, [["" if value is None else value for value in row] for row in rows])
-    return SensorReport(described, figures, written)
+        rows = [["" if row[key] is None else row[key] for key in head] for row in report.figures]
+        write_table(report.csv, head, rows)
+    return report
 
 
 _AXES = ("x", "y")
@@ -94,29 +91,11 @@ _ALONG = ("across", "down")
 SHARES = (0.25, 0.5, 0.75, 1.0)
 
 
-@dataclass(frozen=True)
-class SensorFigure:
-    """One figure of a sensor."""
-
-    section: str
-    """Table of the description that it follows from."""
-    name: str
-    """Its name in JSON and under ``[stated]``, with the unit."""
-    meaning: str
-    """In words."""
-    value: float
-    unit: str
-    source: str
-    """Equation that it was computed with."""
-    stated: float | None = None
-    """The value that the description states for it."""
-
-
 Found = Iterator[tuple[str, str, float, str, str]]
 
 
-def sensor_figures(described: SensorDescription, file: str) -> tuple[SensorFigure, ...]:
-    """Every figure that a description determines, in the order of its tables."""
+def sensor_figures(described: SensorDescription, file: str) -> tuple[Findings, ...]:
+    """Return every figure that a description determines, and plots, by the tables of the description."""
     parts: list[tuple[str, Found]] = []
     if described.viewing is not None:
         parts.append(("viewing", _viewing(described.viewing)))
@@ -132,15 +111,85 @@ def sensor_figures(described: SensorDescription, file: str) -> tuple[SensorFigur
         parts.append(("noise", _noise(described)))
     if described.optics is not None:
         parts.append(("optics", _optics(described.optics, described.sensor)))
-    found = [SensorFigure(section, *figure) for section, figures in parts for figure in figures]
-    names = {figure.name for figure in found}
+    estimates = {
+        part: tuple(
+            Estimate(name, value, label=label, unit=unit, remark=source, stated=described.stated.get(name))
+            for name, label, value, unit, source in found
+        )
+        for part, found in parts
+    }
+    values = {figure.name: figure.value for figures in estimates.values() for figure in figures}
     for name in described.stated:
-        if name not in names:
+        if name not in values:
             raise InputError(
                 f"{file}: stated.{name}: no such figure follows from the description; those that do are "
-                f"{', '.join(sorted(names)) or 'none'}"
+                f"{', '.join(sorted(values)) or 'none'}"
             )
-    return tuple(replace(figure, stated=described.stated.get(figure.name)) for figure in found)
+    plots = _plots(described, values)
+    return tuple(Findings(figures, plots=tuple(plots.get(part, ())), title=part) for part, figures in estimates.items())
+
+
+def _plots(described: SensorDescription, values: Mapping[str, float]) -> dict[str, list[Chart | Bars]]:
+    """Return plots by the table that they belong to."""
+    found: dict[str, list[Chart | Bars]] = {}
+    if described.transfer is not None:
+        own = described.transfer.inefficiency * described.transfer.transfers
+        ratio = np.linspace(0.0, 0.5, 201)
+        curves = [
+            Trace(ratio, np.exp(-product * (1.0 - np.cos(2.0 * np.pi * ratio))), label, "line")
+            for product, label in [(own, f"this sensor, nε = {own:.3g}"),
+                                   *((other, f"{other:g}") for other in (0.01, 0.1, 0.3, 0.7, 2.0))]
+        ]  # fmt: skip
+        found["transfer"] = [Chart(
+            "Modulation after charge transfer",
+            "Also of other transfer inefficiency products nε. 0.5 is the Nyquist frequency. Behr 1989, eq. 3.15.",
+            "signal frequency through clock frequency", "modulation that is left", tuple(curves),
+        )]  # fmt: skip
+    chip, optics = described.sensor, described.optics
+    periods = {} if chip is None else {f"element, {along}": pitch for along, pitch in zip(_ALONG, chip.pitch)}
+    periods |= {f"pixel, {along}": values[f"pixel_{axis}_um"] for axis, along in zip(_AXES, _ALONG)
+                if f"pixel_{axis}_um" in values}  # fmt: skip
+    if periods:
+        period = np.geomspace(min(periods.values()) / 2.0, max(periods.values()) * 2.0, 200)
+        points = [
+            Trace(np.array([value]), np.array([500.0 / value]), f"{name}: {500.0 / value:.1f} LP/mm")
+            for name, value in periods.items()
+        ]
+        place = "image" if any(name.startswith("pixel") for name in periods) else "sensor"
+        found[place] = [Chart(
+            "Nyquist frequency", "Half the reciprocal of the period. Behr 1989, eq. 3.23.", "period of sampling µm",
+            "Nyquist frequency LP/mm", (Trace(period, 500.0 / period, style="line"), *points),
+        )]  # fmt: skip
+    budget = noise_budget(described)
+    if budget is not None and budget.sources():
+        text = "The total is the root of the sum of squares, since the sources are independent."
+        found["noise"] = [Bars("Noise budget", text, {**budget.sources(), "total": budget.total}, "electrons")]
+    if chip is not None and (chip.sensitive_um is not None or optics is not None):
+        key = "optics" if optics is not None else "sensor"
+        found.setdefault(key, []).append(Chart(
+            "Modulation transfer", "The sensor can do no better than both together.", "spatial frequency LP/mm",
+            "modulation", tuple(_curves(chip, optics)),
+            marks=tuple((500.0 / pitch, "Nyquist") for pitch in dict.fromkeys(chip.pitch)),
+        ))  # fmt: skip
+    return found
+
+
+def _curves(chip: Chip, optics: OpticsEntry | None) -> Iterator[Trace]:
+    """Yield the transfer functions of lens and sensitive width."""
+    frequency = np.linspace(0.0, 2.0 * max(float(sensor.nyquist(pitch)) for pitch in chip.pitch), 201)
+    lens = np.ones_like(frequency)
+    if optics is not None:
+        lens = sensor.diffraction_mtf(frequency, sensor.diffraction_cutoff(optics.f_number, optics.wavelength_nm))
+        yield Trace(frequency, lens, "perfect lens", "line")
+    if chip.sensitive_um is None:
+        return
+    same = chip.sensitive_um[0] == chip.sensitive_um[1]
+    for width, along in zip(chip.sensitive_um[: 1 if same else 2], _ALONG):
+        place = "" if same else f", {along}"
+        aperture = sensor.aperture_mtf(frequency, width)
+        yield Trace(frequency, aperture, f"sensitive width{place}", "line")
+        if optics is not None:
+            yield Trace(frequency, aperture * lens, f"both{place}", "line")
 
 
 def _viewing(table: Viewing) -> Found:
