@@ -201,7 +201,7 @@ class SimulateRequest(Request):
     def check(self) -> None:
         """Refuse options that do not belong to the kind of scene."""
         if (self.scene is None) == (self.project is None):
-            raise UsageError("give SCENE, a file or a pattern, or `project` (the option --scene)")
+            raise UsageError("give SCENE, a file or a pattern, or `project`")
         of_projects, of_patterns = "images texture grain truth resolution bounds", "frames exposure size levels phase"
         idle, kind = (of_patterns, "project") if self.scene is None else (of_projects, "file or pattern")
         for name in idle.split():
