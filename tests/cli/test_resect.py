@@ -165,6 +165,16 @@ def test_a_dry_run_changes_nothing(folder: Path) -> None:
     assert not (folder / "project.previous.toml").exists()
 
 
+def test_a_dry_run_writes_the_report_that_is_asked(folder: Path) -> None:
+    pytest.importorskip("matplotlib")
+    before = (folder / "project.toml").read_text()
+    result = run(folder, "--images", "a", "--dry-run", "--report", str(folder / "r.html"), "--json")
+    assert json.loads(result.stdout)["report"] == str(folder / "r.html") and "sigma0" in (folder / "r.html").read_text()
+    assert (folder / "project.toml").read_text() == before and not (folder / "project.resect.run.json").exists()
+    inside = run(folder, "--images", "a", "--report", str(folder / "control.csv"), "--overwrite")
+    assert isinstance(inside.exception, UsageError) and "is the input" in str(inside.exception)
+
+
 def test_fault_17_a_wrong_point_is_named(folder: Path) -> None:
     lines = (folder / "points.csv").read_text().splitlines()
     k = next(i for i, line in enumerate(lines) if line.startswith("K4,a"))
