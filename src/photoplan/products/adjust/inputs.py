@@ -357,28 +357,18 @@ def known_poses(inputs: AdjustInputs) -> dict[str, Pose]:
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class EarlierResult:
-    """Result of an adjustment with which another one begins."""
-
-    poses: Mapping[str, Pose]
-    """Map poses of the images that took part."""
-    cameras: Mapping[str, BlockCamera]
-    """As they were calibrated."""
-
-
 def started(
-    inputs: AdjustInputs, *, known: bool = True, earlier: EarlierResult | None = None
+    inputs: AdjustInputs, *, known: bool = True, earlier: MapResult | None = None
 ) -> tuple[AdjustInputs, dict[str, Pose]]:
     """Return a map pose for every image; images that cannot be oriented are taken out, with a note that names them.
 
     Without `known`, orientations that are stated are not used; with `earlier`, its poses and cameras are used instead.
     """
-    poses = dict(earlier.poses) if earlier is not None else known_poses(inputs) if known else {}
+    poses = earlier.pose_of if earlier is not None else known_poses(inputs) if known else {}
     _refuse_far(inputs, poses)
     if len(poses) == len(inputs.images):
         return inputs, poses
-    found, reasons = _found(inputs, poses, {} if earlier is None else earlier.cameras)
+    found, reasons = _found(inputs, poses, {} if earlier is None else earlier.block_cameras)
     images = tuple(image for image in inputs.images if image.name in found)
     if not images and not inputs.projected:
         why = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:3])
@@ -489,6 +479,20 @@ class MapResult:
     """Those that had unknowns."""
     corrections: tuple[tuple[str, Geometry, FoundCorrection], ...]
     """Of the images without poses: name, kind, and what came out."""
+
+    @property
+    def pose_of(self) -> dict[str, Pose]:
+        """Map poses by the names of images."""
+        return dict(zip(self.adjusted.images, self.poses))
+
+    @property
+    def block_cameras(self) -> dict[str, BlockCamera]:
+        """Cameras of the block as they were calibrated."""
+        known = self.prepared.block.cameras
+        return {
+            c.name: replace(known[c.name], c=c.c, principal_point=c.principal_point, lens=c.lens)
+            for c in self.adjusted.cameras
+        }
 
     @property
     def sigma_center(self) -> _Floats:

@@ -30,7 +30,6 @@ from photoplan.plain import pick
 from photoplan.products.adjust.findings import AdjustReport, block_json, point_layers, summarise
 from photoplan.products.adjust.inputs import (
     AdjustInputs,
-    EarlierResult,
     MapResult,
     Prepared,
     adjust_prepared,
@@ -222,7 +221,7 @@ def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events
     def iterated(number: int, rms: float) -> None:
         events.begin(f"iteration {number} · weighted residuals {rms:.4g}")
 
-    def tried(known: bool = True, earlier: EarlierResult | None = None) -> tuple[Prepared, Adjusted]:
+    def tried(known: bool = True, earlier: MapResult | None = None) -> tuple[Prepared, Adjusted]:
         prepared = prepare(*started(inputs, known=known, earlier=earlier), free)
         events.talk(_used(prepared))
         return adjust_prepared(prepared, settings, partial(adjust_block, progress=iterated))
@@ -232,13 +231,8 @@ def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events
     if not (lost and any(camera.free for camera in adjusted.cameras)):
         return prepared, adjusted
     # A lens that was not known yet may have kept them out.
-    poses = dict(zip(adjusted.images, map_result(prepared, adjusted).poses))
-    cameras = {
-        c.name: replace(prepared.block.cameras[c.name], c=c.c, principal_point=c.principal_point, lens=c.lens)
-        for c in adjusted.cameras
-    }
-    earlier = EarlierResult(poses, cameras)
-    if len(started(inputs, earlier=earlier)[1]) == len(poses):
+    earlier = map_result(prepared, adjusted)
+    if len(started(inputs, earlier=earlier)[1]) == len(earlier.poses):
         return prepared, adjusted
     events.talk(f"note: starting again with the calibrated cameras, as {lost} images could not be oriented without")
     return tried(earlier=earlier)
