@@ -11,8 +11,6 @@ from collections.abc import Callable
 
 import click
 
-from photoplan.findings import raise_failed as end_with_failures  # noqa: F401
-
 _PARAMETER = re.compile(r"`([a-z][a-z0-9_]*)(=False)?`")
 _DOUBT = re.compile(r"\s*(?:warning|note):")
 #: Characters that move the cursor, colour, or turn the direction of writing: names of foreign files may hold them.
