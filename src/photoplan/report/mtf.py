@@ -12,12 +12,11 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.mtf.edges import LightImage
 from photoplan.products.mtf.patterns import MOST_PIXELS, PatternReport, PatternResult
-from photoplan.products.mtf.result import EdgeGroup, ImageMtf, MeasuredEdge, MtfReport, rejected_words
+from photoplan.products.mtf.result import EdgeGroup, ImageMtf, MeasuredEdge, MtfReport, means, rejected_words
 from photoplan.quality.linearise import Linearisation
-from photoplan.quality.mtf_curve import MtfCurve, gaussian_modulation
-from photoplan.quality.patterns.bars import coltman_mtf
+from photoplan.quality.mtf_curve import gaussian_modulation
 from photoplan.quality.patterns.siemens import StarMtf
-from photoplan.quality.patterns.usaf import UsafBars, UsafResult
+from photoplan.quality.patterns.usaf import UsafResult
 from photoplan.report.drawing import (
     BLUE,
     GREEN,
@@ -34,6 +33,7 @@ from photoplan.report.drawing import (
     png,
     styled,
 )
+from photoplan.report.findings import findings_table
 from photoplan.report.page import Cell, cells, figure, headline, number, page, section, table, text
 
 #: Images that get plots.
@@ -43,7 +43,6 @@ _LISTED = 300
 #: Longer side of the small copy of an image, pixels.
 _SMALL = 1100
 _ROWS_AT_ONCE = 1 << 22
-_GROUP_HEAD = ("edges of", "MTF50 cy/px", "95 % interval", "MTF10", "FWHM px", "Gaussian px", "rms", "edges")
 _EDGE_HEAD = ("no.", "channel", "column", "row", "direction", "angle °", "length", "contrast/noise", "MTF50",
               "95 % interval", "FWHM px", "over %", "under %")  # fmt: skip
 
@@ -67,10 +66,9 @@ def _image(image: ImageMtf, pixel_um: float | None, drawn: bool) -> str:
     parts = [headline(_figures(image, pixel_um))]
     parts.append(f"<p>Linearisation: {text(image.linearisation)}. Rejected: {text(rejected)}.</p>")
     parts += [f"<p>{text(note)}</p>" for note in image.notes]
-    whole = [g for g in image.groups if g.cell is None]
     if drawn:
-        parts += _plots(image, whole)
-    parts.append(table(_GROUP_HEAD, [cells(_group_row(group), 1) for group in whole]))
+        parts += _plots(image, [g for g in image.groups if g.cell is None])
+    parts.append(findings_table(means(image.groups)))
     if image.total.laboratory is not None:
         head = ("cycles per pixel", "laboratory", "measured", "difference")
         lab = image.total.laboratory
@@ -132,21 +130,6 @@ def _figures(image: ImageMtf, pixel_um: float | None) -> list[tuple[str, str, st
             "edges are enhanced" if enhanced.enhanced else "no edge enhancement",
         ),
     ]
-
-
-def _group_row(group: EdgeGroup) -> tuple[str, ...]:
-    low, high = group.mtf50.interval
-    where = group.direction or "all"
-    return (
-        f"{group.band}, {where}" + (f" ({group.flight})" if group.flight else ""),
-        number(group.mtf50.value, 4),
-        f"{number(low, 4)} – {number(high, 4)}",
-        number(group.mtf10.value, 3),
-        number(group.fwhm.value, 2),
-        number(group.gaussian.fwhm, 2),
-        number(group.gaussian.rms, 3),
-        str(group.mtf50.edges),
-    )
 
 
 def _edge_row(edge: MeasuredEdge) -> tuple[str, ...]:
@@ -426,7 +409,7 @@ def draw_picture(result: PatternResult, light: NDArray[np.float32]) -> bytes:
 def _pattern_page(made: PatternReport) -> str:
     parts = []
     for result in (result for image in made.images for result in image.results):
-        found = [f"<p>{text(result.lines()[0])}</p>", _table(result)]
+        found = [f"<p>{text(result.heading)}</p>", findings_table(result.table)]
         found += [f"<p>{text(note)}</p>" for note in result.notes]
         if any(frequency.size for _, _, (frequency, _, _) in _curves(result)):
             caption = "With two standard deviations; the dotted line is the Nyquist frequency."
@@ -441,49 +424,6 @@ def _pattern_page(made: PatternReport) -> str:
         parts.append(section(result.name, found))
     kind = made.linearisation.describe()
     return page("Test patterns", f"Modulation and contrast transfer of images; linearisation: {kind}", parts)
-
-
-def _table(result: PatternResult) -> str:
-    found = result.found
-    head: tuple[str, ...]
-    if isinstance(found, StarMtf):
-        head = ("direction", "MTF50 cy/px", "MTF10 cy/px", "from cy/px", "to cy/px")
-        curves = [("all", found.mtf), *((f"{angle:.1f}°", curve) for angle, curve in found.directional.items())]
-        rows = [
-            (name, _reached(c.mtf50), _reached(c.mtf10), f"{c.frequency[1]:.3f}", f"{c.frequency[-1]:.3f}")
-            for name, c in curves
-        ]
-        return table(head, [cells(row, 1) for row in rows])
-    if isinstance(found, UsafResult):
-        head = ("bars", "resolved up to", "LP/mm on the target", "cy/px", "contrast transfer")
-        limits = (("horizontal", found.limit(horizontal=True)), ("vertical", found.limit(horizontal=False)))
-        return table(head, [cells(_limit(name, last), 1) for name, last in limits])
-    head = ("bars", "cy/px", "direction", "contrast transfer", "MTF", *(["by Coltman"] if result.coltman else []))
-    columns = [found.contrast, found.mtf, *([coltman_mtf(found.contrast)] if result.coltman else [])]
-    return table(
-        head,
-        [
-            cells((str(k), f"{group.frequency:.4f}", f"{group.angle_deg:.1f}°", *(_value(c, k) for c in columns)), 1)
-            for k, group in enumerate(found.groups, 1)
-        ],
-    )
-
-
-def _limit(name: str, last: UsafBars | None) -> tuple[str, ...]:
-    if last is None:
-        return (name, "none", "", "", "")
-    place = f"group {last.group}, element {last.element}"
-    return (name, place, f"{last.lp_mm:.2f}", f"{last.frequency:.3f}", f"{last.contrast:.3f} ± {last.sigma:.3f}")
-
-
-def _reached(value: float) -> str:
-    return f"{value:.4f}" if isfinite(value) else "not reached"
-
-
-def _value(curve: MtfCurve, k: int) -> str:
-    """A value of a curve, whose first is that at frequency 0."""
-    sigma = "" if curve.sigma is None or not isfinite(curve.sigma[k]) else f" ± {curve.sigma[k]:.4f}"
-    return f"{curve.modulation[k]:.4f}{sigma}"
 
 
 def _curves(result: PatternResult) -> list[tuple[str, str, tuple[Array, Array, Array]]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result, raise_failed
+from photoplan.findings import Findings, Result, Table, raise_failed, with_sigma
 from photoplan.geometry.grid import Window
 from photoplan.io.tables import write_table
 from photoplan.plain import pick
@@ -98,27 +98,44 @@ class PatternResult:
             for f, m, s in _points(curve):
                 yield [*head, label, direction.rstrip("°"), "", "", f, "", m, s, ""]
 
-    def lines(self) -> list[str]:
-        """What is printed."""
-        if isinstance(self.found, UsafResult):
-            return _usaf_lines(self.found)
-        if isinstance(self.found, StarMtf):
-            star = self.found
-            lines = [
-                f"star of {star.sectors} {star.wave} sectors, centre column {star.centre[0] + self.window.col:.2f}, "
-                f"row {star.centre[1] + self.window.row:.2f}: {_figures(star.mtf)}"
-            ]
-            return lines + [f"  {angle:5.1f}°  {_figures(curve)}" for angle, curve in star.directional.items()]
-        found = self.found
-        lines = [f"bars, full contrast from {found.levels_from}"]
-        series = coltman_mtf(found.contrast) if self.coltman else None
-        for k, group in enumerate(found.groups, 1):
-            lines.append(
-                f"  {group.frequency:.4f} cy/px at {group.angle_deg:.1f}°  contrast transfer "
-                f"{_value(found.contrast, k)}  MTF {_value(found.mtf, k)}"
-                + (f"  by Coltman {_value(series, k)}" if series is not None else "")
+    @property
+    def heading(self) -> str:
+        """The pattern as a whole, in words."""
+        found, window = self.found, self.window
+        if isinstance(found, UsafResult):
+            return (
+                f"USAF-1951 target: groups {', '.join(map(str, found.groups))} seen; {found.place.matched} threes of "
+                f"bars placed within {found.place.rms:.2f} px; {found.pixel_um:.4g} µm a pixel on the target"
             )
-        return lines
+        if isinstance(found, StarMtf):
+            return (
+                f"star of {found.sectors} {found.wave} sectors, centre column {found.centre[0] + window.col:.2f}, "
+                f"row {found.centre[1] + window.row:.2f}"
+            )
+        return f"bars, full contrast from {found.levels_from}"
+
+    @property
+    def table(self) -> Table:
+        """The figures: of each direction of a star, each group of bars, or the limits of a target."""
+        found = self.found
+        if isinstance(found, UsafResult):
+            head: tuple[str, ...] = ("bars", "resolved up to", "LP/mm on the target", "cy/px", "contrast transfer")
+            rows = [_limit(name, found.limit(horizontal=name == "horizontal")) for name in ("horizontal", "vertical")]
+        elif isinstance(found, StarMtf):
+            head = ("direction", "MTF50 cy/px", "MTF10 cy/px", "from cy/px", "to cy/px")
+            curves = [("all", found.mtf), *((f"{angle:.1f}°", curve) for angle, curve in found.directional.items())]
+            rows = [
+                (name, _reached(c.mtf50), _reached(c.mtf10), f"{c.frequency[1]:.3f}", f"{c.frequency[-1]:.3f}")
+                for name, c in curves
+            ]
+        else:
+            head = ("bars", "frequency", "direction", "contrast transfer", "MTF", *["by Coltman"] * self.coltman)
+            series = [found.contrast, found.mtf, *([coltman_mtf(found.contrast)] if self.coltman else [])]
+            rows = [
+                (str(k), f"{group.frequency:.4f} cy/px", f"{group.angle_deg:.1f}°", *(_value(c, k) for c in series))
+                for k, group in enumerate(found.groups, 1)
+            ]
+        return Table(head, tuple(rows), printed=True)
 
 
 def _kind(bars: UsafBars) -> str:
@@ -131,16 +148,19 @@ def _points(curve: MtfCurve) -> Iterator[tuple[float, float, float]]:
 
 
 def _value(curve: MtfCurve, k: int) -> str:
-    sigma = "" if curve.sigma is None else f" ± {curve.sigma[k]:.4f}"
-    return f"{curve.modulation[k]:.4f}{sigma}"
+    """Return a value of a curve, whose first is that at frequency 0."""
+    return with_sigma(float(curve.modulation[k]), nan if curve.sigma is None else float(curve.sigma[k]))
 
 
-def _figures(curve: MtfCurve) -> str:
-    words = [
-        f"{name} {value:.4f}" for name, value in (("MTF50", curve.mtf50), ("MTF10", curve.mtf10)) if isfinite(value)
-    ]
-    first, last = curve.frequency[1], curve.frequency[-1]
-    return f"{'  '.join(words) or 'stays above 0.5'}  ({first:.3f} to {last:.3f} cy/px)"
+def _reached(value: float) -> str:
+    return f"{value:.4f}" if isfinite(value) else "not reached"
+
+
+def _limit(name: str, last: UsafBars | None) -> tuple[str, ...]:
+    if last is None:
+        return (name, "none", "", "", "")
+    place = f"group {last.group}, element {last.element}"
+    return name, place, f"{last.lp_mm:.2f}", f"{last.frequency:.3f}", with_sigma(last.contrast, last.sigma)
 
 
 def _roi(window: Window) -> list[int]:
@@ -190,25 +210,6 @@ def _usaf(found: UsafResult, window: Window) -> dict[str, Any]:
     }
 
 
-def _usaf_lines(found: UsafResult) -> list[str]:
-    groups = ", ".join(map(str, found.groups))
-    lines = [
-        f"USAF-1951 target: groups {groups} seen; {found.place.matched} threes of bars placed within "
-        f"{found.place.rms:.2f} px; {found.pixel_um:.4g} µm a pixel on the target"
-    ]
-    for horizontal in (True, False):
-        kind = "horizontal" if horizontal else "vertical"
-        last = found.limit(horizontal=horizontal)
-        if last is None:
-            lines.append(f"  {kind} bars: none is resolved")
-            continue
-        lines.append(
-            f"  {kind} bars resolved up to group {last.group}, element {last.element}: {last.lp_mm:.2f} LP/mm, "
-            f"{last.frequency:.3f} cy/px, contrast transfer {last.contrast:.3f} ± {last.sigma:.3f}"
-        )
-    return lines
-
-
 @dataclass(frozen=True, eq=False)
 class ImagePattern:
     """Measurements in one image."""
@@ -227,13 +228,6 @@ class ImagePattern:
     def json_fields(self) -> dict[str, Any]:
         """Its results as patterns."""
         return pick(self, "file", "size", "linearisation", image="name", patterns="results")
-
-    def __str__(self) -> str:
-        lines = [f"{self.name}: {self.linearisation}"]
-        for result in self.results:
-            first, *rest = result.lines()
-            lines += [f"  {result.band}: {first}", *(f"  {line}" for line in rest)]
-        return "\n".join(lines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,9 +250,16 @@ class PatternReport(Result):
             "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
         }
 
-    def summary(self) -> list[str]:
-        """Return the figures of each image."""
-        return [str(image) for image in self.images]
+    def outcome(self) -> list[Findings]:
+        """Return the figures of each pattern."""
+        return [
+            Findings(
+                tables={"figures": found.table},
+                title=f"{image.name}, {found.band}: {found.heading} · {image.linearisation}",
+            )
+            for image in self.images
+            for found in image.results
+        ]
 
     def remarks(self) -> list[str]:
         """Return the notes of each image."""

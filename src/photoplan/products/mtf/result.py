@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.findings import Result, raise_failed
+from photoplan.findings import Findings, Result, Table, raise_failed
 from photoplan.plain import pick
 from photoplan.quality.edges.find import REASONS
 from photoplan.quality.edges.groups import CombinedValue, Enhancement, GaussianFit
@@ -189,13 +189,12 @@ class ImageMtf:
             "point_spread": point_spread_of(self.groups),
         }
 
-    def __str__(self) -> str:
-        """A line for each direction and channel of the whole field."""
+    @property
+    def found_here(self) -> Findings:
+        """The means over the whole field, with how many edges there are."""
         number = len({edge.number for edge in self.edges})
-        return (
-            f"{self.name}: {number} {'edge' if number == 1 else 'edges'} of {self.found} · {self.linearisation}\n"
-            + group_lines(self.groups)
-        )
+        title = f"{self.name}: {number} {'edge' if number == 1 else 'edges'} of {self.found} · {self.linearisation}"
+        return Findings(tables={"means": means(self.groups)}, title=title)
 
 
 def point_spread_of(groups: Sequence[EdgeGroup]) -> list[list[float]] | None:
@@ -211,30 +210,34 @@ def point_spread_of(groups: Sequence[EdgeGroup]) -> list[list[float]] | None:
     return [[round(float(v), 6) for v in row] for row in point_spread(*both)]
 
 
-def group_lines(groups: Sequence[EdgeGroup]) -> str:
-    """A line for each mean over the whole field."""
-    return "\n".join(f"  {_label(group):<22} {_figures(group)}" for group in groups if group.cell is None)
-
-
-def _label(group: EdgeGroup) -> str:
-    where = group.direction or "all"
-    if group.flight is not None:
-        where += f" ({group.flight} flight)"
-    return f"{group.band} {where}"
-
-
-def _figures(group: EdgeGroup) -> str:
-    low, high = group.mtf50.interval
-    return (
-        f"MTF50 {group.mtf50.value:.4f} [{low:.4f}, {high:.4f}] cy/px  MTF10 {_number(group.mtf10.value)}  "
-        f"FWHM {_number(group.fwhm.value)} px  Gaussian {group.gaussian.fwhm:.2f} px (rms {group.gaussian.rms:.3f})  "
-        f"{group.mtf50.edges} edges" + _shares(group)
+def means(groups: Sequence[EdgeGroup]) -> Table:
+    """Return the means over the whole field as a table."""
+    head = (
+        "edges of",
+        "MTF50 cy/px",
+        "95 % interval",
+        "MTF10",
+        "FWHM px",
+        "Gaussian px",
+        "rms",
+        "edges",
+        "Z",
+        "A",
+        "B",
     )
-
-
-def _shares(group: EdgeGroup) -> str:
-    names = zip("ZAB", group.spread, strict=False)
-    return "".join(f"  {name} {share.value:.3f}" for name, share in names)
+    rows = []
+    for group in groups:
+        if group.cell is not None:
+            continue
+        low, high = group.mtf50.interval
+        flight = "" if group.flight is None else f" ({group.flight} flight)"
+        shares = [f"{share.value:.3f}" for share in group.spread[:3]]
+        rows.append((
+            f"{group.band} {group.direction or 'all'}{flight}", f"{group.mtf50.value:.4f}", f"{low:.4f} – {high:.4f}",
+            _number(group.mtf10.value), _number(group.fwhm.value), f"{group.gaussian.fwhm:.2f}",
+            f"{group.gaussian.rms:.3f}", str(group.mtf50.edges), *shares, *[""] * (3 - len(shares)),
+        ))  # fmt: skip
+    return Table(head, tuple(rows), printed=True)
 
 
 def _number(value: float) -> str:
@@ -272,12 +275,13 @@ class MtfReport(Result):
             "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
         }
 
-    def summary(self) -> list[str]:
+    def outcome(self) -> list[Findings]:
         """Return the means of each image, and of all together."""
-        lines = [str(image) for image in self.images]
+        found = [image.found_here for image in self.images]
         if len(self.images) > 1:
-            lines.append(f"all {len(self.images)} images\n{group_lines(self.groups)}")
-        return lines
+            title = f"all {len(self.images)} images"
+            found.append(Findings(tables={"means": means(self.groups)}, title=title))
+        return found
 
     def remarks(self) -> list[str]:
         """Return the notes of each image, and of all together."""
