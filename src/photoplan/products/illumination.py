@@ -15,7 +15,7 @@ from photoplan import __version__
 from photoplan.cameras.curvature import SunProjection
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result
+from photoplan.findings import Findings, Result, Table, with_sigma
 from photoplan.geometry.frames import triple
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.product import check_output
@@ -71,19 +71,23 @@ class IlluminationReport(Result):
         shadow = float(np.mean(~self.sample.lit))
         return {"path": self.path, **own, "not_lit": shadow, "correlation_before": before, "correlation_after": after}
 
+    def outcome(self) -> Sequence[Findings]:
+        """Return the parameters of each band, and correlations before and after."""
+        model = self.model
+        sky = "a of c" if "c" in model.corrections else "sky"
+        head = ("band", "per cos i", sky, "haze", "haze per 100 m", "correlation with cos i", "then")
+        rows = []
+        for k, (band, before, after) in enumerate(zip(model.bands, *self.correlations), 1):
+            values = zip((band.slope, band.sky, band.haze, band.haze_by_height), band.sigmas)
+            texts = (with_sigma(value, sigma) if value or sigma else "" for value, sigma in values)
+            rows.append((str(k), *texts, f"{before:+.3f}", f"{after:+.3f}"))
+        return [Findings(tables={"bands": Table(head, tuple(rows), printed=True)})]
+
     def summary(self) -> Sequence[str]:
-        """Return the parameters of each band, and how much lies in shadow."""
-        model, lines = self.model, []
-        names = ("per cos i", "a of c" if "c" in model.corrections else "sky", "haze", "haze per 100 m")
-        for number, (band, before, after) in enumerate(zip(model.bands, *self.correlations), 1):
-            values = zip(names, (band.slope, band.sky, band.haze, band.haze_by_height), band.sigmas)
-            listed = ", ".join(f"{name} {value:.4g} ± {sigma:.2g}" for name, value, sigma in values if value or sigma)
-            lines.append(f"band {number}: {listed}; correlation with cos i {before:+.3f}, then {after:+.3f}")
+        """Return the findings, and how much lies in shadow."""
         dark = float((~self.sample.lit).mean())
-        return [
-            *lines,
-            f"{dark:.1%} of the sample lie in shadow or turn away from the sun; slopes are not corrected there",
-        ]
+        said = f"{dark:.1%} of the sample lie in shadow or turn away from the sun; slopes are not corrected there"
+        return [*super().summary(), said]
 
 
 @dataclass(frozen=True, eq=False)

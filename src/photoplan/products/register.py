@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from photoplan.engine.run import steps
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result, noted
+from photoplan.findings import Result, columns, noted, with_sigma
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import Placement, Window
 from photoplan.io.product import check_output
@@ -255,8 +255,8 @@ class RegisterReport(Result):
         """Return the figures, or how many patches there are after a dry run."""
         f = self.figures
         if f is None:
-            rows, columns = self.shape
-            return [f"{columns} × {rows} patches of {2 * self.radius + 1} px, every {self.step} px"]
+            rows, across = self.shape
+            return [f"{across} × {rows} patches of {2 * self.radius + 1} px, every {self.step} px"]
         left = ", ".join(f"{count} {name}" for name, count in f.counts.items() if count and name != "found")
         shares = ", ".join(f"{name} % {value:.3f}" for name, value in f.percentiles.items())
         metres = "" if self.pair.pixel is None else f"; a pixel is {self.pair.pixel:.4g} on the map"
@@ -270,9 +270,10 @@ class RegisterReport(Result):
         ]
         if self.model is not None:
             m, sigma = self.model, (self.model.covariances[:, 0, 0] ** 0.5).tolist()
-            shift = ", ".join(f"{name} {m.unknowns[k, 0]:+.4f} ± {sigma[k]:.4f}" for k, name in enumerate(("dx", "dy")))
+            pairs = zip(("dx", "dy"), m.unknowns[:, 0].tolist(), sigma)
+            shift = ", ".join(f"{name} {with_sigma(value, s, signed=True)}" for name, value, s in pairs)
             lines.append((m.kind, f"in the middle {shift} px; residuals {m.rms[0]:.4f}, {m.rms[1]:.4f} px (rms)"))
-        return [f"{what:8} {text}" for what, text in lines]
+        return columns(lines)
 
     def messages(self) -> Sequence[str]:
         """Return the notes."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.findings import with_sigma
 from photoplan.orientation.intersection import CheckAccuracy
 from photoplan.plain import two_figures
 from photoplan.products.adjust.findings import (
@@ -507,7 +508,7 @@ def correction_parts(corrections: tuple[CorrectionFigures, ...]) -> list[str]:
         row: Row = [image.name, image.group, cell(number(image.measurements)), cell(number(image.rejected))]
         row += [cell(plain(v, 3, True)) for v in image.mean]
         row += [cell(plain(v, 2)) for v in (*image.rms, image.worst)]
-        found = (f"{p.name} {p.value:+.4g} ± {p.sigma:.2g} {p.unit}" for p in image.parameters)
+        found = (f"{p.name} {with_sigma(p.value, p.sigma, p.unit, signed=True)}" for p in image.parameters)
         rows.append([*row, "; ".join(found)])
     head = ["image", "geometry", "points", "out", "mean x", "y px", "rms x", "y px", "worst", "correction"]
     parts = [

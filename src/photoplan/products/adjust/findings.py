@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import ImagesLeftOut
-from photoplan.findings import Result, noted
+from photoplan.findings import Result, noted, with_sigma
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.frames import Triple, triple
 from photoplan.geometry.heights import height_label
@@ -221,10 +221,11 @@ class AdjustReport(Result):
         for camera in self.cameras:
             columns = zip(camera.parameters, camera.units, camera.before, camera.after, camera.sigma)
             for name, unit, before, after, sigma in columns:
-                value = f"{after:.8g} {unit}".rstrip()
-                lines.append(f"  camera {camera.name}: {name} {value} ± {sigma:.2g} (change {after - before:+.3g})")
+                lines.append(
+                    f"  camera {camera.name}: {name} {with_sigma(after, sigma, unit)} (change {after - before:+.3g})"
+                )
         for image in self.corrections:
-            found = ", ".join(f"{p.name} {p.value:+.4g} ± {p.sigma:.2g} {p.unit}" for p in image.parameters)
+            found = ", ".join(f"{p.name} {with_sigma(p.value, p.sigma, p.unit, signed=True)}" for p in image.parameters)
             lines.append(f"  {image.name}: {found or 'nothing of it was unknown'}")
         if self.check is not None:
             c = self.check

@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, with_sigma
 from photoplan.io.series import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, tried
 from photoplan.products.characterise.data import SeriesData, Setting
@@ -80,7 +80,7 @@ def _current(settings: list[Setting], levels: list[Level], of: Subject) -> Findi
     t = exposures / 1000
     chart = Chart(
         title=of.named("Dark signal"),
-        caption=f"Dark current {found.current_dn_s:.4g} ± {found.current_dn_s_sigma:.2g} DN/s.",
+        caption=f"Dark current {with_sigma(found.current_dn_s, found.current_dn_s_sigma, 'DN/s')}.",
         x_label="exposure s",
         y_label="mean grey value DN",
         curves=(Trace(t, means, "dark frames"), Trace(t, found.line.at(t), "line", "dashed")),
@@ -108,7 +108,7 @@ def _doubling(known: dict[float, DarkCurrent], of: Subject, stated: int) -> Find
     model = found.current_at_reference * 2 ** ((grid - found.reference_c) / found.doubling_k)
     chart = Chart(
         title=of.named("Dark current against temperature"),
-        caption=f"It doubles every {found.doubling_k:.3g} ± {found.doubling_k_sigma:.2g} K.",
+        caption=f"It doubles every {with_sigma(found.doubling_k, found.doubling_k_sigma, 'K')}.",
         x_label="temperature °C",
         y_label="dark current DN/s",
         curves=(

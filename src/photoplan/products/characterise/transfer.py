@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, known
+from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, known, with_sigma
 from photoplan.io.series import Plane, ReducedPoint
 from photoplan.products.characterise.common import dark_levels, tried, used_and_rest
 from photoplan.products.characterise.data import SeriesData, Setting
@@ -101,7 +101,9 @@ def _plots(found: PhotonTransfer, of: Subject, step: float) -> tuple[Chart, ...]
     noise = np.sqrt(np.maximum(of_line, 1e-9 * step**2))
     model = Trace(grid, noise, "parabola" if found.curve.bend else "√(read² + K · signal)", "dashed", colour=1)
     log = used_and_rest(signal[seen], np.sqrt(variance[seen]), used[seen])
-    caption = f"Slope K = {found.gain:.4g} ± {found.gain_sigma:.2g} DN/e; each point is a level of two frames or more."
+    caption = (
+        f"Slope K = {with_sigma(found.gain, found.gain_sigma, 'DN/e')}; each point is a level of two frames or more."
+    )
     points = used_and_rest(signal, variance, used)
     return (
         Chart(

@@ -14,6 +14,7 @@ from scipy import ndimage, special
 
 from photoplan.adjustment.least_squares import spread
 from photoplan.errors import InputError
+from photoplan.findings import with_sigma
 from photoplan.quality.camera.straight_lines import StraightLine, fit_line
 
 #: Share of zeros beyond which black is cut off, and mean and variance are not those of the signal.
@@ -236,7 +237,7 @@ def doubling_temperature(
     if weak.any():
         k = int(np.argmax(weak))
         raise InputError(
-            f"the dark current at {t[k]:g} °C is {i[k]:.3g} ± {s[k]:.2g}, not significantly positive; take longer "
+            f"the dark current at {t[k]:g} °C is {with_sigma(i[k], s[k])}, not significantly positive; take longer "
             "exposures or leave this temperature out"
         )
     reference = float(t.mean())

@@ -13,6 +13,7 @@ from scipy.special import erfc
 from photoplan.adjustment.least_squares import solve, spread
 from photoplan.adjustment.statistics import chance_chi_square, chance_t
 from photoplan.errors import InputError
+from photoplan.findings import with_sigma
 from photoplan.quality.camera.dark_signal import Level, check_level, cut_off
 from photoplan.quality.camera.straight_lines import fit_line
 
@@ -118,8 +119,9 @@ class PhotonTransfer:
         if self.curve.bend:
             notes.append(
                 f"the response {'is not' if self.bent else 'may not be'} linear (chance of a straight one "
-                f"{self.curve.chance_straight:.1g}): its bend takes {self.compression_percent:.2g} ± "
-                f"{self.compression_percent_sigma:.2g} % at the brightest level used; the gain is that of little light"
+                f"{self.curve.chance_straight:.1g}): its bend takes "
+                f"{with_sigma(self.compression_percent, self.compression_percent_sigma, '%')} at the brightest level "
+                "used; the gain is that of little light"
             )
         if not self.curve.fits:
             notes.append(
@@ -188,7 +190,7 @@ def photon_transfer(
     gain_sigma = sqrt(curve.covariance[1][1])
     if curve.slope <= 3 * gain_sigma:
         raise InputError(
-            f"the variance does not grow with the mean (slope {curve.slope:.3g} ± {gain_sigma:.2g}); these are "
+            f"the variance does not grow with the mean (slope {with_sigma(curve.slope, gain_sigma)}); these are "
             "not raw frames of a linear sensor, or their levels are too close together"
         )
     read = _read_noise(curve, bias, bias_sigma, dark, step)
@@ -293,7 +295,7 @@ def _no_read_noise(total: float, total_sigma: float, bias: float, dark: Sequence
             "the noise: raise the camera's gain"
         )
     if total - QUANTISATION * step**2 < 2 * total_sigma:
-        return f"the variance without light is {total:.3g} ± {total_sigma:.2g} DN²: not significant"
+        return f"the variance without light is {with_sigma(total, total_sigma, 'DN²')}: not significant"
     return ""
 
 

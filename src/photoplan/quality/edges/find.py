@@ -14,6 +14,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter1d
 from photoplan.adjustment.least_squares import MEDIAN_1D, huber, spread
 from photoplan.adjustment.statistics import chance_chi_square
 from photoplan.errors import InputError
+from photoplan.findings import with_sigma
 from photoplan.kernels.edge_chains import grow, ridge
 
 Array = NDArray[np.float64]
@@ -693,7 +694,7 @@ def check_certainty(mtf50: float, reach: float, most: float) -> None:
     """Refuse an edge whose MTF50 is hardly known; one that is not determined at all (NaN) says so itself."""
     if reach > most * mtf50:
         raise InputError(
-            f"edge too noisy or too short: MTF50 would be {mtf50:.3f} ± {reach:.3f} cycles per pixel, allowed are "
+            f"edge too noisy or too short: MTF50 would be {with_sigma(mtf50, reach)} cycles per pixel, allowed are "
             f"{100 * most:g} %; use a longer or stronger edge"
         )
 

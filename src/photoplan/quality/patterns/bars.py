@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.adjustment.least_squares import solve
 from photoplan.errors import InputError
+from photoplan.findings import with_sigma
 from photoplan.quality.mtf_curve import MtfCurve
 
 Array = NDArray[np.float64]
@@ -179,7 +180,7 @@ def measure_bars(
     sigma = sqrt(float(along @ covariance[3:5, 3:5] @ along))
     noise = white_noise(residuals.reshape(values.shape))
     if amplitude < LEAST_SIGNIFICANCE * max(sigma, noise * sqrt(2.0 / values.size)):
-        raise InputError(f"{what}: the bars are below the noise (amplitude {amplitude:.3g} ± {sigma:.2g})")
+        raise InputError(f"{what}: the bars are below the noise (amplitude {with_sigma(amplitude, sigma)})")
     rest = float(np.sqrt((residuals**2).mean()))
     if rest**2 > 2.0 * noise**2 + (0.12 * amplitude) ** 2:
         raise InputError(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.findings import with_sigma
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.patterns.bars import least_squares, pattern_window, waves, white_noise
 
@@ -392,7 +393,7 @@ def _refuse_weak(rings: list[StarRing], noise: float, what: str) -> None:
     widest = rings[0]
     strongest = max(ring.amplitude for ring in rings)
     if strongest < 5.0 * widest.sigma or strongest == 0.0:
-        raise InputError(f"{what}: the star is below the noise (amplitude {strongest:.3g} ± {widest.sigma:.2g})")
+        raise InputError(f"{what}: the star is below the noise (amplitude {with_sigma(strongest, widest.sigma)})")
     rest = float(np.median([ring.residual for ring in rings[: max(3, len(rings) // 2)]]))
     if rest**2 > (1.5 * noise) ** 2 + (0.35 * strongest) ** 2:
         raise InputError(
