@@ -46,7 +46,7 @@ def with_sigma(value: float, sigma: float, unit: str = "", signed: bool = False)
 
 def sigma_text(sigma: float) -> str:
     """Format a standard deviation: ``± 0.0012``; nothing if it is NaN."""
-    return f"± {_plain(sigma, 2)}" if math.isfinite(sigma) else ""
+    return f"± {number(sigma, sigma)}" if math.isfinite(sigma) else ""
 
 
 def columns(rows: Iterable[Sequence[str]]) -> list[str]:
