@@ -19,23 +19,19 @@ MOST_PIXELS = 900
 
 
 def number(value: float, sigma: float = math.nan) -> str:
-    """Format a number with the digits that its standard deviation allows (two of it), else with four or more."""
+    """Format a number to two digits of its standard deviation; without one to four digits, and to whole numbers."""
     if not math.isfinite(value):
         return "–"
-    if not (math.isfinite(sigma) and sigma > 0) or value == 0:
-        return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else _plain(value, 4)
-    digits = min(max(math.floor(math.log10(abs(value))) - math.floor(math.log10(sigma)) + 2, 2), 9)
-    text = _plain(value, digits)
-    if "e" in text or len(text.lstrip("-").replace(".", "").lstrip("0")) >= digits:
-        return text
-    # Zeros at the end show how well a number is known.
-    return f"{value:.{max(digits - 1 - math.floor(math.log10(abs(value))), 0)}f}"
-
-
-def _plain(value: float, digits: int) -> str:
-    """Format a number with so many digits; powers of ten only if it would be very long."""
-    rounded = float(f"{value:.{digits}g}")
-    return f"{rounded:.10g}" if 1e-4 <= abs(rounded) < 1e7 or rounded == 0 else f"{value:.{digits}g}"
+    if not (math.isfinite(sigma) and sigma > 0):
+        if 1e4 <= abs(value) < 1e9:
+            return f"{value:.0f}"
+        rounded = float(f"{value:.4g}")
+        return f"{rounded:.10g}" if 1e-4 <= abs(rounded) < 1e4 else f"{value:.4g}"
+    size, last = max(abs(value), sigma), math.floor(math.log10(sigma)) - 1
+    if not 1e-4 <= size < 1e9:
+        return f"{value:.{min(math.floor(math.log10(size)) - last + 1, 9)}g}"
+    decimals = min(-last, 9)
+    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}"
 
 
 def with_sigma(value: float, sigma: float, unit: str = "", signed: bool = False) -> str:

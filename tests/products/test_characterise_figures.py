@@ -22,6 +22,10 @@ from photoplan.products.characterise.run import CharacteriseRequest, characteris
         (1.77218, 0.00091, "1.77218 ± 0.00091"),
         (5.0, math.nan, "5"),
         (1.234e-6, 1.1e-8, "1.234e-06 ± 1.1e-08"),
+        (0.0003, 0.0123, "0.000 ± 0.012"),
+        (120.83, 1.04, "120.8 ± 1.0"),
+        (-1e-9, 1.0, "0.0 ± 1.0"),
+        (15625.0, math.nan, "15625"),
     ],
 )
 def test_digits_follow_the_standard_deviation(value: float, sigma: float, text: str):
