@@ -81,6 +81,11 @@ class Estimate:
         name = f"{self.label} ({where})" if where else self.label
         return name, with_sigma(self.value, self.sigma, self.unit), self.remark + stated
 
+    @property
+    def texts(self) -> tuple[str, str]:
+        """Its value and standard deviation as they are printed."""
+        return number(self.value, self.sigma), sigma_text(self.sigma)
+
     def json_fields(self) -> dict[str, Any]:
         """Return the fields; keys that say nothing are left out."""
         more = {key: value for key in ("plane", "at", "remark", "label") if (value := getattr(self, key))}

@@ -27,7 +27,7 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Lens
 from photoplan.errors import GeometryError, InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result, noted, raise_failed
+from photoplan.findings import Estimate, Result, noted, raise_failed, with_sigma
 from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.model import FiducialSystem
@@ -44,7 +44,7 @@ from photoplan.orientation.judgement import fitting, impossible, of_resection
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
 from photoplan.orientation.marks.layout import FiducialResult, MarkLayout, MarksNotFound, SoughtMark
 from photoplan.orientation.resection import MeasuredPoints, Resected, ResectSettings, resect
-from photoplan.plain import pick, shown_metres
+from photoplan.plain import pick
 from photoplan.products.adjust.inputs import AdjustInputs, decimals_of, read_inputs, stated_accuracy
 from photoplan.products.adjust.sensors import (
     Calibrated,
@@ -654,7 +654,6 @@ Array = NDArray[np.float64]
 #: Decimals of angles that are written.
 _ANGLE_DECIMALS = 10
 _SINGULAR = "the angles are near a singular position of their order, only their combination is determined"
-_DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 _GREEK = {"o": "ω", "p": "φ", "k": "κ"}
 
 
@@ -692,11 +691,6 @@ class ResectedImage:
         return np.sqrt(np.diag(self.covariance)[3:6])
 
     @property
-    def angle_sign(self) -> str:
-        """What is written behind angles."""
-        return {"deg": "°", "gon": " gon", "rad": " rad"}[self.angle_unit]
-
-    @property
     def image_entries(self) -> dict[str, Any]:
         """Entries of the image in the project."""
         return {
@@ -720,27 +714,34 @@ class ResectedImage:
             )
         return lines
 
-    def lines(self) -> list[str]:
-        """Return the parameters with their standard deviations, and gross errors."""
-        found = self.found
-        sign, digits = self.angle_sign, _DIGITS[self.angle_unit]
-        head = f"{self.image.name}  {int((~found.rejected).sum())} points · redundancy {found.redundancy} · "
-        head += f"sigma0 {found.sigma0:.3g} · rms {found.rms:.2f} px"
-        if found.redundancy > 0:
-            head += f" · 95 % within {found.reach_95:.1f} times ±"
+    @property
+    def estimates(self) -> list[list[Estimate]]:
+        """Projection centre, angles and, if they were unknown, parameters of the camera."""
         center = zip(("X0", "Y0", "Z0"), self.center, self.sigma_center)
-        rows = [
-            [f"{name} {shown_metres(v, s).removesuffix(' m')} ±{shown_metres(s, s)}" for name, v, s in center],
+        angles = zip(self.angle_names, self.angles, self.sigma_angles)
+        found = [
+            [Estimate(name, value, sigma, unit="m") for name, value, sigma in center],
             [
-                f"{name} {value:.{digits}f} ±{sigma:.{digits}f}{sign}"
-                for name, value, sigma in zip(self.angle_names, self.angles, self.sigma_angles)
+                Estimate(name, value, sigma, unit="°" if self.angle_unit == "deg" else self.angle_unit)
+                for name, value, sigma in angles
             ],
         ]
         if self.calibrated is not None:
             c = self.calibrated
-            values = zip(c.parameters, c.after, c.sigma, c.units)
-            rows.append([f"{name} {value:.4f} ±{sigma:.4f} {u}" for name, value, sigma, u in values])
-        return [head, *("  " + "  ".join(row) for row in rows), *(f"  {line}" for line in self.gross_errors)]
+            found.append([Estimate(*each) for each in zip(c.parameters, c.after, c.sigma, c.parameters, c.units)])
+        return found
+
+    def lines(self) -> list[str]:
+        """Return the parameters with their standard deviations, and gross errors."""
+        found = self.found
+        head = f"{self.image.name}  {int((~found.rejected).sum())} points · redundancy {found.redundancy} · "
+        head += f"sigma0 {found.sigma0:.3g} · rms {found.rms:.2f} px"
+        if found.redundancy > 0:
+            head += f" · 95 % within {found.reach_95:.1f} times ±"
+        rows = [
+            "  ".join(f"{e.name} {with_sigma(e.value, e.sigma, e.unit)}" for e in group) for group in self.estimates
+        ]
+        return [head, *(f"  {row}" for row in rows), *(f"  {line}" for line in self.gross_errors)]
 
     def json_fields(self) -> dict[str, Any]:
         """Orientation, quality, and every point."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.findings import Bars, Chart, Findings, Picture, Table, Trace, number, shrunk, sigma_text, spaced
+from photoplan.findings import Bars, Chart, Findings, Picture, Table, Trace, number, shrunk, spaced
 from photoplan.report.drawing import (
     BLUE,
     GREEN,
@@ -156,7 +156,7 @@ def findings_section(found: Findings) -> str:
     """Return a section with all that was found."""
     heads = ("figure", "of", "value", "standard deviation", "unit", "stated elsewhere", "remark")
     rows = [
-        (f.label, spaced(f.plane, f.at), number(f.value, f.sigma), sigma_text(f.sigma), f.unit,
+        (f.label, spaced(f.plane, f.at), *f.texts, f.unit,
          "" if f.stated is None else number(f.stated), f.remark)
         for f in found.figures
     ]  # fmt: skip

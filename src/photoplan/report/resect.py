@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.plain import shown_metres
 from photoplan.products.film import ResectedImage, ResectResult
 from photoplan.report.drawing import BLUE, INK, RED, SOFT, axes_of, png, round_down, shortened, styled
 from photoplan.report.page import Cell, cells, figure, headline, number, page, section, table, text
@@ -110,21 +109,6 @@ def _image(image: ResectedImage, drawn: bool) -> str:
     return section(name, [*parts, table(("parameter", "value", "standard deviation"), rows), table(head, points)])
 
 
-def _orientation(image: ResectedImage) -> list[tuple[str, str, str]]:
+def _orientation(image: ResectedImage) -> list[tuple[str, ...]]:
     """Return name, value and standard deviation of each parameter."""
-    sign = image.angle_sign
-    rows = [
-        (name, shown_metres(value, sigma), f"± {shown_metres(sigma, sigma)}")
-        for name, value, sigma in zip(("X0", "Y0", "Z0"), image.center, image.sigma_center)
-    ]
-    rows += [
-        (name, f"{value:.5f}{sign}", f"± {sigma:.5f}{sign}")
-        for name, value, sigma in zip(image.angle_names, image.angles, image.sigma_angles)
-    ]
-    if image.calibrated is not None:
-        c = image.calibrated
-        rows += [
-            (name, f"{value:.4f} {u}", f"± {sigma:.4f} {u}")
-            for name, value, sigma, u in zip(c.parameters, c.after, c.sigma, c.units)
-        ]
-    return rows
+    return [(e.name, *(f"{text} {e.unit}" for text in e.texts)) for group in image.estimates for e in group]
