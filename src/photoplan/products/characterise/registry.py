@@ -3,9 +3,9 @@
 The module of an analysis holds two functions::
 
     def missing(data: SeriesData) -> str | None     # None: it can run; else what the series lacks, one sentence
-    def analyse(data: SeriesData) -> Outcome        # figures with sigmas, tables, plots, refusals
+    def analyse(data: SeriesData) -> Findings       # figures with sigmas, tables, plots, refusals
 
-`analyse` raises `InputError` where nothing can be known; it refuses single figures in `Outcome.refused`.
+`analyse` raises `InputError` if nothing can be known; it refuses single figures in `Findings.refused`.
 """
 
 from __future__ import annotations
