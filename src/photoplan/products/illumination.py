@@ -15,7 +15,7 @@ from photoplan import __version__
 from photoplan.cameras.curvature import SunProjection
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Findings, Result, Table, with_sigma
+from photoplan.findings import Estimate, Findings, Result, Table, with_sigma
 from photoplan.geometry.frames import triple
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.product import check_output
@@ -72,7 +72,7 @@ class IlluminationReport(Result):
         return {"path": self.path, **own, "not_lit": shadow, "correlation_before": before, "correlation_after": after}
 
     def outcome(self) -> Sequence[Findings]:
-        """Return the parameters of each band, and correlations before and after."""
+        """Return how much lies in shadow, and the parameters of each band with correlations before and after."""
         model = self.model
         sky = "a of c" if "c" in model.corrections else "sky"
         head = ("band", "per cos i", sky, "haze", "haze per 100 m", "correlation with cos i", "then")
@@ -81,13 +81,11 @@ class IlluminationReport(Result):
             values = zip((band.slope, band.sky, band.haze, band.haze_by_height), band.sigmas)
             texts = (with_sigma(value, sigma) if value or sigma else "" for value, sigma in values)
             rows.append((str(k), *texts, f"{before:+.3f}", f"{after:+.3f}"))
-        return [Findings(tables={"bands": Table(head, tuple(rows), printed=True)})]
-
-    def summary(self) -> Sequence[str]:
-        """Return the findings, and how much lies in shadow."""
-        dark = float((~self.sample.lit).mean())
-        said = f"{dark:.1%} of the sample lie in shadow or turn away from the sun; slopes are not corrected there"
-        return [*super().summary(), said]
+        dark = Estimate(
+            "not_lit_percent", 100 * float((~self.sample.lit).mean()), label="sample in shadow or turned away from the "
+            "sun", unit="%", remark="slopes are not corrected there",
+        )  # fmt: skip
+        return [Findings((dark,), tables={"bands": Table(head, tuple(rows), printed=True)})]
 
 
 @dataclass(frozen=True, eq=False)
