@@ -18,8 +18,8 @@ from photoplan.geometry.grid import Window
 from photoplan.plan.footprint import Tile
 from photoplan.products.view import make
 from photoplan.products.view import make as job
-from photoplan.products.view.camera import CameraRequest
 from photoplan.products.view.content import ViewScene
+from photoplan.requests.view import CameraRequest
 
 #: Side of the tiles, pixels.
 TILE = 128

@@ -72,9 +72,9 @@ class Request(BaseModel):
             annotation = declared[name].annotation
             value, how = _parsed(named[name], annotation), how_of(declared[name])
             odd = isinstance(value, float) and value != value and how.get("nan")
-            named[name] = value if odd else fitted(value, annotation, f"`{name}`")
-            if how.get("project") and (named[name] / "project.toml").is_file():
-                named[name] = named[name] / "project.toml"
+            named[name] = value = value if odd else fitted(value, annotation, f"`{name}`")
+            if how.get("project") and isinstance(value, Path) and (value / "project.toml").is_file():
+                named[name] = value / "project.toml"
         try:
             super().__init__(**named)
         except ValidationError as error:
@@ -96,12 +96,12 @@ class Request(BaseModel):
         return dict(self)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with other values, checked."""
-        return type(self)(**({name: getattr(self, name) for name in self.model_fields_set} | changes))
+        """Return a copy with other values, checked; what was not set stays so."""
+        return self.part(type(self), **changes)
 
-    def part(self, kind: type[Part]) -> Part:
-        """Return the options of a class from which this one derives, or that it holds; those that were set are set."""
-        return kind(**{name: getattr(self, name) for name in kind.model_fields if name in self.model_fields_set})
+    def part(self, other: type[Part], /, **changes: Any) -> Part:
+        """Return the options that another class has, too, with other values; what was not set stays so."""
+        return other(**{n: getattr(self, n) for n in other.model_fields if n in self.model_fields_set} | changes)
 
     @property
     def product(self) -> Path:
@@ -127,7 +127,7 @@ class Request(BaseModel):
             value = getattr(self, name)
             if isinstance(value, Request):
                 found |= value._files(written)
-            elif how_of(field).get("writes", False) == written:
+            elif how_of(field).get("writes", False) == written and (written or not how_of(field).get("folder")):
                 values = value if isinstance(value, tuple) else (value,)
                 found |= {name: [each for each in values if isinstance(each, Path)]}
         return found

@@ -15,9 +15,8 @@ from tools.command import inside
 from tools.recorded import checked, recorded
 
 from photoplan.errors import UsageError
-from photoplan.products.view.camera import CameraRequest
-from photoplan.products.view.make import ViewRequest
-from photoplan.products.view.measure import AreaRequest, visible_area
+from photoplan.products.view.measure import visible_area
+from photoplan.requests.view import AreaRequest, CameraRequest
 
 CRS, X0, Y0 = "EPSG:32633", 500_000.0, 5_300_000.0
 #: Eye 20 m above level ground, level view, 30° to both sides.
@@ -51,7 +50,7 @@ def expected() -> shapely.Geometry:
 
 def test_level_ground_before_and_behind_a_wall(wall: Path, tmp_path: Path) -> None:
     """Every pixel whose middle is more than a metre from the border is right, behind the wall more than two."""
-    found = visible_area(AreaRequest(ViewRequest(wall, STAND), tmp_path / "a.tif", 1.0))
+    found = visible_area(AreaRequest(wall, STAND, output=tmp_path / "a.tif", resolution=1.0))
     with rasterio.open(tmp_path / "a.tif") as file:
         values, left, top = file.read(1), file.bounds.left, file.bounds.top
         assert (left, top, file.res, file.crs.to_string()) == (X0 - 200, Y0 + 300, (1.0, 1.0), CRS)
@@ -84,14 +83,14 @@ def test_the_polygon_goes_along_the_pixels(wall: Path, tmp_path: Path) -> None:
 
 def test_what_is_refused(wall: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"written as \.tif"):
-        visible_area(AreaRequest(ViewRequest(wall, STAND), tmp_path / "a.png"))
+        visible_area(AreaRequest(wall, STAND, output=tmp_path / "a.png"))
     with pytest.raises(UsageError, match=r"larger `resolution`"):
-        visible_area(AreaRequest(ViewRequest(wall, STAND), tmp_path / "a.tif", 0.01))
+        visible_area(AreaRequest(wall, STAND, output=tmp_path / "a.tif", resolution=0.01))
     with pytest.raises(UsageError, match="is the input"):
-        visible_area(AreaRequest(ViewRequest(wall, STAND), wall, overwrite=True))
+        visible_area(AreaRequest(wall, STAND, output=wall, overwrite=True))
 
 
 def test_nothing_seen_is_no_feature(wall: Path, tmp_path: Path) -> None:
     up = CameraRequest(position=(X0, Y0), height=20.0, azimuth=0.0, pitch=60.0, size=(30, 20))
-    assert visible_area(AreaRequest(ViewRequest(wall, up), tmp_path / "up.gpkg")).seen == 0
+    assert visible_area(AreaRequest(wall, up, output=tmp_path / "up.gpkg")).seen == 0
     assert pyogrio.read_info(tmp_path / "up.gpkg")["features"] == 0

@@ -18,10 +18,9 @@ from tools.small_block import X0, Y0, Block, write_block
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.products.run import Run
-from photoplan.products.view.camera import CameraRequest
-from photoplan.products.view.content import ContentRequest, Letters, Overlay, dashed, placed
-from photoplan.products.view.lines import LinesRequest
-from photoplan.products.view.make import LookRequest, ViewRequest, ViewResult, draw, make_view, plan_view
+from photoplan.products.view.content import Letters, Overlay, dashed, placed
+from photoplan.products.view.make import ViewResult, draw, make_view, plan_view
+from photoplan.requests.view import CameraRequest, ContentRequest, LinesRequest, LookRequest, ViewRequest
 
 STAND = CameraRequest(position=(X0 - 80, Y0 - 60), height=40.0, look_at=(X0 + 20, Y0 + 10), size=(240, 160))
 LOOK = LookRequest((ContentRequest("shade"),), samples=1)
@@ -59,7 +58,7 @@ def write(path: Path, layer: str, kind: str, shapes: list, columns: dict, crs: s
 
 def drawn(small: Block, *texts: str) -> Overlay:
     lines = tuple(map(LinesRequest.parse, texts))
-    plan = plan_view(ViewRequest(small.terrain, STAND, None, LOOK, lines=lines, lettering=block_letters))
+    plan = plan_view(ViewRequest(small.terrain, STAND, look=LOOK, lines=lines, lettering=block_letters))
     overlay = draw(plan, plan.camera)
     assert overlay is not None
     return overlay
@@ -67,7 +66,7 @@ def drawn(small: Block, *texts: str) -> Overlay:
 
 def made(small: Block, out: Path, *texts: str, **more: object) -> tuple[ViewResult, np.ndarray]:
     lines = tuple(map(LinesRequest.parse, texts))
-    request = ViewRequest(small.terrain, STAND, out, LOOK, lines=lines, lettering=block_letters, **more)
+    request = ViewRequest(small.terrain, STAND, output=out, look=LOOK, lines=lines, lettering=block_letters, **more)
     result = make_view(plan_view(request), Run(overwrite=True))
     with rasterio.open(out) as file:
         return result, file.read().astype(int)
@@ -194,7 +193,7 @@ def test_files_that_cannot_be_used_are_said(small: Block, ways: Path, tmp_path: 
 
 def made_once(small: Block, out: Path, svg: Path, text: str) -> None:
     lines = (LinesRequest.parse(text),)
-    make_view(plan_view(ViewRequest(small.terrain, STAND, out, LOOK, lines=lines, svg=svg)), Run())
+    make_view(plan_view(ViewRequest(small.terrain, STAND, output=out, look=LOOK, lines=lines, svg=svg)), Run())
 
 
 def test_the_command_draws_labels_with_real_letters(small: Block, ways: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from tools.command import inside
 from tools.small_block import SIZE, Block, write_block
 
 from photoplan.errors import UsageError
-from photoplan.products.view.photo import PhotoRequest
+from photoplan.requests.view import PhotoRequest
 
 
 @pytest.fixture(scope="module")

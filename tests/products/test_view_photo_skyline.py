@@ -19,10 +19,11 @@ from photoplan.io.orientation.toml import read as read_toml_orientation
 from photoplan.io.quicklook import write_png
 from photoplan.orientation.skyline import fit_skyline
 from photoplan.products.init import InitRequest, init_project
-from photoplan.products.view.camera import CameraRequest, open_view_ground, view_camera
-from photoplan.products.view.make import ViewRequest, seen_surface
-from photoplan.products.view.photo import PhotoSkylineRequest, doubt, turned
-from photoplan.products.view.skyline import Skyline, SkylineRequest, skyline
+from photoplan.products.view.camera import open_view_ground, view_camera
+from photoplan.products.view.make import seen_surface
+from photoplan.products.view.photo import doubt, turned
+from photoplan.products.view.skyline import Skyline, skyline
+from photoplan.requests.view import CameraRequest, SkylineRequest
 from photoplan.surfaces.seen import skyline_of
 from photoplan.targets.view import FrameBundle
 
@@ -66,8 +67,8 @@ def photograph(path: Path, terrain: Path, camera: CameraRequest, seed: int) -> P
 
 
 def refined(folder: Path, dem: Path, photo: Path, start: CameraRequest, focal: bool = False) -> Skyline:
-    asked = PhotoSkylineRequest(photo, refine=True, focal=focal, search=60)
-    return skyline(SkylineRequest(ViewRequest(dem, start, force=True), folder / "s.csv", True, asked))
+    asked = {"photo": photo, "refine": True, "focal": focal, "search": 60}
+    return skyline(SkylineRequest(dem, start, force=True, output=folder / "s.csv", overwrite=True, **asked))
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +81,8 @@ def mountains(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_the_edge_is_found_to_a_part_of_a_pixel(mountains: tuple[Path, Path], tmp_path: Path) -> None:
     """With the camera that took it: in every column, but for rocks that overhang by a blur."""
     dem, photo = mountains
-    asked = PhotoSkylineRequest(photo, picture=tmp_path / "both.png")
-    found = skyline(SkylineRequest(ViewRequest(dem, TRUE, force=True), tmp_path / "s.csv", photo=asked))
+    asked = {"photo": photo, "picture": tmp_path / "both.png"}
+    found = skyline(SkylineRequest(dem, TRUE, force=True, output=tmp_path / "s.csv", **asked))
     assert found.match is not None
     apart = np.abs(found.match.residuals)
     print(f"median {np.nanmedian(apart):.3f} px, 95 % below {np.nanpercentile(apart, 95):.3f} px")
@@ -185,9 +186,9 @@ def test_an_image_of_a_project_is_turned_in_its_own_angles(mountains: tuple[Path
     off = np.array([0.5, -0.4, 0.3])
     project = photo_project(tmp_path, dem, photo, off)
     true = true_angles(dem)
-    view = ViewRequest(project, CameraRequest(image="photo", curvature="bend"), force=True)
-    asked = PhotoSkylineRequest(photo, refine=True, search=60, refined=tmp_path / "t.toml")
-    found = skyline(SkylineRequest(view, tmp_path / "s.csv", photo=asked)).refined
+    camera = CameraRequest(image="photo", curvature="bend")
+    asked = {"photo": photo, "refine": True, "search": 60, "refined": tmp_path / "t.toml"}
+    found = skyline(SkylineRequest(project, camera, force=True, output=tmp_path / "s.csv", **asked)).refined
     assert found is not None and found.names == ("omega", "phi", "kappa")
     np.testing.assert_allclose(found.before, true + off, atol=1e-6)
     np.testing.assert_allclose(found.after, true, atol=0.03)

@@ -14,9 +14,10 @@ from tools.command import Said, inside
 from tools.small_block import X0, Y0, Block, write_block
 
 from photoplan.errors import UsageError
-from photoplan.products.view.camera import CameraRequest, open_view_ground, view_camera
+from photoplan.products.view.camera import open_view_ground, view_camera
 from photoplan.products.view.lines import at_equal_steps, cameras
-from photoplan.products.view.make import Stereo, eyes
+from photoplan.products.view.make import eyes
+from photoplan.requests.view import CameraRequest, Stereo
 
 LOOK = ("--size", 64, 48, "--samples", 1, "--content", "shade", "-q")
 

@@ -11,9 +11,8 @@ import rasterio
 from rasterio.transform import from_origin
 from tools.command import inside
 
-from photoplan.products.view.camera import CameraRequest
-from photoplan.products.view.make import ViewRequest
-from photoplan.products.view.skyline import COLUMNS, SkylineRequest, skyline
+from photoplan.products.view.skyline import COLUMNS, skyline
+from photoplan.requests.view import CameraRequest, SkylineRequest
 
 CRS = "EPSG:32633"
 STAND = CameraRequest(position=(500_000.0, 5_300_050.0), height=20.0, look_at=(500_000.0, 5_300_500.0), size=(90, 60))
@@ -35,7 +34,7 @@ def ridge(tmp_path: Path) -> Path:
 
 def test_the_line_of_a_ridge(ridge: Path, tmp_path: Path) -> None:
     """Every point of it lies on the ridge's upper edge, 0.1 m a metre, to a thousandth of a pixel."""
-    found = skyline(SkylineRequest(ViewRequest(ridge, STAND), tmp_path / "s.csv"))
+    found = skyline(SkylineRequest(ridge, STAND, output=tmp_path / "s.csv"))
     x, y, E, N, H, distance, azimuth = found.points.T
     assert len(found.points) == 90 and set(found.surfaces) == {"terrain"}
     np.testing.assert_array_equal(x, np.arange(90))
@@ -70,7 +69,7 @@ def test_without_sky_there_is_none(ridge: Path, tmp_path: Path) -> None:
     down = CameraRequest(
         position=(500_000.0, 5_300_000.0), height=200.0, look_at=(500_000.0, 5_300_001.0), size=(40, 30)
     )
-    found = skyline(SkylineRequest(ViewRequest(ridge, down), tmp_path / "none.csv"))
+    found = skyline(SkylineRequest(ridge, down, output=tmp_path / "none.csv"))
     assert len(found.points) == 0
     said = inside("view", "skyline", ridge, "--from", 0, 0, "--azimuth", 0, "-o", tmp_path / "none.csv")
     assert said.code == 2 and "exists already" in said.err

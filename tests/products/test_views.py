@@ -16,10 +16,11 @@ from tools.small_block import SIZE, X0, Y0, Block, write_block
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.plan import product
 from photoplan.products.run import Run
-from photoplan.products.view.camera import CameraRequest, open_view_ground, view_camera
-from photoplan.products.view.content import ContentRequest, class_colours
-from photoplan.products.view.make import LookRequest, ViewAddress, ViewPlan, ViewRequest, hazy, make_view, plan_view
-from photoplan.products.view.measure import PickRequest, pick
+from photoplan.products.view.camera import open_view_ground, view_camera
+from photoplan.products.view.content import class_colours
+from photoplan.products.view.make import ViewAddress, ViewPlan, hazy, make_view, plan_view
+from photoplan.products.view.measure import pick
+from photoplan.requests.view import CameraRequest, ContentRequest, LookRequest, PickRequest, ViewRequest
 from photoplan.surfaces.seen import best_photos
 
 STAND = CameraRequest(position=(X0 - 80, Y0 - 60), height=40.0, look_at=(X0 + 20, Y0 + 10), size=(60, 40))
@@ -39,7 +40,7 @@ def made(request: ViewRequest) -> tuple[ViewPlan, np.ndarray]:
 
 
 def test_a_matrix_holds_ground_that_lies_in_its_pixels_on_the_terrain(small: Block, tmp_path: Path) -> None:
-    request = ViewRequest(small.terrain, STAND, tmp_path / "m.tif", kind="matrix")
+    request = ViewRequest(small.terrain, STAND, output=tmp_path / "m.tif", kind="matrix")
     plan, bands = made(request)
     ground = open_view_ground(small.terrain)
     XYZ = np.moveaxis(bands[:3], 0, -1)
@@ -63,18 +64,18 @@ def test_a_matrix_holds_ground_that_lies_in_its_pixels_on_the_terrain(small: Blo
 
 
 def test_a_matrix_gives_the_picture_that_looking_again_gives(small: Block, tmp_path: Path) -> None:
-    made(ViewRequest(small.terrain, STAND, tmp_path / "m.tif", kind="matrix"))
+    made(ViewRequest(small.terrain, STAND, output=tmp_path / "m.tif", kind="matrix"))
     look = LookRequest(
         contents=tuple(map(ContentRequest.parse, ("tint:grey:50:150", "shade@0.7", "slope@0.2"))), samples=1
     )
-    _, again = made(ViewRequest(small.terrain, STAND, tmp_path / "a.png", look))
-    _, kept = made(ViewRequest(small.terrain, None, tmp_path / "b.png", look, matrix=tmp_path / "m.tif"))
+    _, again = made(ViewRequest(small.terrain, STAND, output=tmp_path / "a.png", look=look))
+    _, kept = made(ViewRequest(small.terrain, None, output=tmp_path / "b.png", look=look, matrix=tmp_path / "m.tif"))
     np.testing.assert_array_equal(again, kept)
     other = CameraRequest(position=(X0, Y0), azimuth=0.0)
     with pytest.raises(InputError, match="of another view"):
-        plan_view(ViewRequest(small.terrain, other, None, look, matrix=tmp_path / "m.tif"))
+        plan_view(ViewRequest(small.terrain, other, look=look, matrix=tmp_path / "m.tif"))
     with pytest.raises(InputError, match="is no coordinate matrix"):
-        plan_view(ViewRequest(small.terrain, None, None, look, matrix=small.terrain))
+        plan_view(ViewRequest(small.terrain, None, look=look, matrix=small.terrain))
 
 
 def test_the_orthophoto_seen_by_the_camera_that_took_it_is_its_image(small: Block, tmp_path: Path) -> None:
@@ -82,7 +83,7 @@ def test_the_orthophoto_seen_by_the_camera_that_took_it_is_its_image(small: Bloc
     assert inside("ortho", small.project, *words).code == 0
     look = LookRequest(contents=(ContentRequest.parse(str(tmp_path / "one_ortho.tif")),), samples=1)
     camera = CameraRequest(image="one")
-    plan, seen = made(ViewRequest(small.project, camera, tmp_path / "v.tif", look))
+    plan, seen = made(ViewRequest(small.project, camera, output=tmp_path / "v.tif", look=look))
     assert plan.camera.target.bundle.size == SIZE
     with rasterio.open(small.images[0]) as file:
         image = file.read(1).astype(float)
@@ -92,7 +93,7 @@ def test_the_orthophoto_seen_by_the_camera_that_took_it_is_its_image(small: Bloc
     assert np.std(image[inner]) > 15 and np.median(np.abs(off)) < 2 and np.abs(off).mean() < 4
     # The photo itself as content is the image, resampled at its own pixels.
     look = LookRequest((ContentRequest.parse("photo:one"),), samples=1)
-    _, direct = made(ViewRequest(small.project, camera, tmp_path / "d.png", look))
+    _, direct = made(ViewRequest(small.project, camera, output=tmp_path / "d.png", look=look))
     assert np.abs(direct[0][inner].astype(float) - image[inner]).max() <= 1
 
 
@@ -101,13 +102,13 @@ def test_each_pixel_takes_the_photo_that_shows_it_finest(small: Block, tmp_path:
     pictures = {}
     for what in ("photos", "photo:one", "photo:two", "photo:three"):
         look = LookRequest((ContentRequest.parse(what),), samples=1, kernel="nearest")
-        pictures[what] = made(ViewRequest(small.project, camera, tmp_path / "p.png", look))[1][0]
+        pictures[what] = made(ViewRequest(small.project, camera, output=tmp_path / "p.png", look=look))[1][0]
     best = pictures.pop("photos")
     nodata = LookRequest().nodata[0]
     ours = [(picture == best) & (picture != nodata) for picture in pictures.values()]
     assert np.mean(np.any(ours, axis=0) | (best == nodata)) == 1
     # The projection centres lie from west to east, 60 m apart: so do their regions.
-    plan = plan_view(ViewRequest(small.project, camera, None, LookRequest((ContentRequest.parse("photos"),))))
+    plan = plan_view(ViewRequest(small.project, camera, look=LookRequest((ContentRequest.parse("photos"),))))
     view = plan.address.open()
     seen = view.surface.look(view.target, view.target.window)
     (layer,) = view.layers
@@ -132,8 +133,8 @@ def test_a_raster_of_another_crs_lies_where_it_belongs(small: Block, tmp_path: P
     with rasterio.open(tmp_path / "north.tif", "w", transform=transform, **profile) as file:
         file.write(values, 1)
     look = LookRequest((ContentRequest.parse(str(tmp_path / "north.tif")),), samples=1)
-    _, bands = made(ViewRequest(small.terrain, STAND, tmp_path / "m.tif", kind="matrix"))
-    _, picture = made(ViewRequest(small.terrain, STAND, tmp_path / "p.png", look))
+    _, bands = made(ViewRequest(small.terrain, STAND, output=tmp_path / "m.tif", kind="matrix"))
+    _, picture = made(ViewRequest(small.terrain, STAND, output=tmp_path / "p.png", look=look))
     low, high = np.percentile(values, (2, 98))
     wanted = np.clip((bands[1] - Y0 - low) * 255 / (high - low), 0, 255)
     there = np.isfinite(wanted)
@@ -151,9 +152,10 @@ def test_haze_follows_equation_5_8_of_ecker() -> None:
 def test_shadows_darken_what_the_sun_does_not_reach(small: Block, tmp_path: Path) -> None:
     camera = CameraRequest(position=(X0, Y0), altitude=600.0, azimuth=0.0, pitch=-90.0, size=(60, 40))
     grey = (ContentRequest.parse("tint:grey:-1000:9000"),)
-    lit, low = ({"azimuth": 90.0, "altitude": a, "shadows": True, "samples": 1} for a in (80.0, 1.0))
+    lit, low = ({"sun": (90.0, a), "shadows": True, "samples": 1} for a in (80.0, 1.0))
     bright, dark = (
-        made(ViewRequest(small.terrain, camera, tmp_path / "s.png", LookRequest(grey, **how)))[1] for how in (lit, low)
+        made(ViewRequest(small.terrain, camera, output=tmp_path / "s.png", look=LookRequest(grey, **how)))[1]
+        for how in (lit, low)
     )
     share = np.mean(dark[0] < bright[0])
     assert 0.05 < share < 0.95 and (dark[0] <= bright[0]).all()
@@ -202,19 +204,19 @@ def test_what_cannot_be_seen_or_written_is_refused(small: Block, tmp_path: Path)
 
 
 def test_picking_goes_both_ways_and_says_what_hides(small: Block, tmp_path: Path) -> None:
-    view = ViewRequest(small.project, CameraRequest(image="two"))
+    view = (small.project, CameraRequest(image="two"))
     pixels = ((20.0, 30.0), (100.25, 71.5), (190.0, 140.0))
-    ground = pick(PickRequest(view, pixels=pixels))
+    ground = pick(PickRequest(*view, pixels=pixels))
     points = tuple((each.E, each.N, each.H) for each in ground)
-    back = pick(PickRequest(view, points=points, output=tmp_path / "picked.csv"))
+    back = pick(PickRequest(*view, points=points, output=tmp_path / "picked.csv"))
     np.testing.assert_allclose([(b.x, b.y) for b in back], pixels, atol=1e-6)
     assert all(each.seen and each.surface == "terrain" for each in (*ground, *back))
-    below = pick(PickRequest(view, points=((points[1][0], points[1][1], points[1][2] - 10),)))[0]
+    below = pick(PickRequest(*view, points=((points[1][0], points[1][1], points[1][2] - 10),)))[0]
     assert not below.seen
     lines = (tmp_path / "picked.csv").read_text().splitlines()
     assert lines[0].startswith("name,x,y,E,N,H") and len(lines) == 4
     with pytest.raises(UsageError, match="nothing to pick"):
-        pick(PickRequest(view))
+        pick(PickRequest(*view))
 
 
 def test_commands_say_what_will_be_seen_and_take_files_of_cameras(small: Block, tmp_path: Path) -> None:
@@ -312,7 +314,7 @@ def test_class_rasters_keep_their_classes(small: Block, tmp_path: Path, samples:
         file.write(classes)
         file.write_colormap(1, table)
     look = LookRequest(contents=(ContentRequest.parse(str(tmp_path / "c.tif")),), samples=samples, sky=(1, 2, 3))
-    _, picture = made(ViewRequest(small.terrain, STAND, tmp_path / "v.tif", look=look))
+    _, picture = made(ViewRequest(small.terrain, STAND, output=tmp_path / "v.tif", look=look))
     found = {tuple(map(int, colour)) for colour in np.moveaxis(picture[:3], 0, -1).reshape(-1, 3)}
     assert found <= {*table.values(), (1, 2, 3), tuple(look.nodata)}
     assert {*table.values()} <= found
@@ -342,7 +344,7 @@ def test_class_rasters_without_a_colour_table(small: Block, tmp_path: Path, dtyp
         file.with_name("c.tif.vat.dbf").write_bytes(b"")
     content = ContentRequest.parse(f"{file}@classes" if how == "word" else str(file))
     look = LookRequest(contents=(content,), samples=samples, sky=(1, 2, 3))
-    _, picture = made(ViewRequest(small.terrain, STAND, tmp_path / "v.tif", look=look))
+    _, picture = made(ViewRequest(small.terrain, STAND, output=tmp_path / "v.tif", look=look))
     found = {tuple(map(int, colour)) for colour in np.moveaxis(picture[:3], 0, -1).reshape(-1, 3)}
     colours = np.array(sorted(found - {(1, 2, 3), tuple(look.nodata)}))
     assert len(colours) == len(numbers)
@@ -357,7 +359,7 @@ def test_grey_values_are_no_classes_unless_it_is_said(small: Block, tmp_path: Pa
         ContentRequest.parse("tint@classes")
     look = LookRequest(contents=(ContentRequest.parse(f"{small.terrain}@classes"),))
     with pytest.raises(UsageError, match="classes are whole numbers in one band"):
-        made(ViewRequest(small.terrain, STAND, tmp_path / "v.tif", look=look))
+        made(ViewRequest(small.terrain, STAND, output=tmp_path / "v.tif", look=look))
     numbers = np.arange(256)
     colours = class_colours(numbers[None])[:, 0].T
     assert len({tuple(c) for c in colours.tolist()}) == 256 and colours.min() >= 0 and colours.max() <= 255
@@ -376,7 +378,7 @@ def test_tolerance_0_is_the_strict_way(small: Block, tmp_path: Path, monkeypatch
     for tolerance in (0.0, 0.02):
         residuals.clear()
         look = LookRequest(contents=(ContentRequest("photos"),), samples=1, tolerance=tolerance)
-        _, picture = made(ViewRequest(small.project, STAND, tmp_path / f"{tolerance}.tif", look=look))
+        _, picture = made(ViewRequest(small.project, STAND, output=tmp_path / f"{tolerance}.tif", look=look))
         pictures[tolerance] = picture.astype(int)
         assert residuals and (max(residuals) == 0) == (tolerance == 0), residuals
     off = np.abs(pictures[0.0] - pictures[0.02])

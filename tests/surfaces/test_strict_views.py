@@ -9,8 +9,9 @@ import pytest
 import rasterio
 
 from photoplan.geometry.grid import Window
-from photoplan.products.view.camera import CameraRequest, open_view_ground, view_camera
+from photoplan.products.view.camera import open_view_ground, view_camera
 from photoplan.products.view.make import seen_surface
+from photoplan.requests.view import CameraRequest
 from photoplan.targets.view import ViewTarget
 
 CRS = "EPSG:31287"

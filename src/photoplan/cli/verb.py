@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 import click
 from click.core import ParameterSource
 
-from photoplan.cli.options import BYTES, NEW_FOLDER, PATH, PROJECT, all_cores, json_option, listed, quiet_option
+from photoplan.cli.options import BYTES, NEW_FOLDER, PATH, all_cores, listed
 from photoplan.cli.output import can_draw, say, show, show_json, spelled, talking
 
 if TYPE_CHECKING:
@@ -64,11 +64,11 @@ class Verb:
             call(_request(kind, given), as_json=as_json, quiet=quiet)
 
         command = VerbCommand(name, callback=callback, help=self.help)
-        command.params = list(_parameters(kind, command.section_of))
-        for add in (quiet_option, json_option):
-            add(command)
-        command.params = [*(p for p in command.params if p.name not in ("quiet", "as_json")),
-                          *(p for p in reversed(command.params) if p.name in ("quiet", "as_json"))]  # fmt: skip
+        command.params = [
+            *_parameters(kind, command.section_of),
+            click.Option(["--json", "as_json"], is_flag=True, help="Print one JSON object on stdout."),
+            click.Option(["-q", "--quiet"], is_flag=True, help="No progress on stderr; warnings stay."),
+        ]
         return command
 
 
@@ -206,28 +206,34 @@ def _opened(path: Path, key: str, request: Any) -> ReportFile | None:
 def _request(kind: type[Request], given: dict[str, Any]) -> Request:
     """Return the request, with the requests that it holds; options that were not given keep their defaults."""
     values: dict[str, Any] = {}
-    for name, entry in kind.model_fields.items():
-        if _is_group(entry.annotation):
-            values[name] = _request(entry.annotation, given)  # type: ignore[arg-type]
+    # Of several mistakes that of the last option is named: the first ones may lack what only all of them make whole.
+    for name, entry in reversed(kind.model_fields.items()):
+        if (group := _group_of(entry.annotation)) is not None:
+            told = any(given.get(each) not in (None, ()) for each in group.model_fields)
+            if told or group is entry.annotation:
+                values[name] = _request(group, given)
         elif name in given and (value := given.pop(name)) is not None and value != ():
             values[name] = value
     return kind(**values)
 
 
-def _is_group(annotation: Any) -> bool:
-    return isinstance(annotation, type) and hasattr(annotation, "model_fields")
+def _group_of(annotation: Any) -> type[Request] | None:
+    """Return the request that a field holds, perhaps if any of its options is given; None if it holds none."""
+    kinds = [each for each in get_args(annotation) or (annotation,) if each is not type(None)]
+    return kinds[0] if len(kinds) == 1 and hasattr(kinds[0], "model_fields") else None
 
 
 def _parameters(kind: type[Request], section_of: dict[str, str]) -> Iterator[click.Parameter]:
-    """Yield the parameters of a request, those of the requests that it holds among them."""
+    """Yield the parameters of a request, those of the requests that it holds among them; a field without help is
+    none."""
     for name, entry in kind.model_fields.items():
-        if _is_group(entry.annotation):
-            yield from _parameters(entry.annotation, section_of)  # type: ignore[arg-type]
-            continue
-        how = entry.json_schema_extra if isinstance(entry.json_schema_extra, dict) else {}
-        if not how.get("argument"):
-            section_of[name] = str(how.get("section") or ("result" if how.get("writes") else "method"))
-        yield _parameter(name, entry, how)
+        if (group := _group_of(entry.annotation)) is not None:
+            yield from _parameters(group, section_of)
+        elif entry.description is not None:
+            how = entry.json_schema_extra if isinstance(entry.json_schema_extra, dict) else {}
+            if not how.get("argument"):
+                section_of[name] = str(how.get("section") or ("result" if how.get("writes") else "method"))
+            yield _parameter(name, entry, how)
 
 
 def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter:
@@ -238,12 +244,12 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     more: dict[str, Any] = {"metavar": how["metavar"]} if "metavar" in how else {}
     if get_origin(hint) is tuple:
         parts = get_args(hint)
-        if parts[-1] is not Ellipsis:
-            more["nargs"], hint = len(parts), parts[0]
+        if parts[-1] is not Ellipsis or ("nargs" in how and get_origin(parts[0]) is not tuple):
+            more["nargs"], hint = how.get("nargs", len(parts)), parts[0]
         else:
             hint = parts[0]
             if get_origin(hint) is tuple:
-                more["nargs"], hint = len(get_args(hint)), get_args(hint)[0]
+                more["nargs"], hint = how.get("nargs", len(get_args(hint))), get_args(hint)[0]
             more["multiple"] = True
             if how.get("listed"):
                 more["callback"] = partial(_numbers, how["listed"]) if hint in (int, float) else _words
@@ -261,7 +267,7 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
         more["callback"] = partial(_value_of, choices)
     kind: Any = click.Choice(choices) if choices else BYTES if how.get("size") else hint
     if hint is Path:
-        kind = NEW_FOLDER if how.get("folder") else PROJECT if how.get("project") else PATH
+        kind = NEW_FOLDER if how.get("folder") else PATH
     if isinstance(more.get("callback"), partial) and not choices:
         kind = str
     if how.get("argument"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,7 @@ from photoplan.cameras.curvature import EarthBend, Exaggeration, Warp
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import NoLens
 from photoplan.errors import GeometryError, InputError, UsageError
-from photoplan.geometry.bounds import odd_angles, odd_place
-from photoplan.geometry.grid import USUAL_TILE, refuse_absurd
+from photoplan.geometry.bounds import odd_place
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose, rotation_from_view, view_from_rotation
 from photoplan.io.project.file import load_project
@@ -25,6 +24,7 @@ from photoplan.io.project.model import Project
 from photoplan.project.cameras import central_without_pixels
 from photoplan.project.ground import ground_of, open_terrain
 from photoplan.project.scene import input_files
+from photoplan.requests.view import USUAL_REFRACTION, CameraRequest
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.objects import ObjectSurface, painted_surface
 from photoplan.surfaces.seen import SeenSurface
@@ -100,130 +100,8 @@ def _dry_ground(path: Path, crs: str | None) -> ViewGround:
     )
 
 
-CURVATURES = ("none", "bend", "strict")
-PANORAMAS = ("cylinder", "sphere")
-#: Coefficient of refraction that is usual by day (Ecker 1991, §5.7.6).
-USUAL_REFRACTION = 0.13
-#: Sides of pictures, pixels.
-_LARGEST = 200_000
-#: What the camera of an image has of its own.
-_OF_STANDPOINT = (
-    *("height", "altitude", "look_at", "azimuth", "pitch", "roll", "field_of_view", "size", "pixel_aspect"),
-    "panorama",
-)
 #: Steepest middle of a panorama on a cylinder, radians: rows are tangents of it.
 _STEEPEST = math.radians(89.0)
-
-
-@dataclass(frozen=True)
-class CameraRequest:
-    """A camera as a user states it; angles in degrees, lengths in metres."""
-
-    image: str | None = None
-    """An image of the project: its orientation, camera and lens as they are; with a standpoint None."""
-    aside: float | None = None
-    """How far the camera of an image is moved to the right along its rows, metres: an eye of a stereo pair."""
-    position: tuple[float, float] | None = None
-    """X, Y of the standpoint."""
-    height: float = 1.7
-    """Of the eye above ground; an exaggeration leaves it as it is."""
-    altitude: float | None = None
-    """Height of the eye in the system of the terrain, instead of `height`."""
-    look_at: tuple[float, ...] | None = None
-    """X, Y or X, Y, Z of the point in the middle of the picture."""
-    azimuth: float | None = None
-    """Direction of view from grid north, clockwise, instead of `look_at`."""
-    pitch: float = 0.0
-    """Of the direction of view above the horizon, with `azimuth`."""
-    roll: float = 0.0
-    """Of the camera about its axis, clockwise."""
-    field_of_view: float | None = None
-    """From the left to the right edge of the picture; None: 60, of panoramas 360."""
-    size: tuple[int, int] = (1200, 800)
-    """Width and height of the picture, pixels."""
-    pixel_aspect: float = 1.0
-    """Width of a pixel divided by its height."""
-    panorama: str | None = None
-    """`cylinder` or `sphere` instead of a plane picture."""
-    curvature: str | None = None
-    """`none`; `bend`: ground is lowered by s²/2R (Ecker 1991, eq. 5.6); `strict`: through the local system of the
-    standpoint. None: `bend` from a standpoint, and as the project has it for an image."""
-    refraction: float | None = None
-    """Coefficient k (eq. 5.7); None: 0.13 where the earth is round."""
-    earth_radius: float | None = None
-    """R; None: that of the ellipsoid at the standpoint."""
-    exaggeration: float = 1.0
-    reference: float | None = None
-    """Height that an exaggeration leaves; None: where the middle of the picture meets the ground."""
-
-    def __post_init__(self) -> None:
-        if (self.image is None) == (self.position is None):
-            raise UsageError("a view needs one `camera`: an image of the project, or a standpoint `position` X Y")
-        own = [f.name for f in fields(self) if f.name in _OF_STANDPOINT and getattr(self, f.name) != f.default]
-        if self.image is not None and own:
-            raise UsageError(f"`{own[0]}` belongs to a standpoint `position`; an image is seen with its own camera")
-        if self.aside is not None and self.image is None:
-            raise UsageError("`aside` belongs to the camera of an image; a standpoint is moved by its `position`")
-        numbers = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name, value in numbers.items():
-            flat = value if isinstance(value, tuple) else (value,)
-            if any(isinstance(v, float | int) and not math.isfinite(v) for v in flat):
-                raise UsageError(f"`{name}` {value}; finite numbers are needed")
-        odd = odd_angles((self.azimuth or 0.0, self.roll), "deg", ("`azimuth`", "`roll`"))
-        far = odd_place((0.0, 0.0, self.reference or 0.0), camera=True)
-        if odd is not None or far is not None:
-            raise UsageError(odd or f"`reference`: {far}")
-        if self.panorama and self.look_at is None and self.azimuth is None:
-            object.__setattr__(self, "azimuth", 0.0)
-        if self.position is not None and (self.look_at is None) == (self.azimuth is None):
-            raise UsageError("a standpoint needs either `look_at` X Y [Z] or `azimuth`")
-        if self.look_at is not None and len(self.look_at) not in (2, 3):
-            raise UsageError(f"`look_at` {self.look_at}; X Y or X Y Z are needed")
-        for name, allowed in (("curvature", CURVATURES), ("panorama", PANORAMAS)):
-            if numbers[name] not in (None, *allowed):
-                raise UsageError(f"`{name}` {numbers[name]!r}; allowed are {', '.join(allowed)}")
-        most = 360.0 if self.panorama else 170.0
-        if self.field_of_view is not None and not 1e-4 <= self.field_of_view <= most:
-            raise UsageError(f"`field_of_view` {self.field_of_view}°; 0.0001 to {most:g} are allowed")
-        if not all(1 <= side <= _LARGEST for side in self.size):
-            raise UsageError(f"picture of {self.size[0]} × {self.size[1]} pixels; sides of 1 to {_LARGEST} are allowed")
-        refuse_absurd(self.size, USUAL_TILE, "the picture")
-        if not 0.01 <= self.pixel_aspect <= 100:
-            raise UsageError(f"`pixel_aspect` {self.pixel_aspect}; 0.01 to 100 are allowed")
-        if self.refraction is not None and not -1 <= self.refraction < 1:
-            raise UsageError(f"`refraction` {self.refraction}; from -1 to below 1, usual is {USUAL_REFRACTION}")
-        if self.earth_radius is not None and not 1e6 <= self.earth_radius <= 1e8:
-            raise UsageError(f"`earth_radius` {self.earth_radius} m; that of the earth is 6380000")
-        if self.exaggeration != 1.0:
-            Exaggeration(0.0, self.exaggeration)
-        if not abs(self.pitch) <= 90:
-            raise UsageError(f"`pitch` {self.pitch}°; -90 to 90 are allowed")
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any], where: str) -> CameraRequest:
-        """From plain values, as a file has them; `where` names it.
-
-        Raises
-        ------
-        InputError
-            A name or a value is not allowed.
-        """
-        known = {f.name: f for f in fields(cls)}
-        for name, value in values.items():
-            if name not in known:
-                raise InputError(f"{where}: {name!r} is no part of a camera; known are {', '.join(known)}")
-            kind, text = str(known[name].type), isinstance(value, str)
-            if (
-                isinstance(value, bool | dict)
-                or ("str" in kind) != text
-                or ("tuple" in kind) != isinstance(value, list)
-            ):
-                raise InputError(f"{where}: {name} = {value!r} is not of the kind {kind}")
-        try:
-            given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
-            return cls(**given)
-        except (TypeError, UsageError) as error:
-            raise InputError(f"{where}: {str(error).replace('`', '')}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +123,7 @@ class ViewCamera:
         return {
             "standpoint": [float(v) for v in c],
             "height_above_ground": self.above_ground,
-            "camera": {k: v for k, v in vars(self.request).items() if v is not None},
+            "camera": {k: v for k, v in self.request.json_fields().items() if v is not None},
             "earth_radius": self.earth_radius,
             "bend_per_metre": self.bend,
         }
@@ -274,7 +152,7 @@ def _of_image(request: CameraRequest, ground: ViewGround) -> ViewCamera:
     if request.curvature in ("bend", "strict"):
         if plain.warps:
             raise UsageError("the project states its own earth curvature or refraction; leave `curvature` to it")
-        warps, bend, radius = _round(replace(request, curvature="bend"), ground, camera.center)
+        warps, bend, radius = _round(request.replace(curvature="bend"), ground, camera.center)
         plain = ViewTarget(plain.bundle, camera.center, warps, bend)
     return _stretched(request, ground, plain.moved(request.aside) if request.aside else plain, radius)
 
@@ -317,12 +195,12 @@ def _of_standpoint(request: CameraRequest, ground: ViewGround) -> ViewCamera:
             if not math.isfinite(look_at[2]):
                 raise InputError(f"look-at point {look_at[0]:.10g} {look_at[1]:.10g}: the terrain has no height there")
         if request.reference is None and request.exaggeration != 1.0:
-            request = replace(request, reference=float(look_at[2]))
+            request = request.replace(reference=float(look_at[2]))
     warps, bend, radius = _round(request, ground, center)
     plain = ViewTarget(_bundle(request, center, warps, look_at), center, warps, bend)
     if request.exaggeration != 1.0:
         reference = _reference(plain, ground) if request.reference is None else request.reference
-        request = replace(request, reference=reference)
+        request = request.replace(reference=reference)
         if request.altitude is None:
             # The eye keeps its height above the ground that is raised.
             stretch = Exaggeration(reference, request.exaggeration)
@@ -388,7 +266,7 @@ def _stretched(request: CameraRequest, ground: ViewGround, target: ViewTarget, r
     if request.exaggeration != 1.0:
         reference = _reference(target, ground) if request.reference is None else request.reference
         stretch = Exaggeration(reference, request.exaggeration)
-        request = replace(request, reference=reference)
+        request = request.replace(reference=reference)
         center, warps = stretch.inverse(target.center), (stretch, *target.warps)
         target = ViewTarget(target.bundle, center, warps, bend / request.exaggeration)
     above = request.exaggeration * float(target.center[2] - ground.terrain.heights(target.center[:2]))
@@ -424,8 +302,7 @@ def _resolved(made: ViewCamera, bundle: Bundle) -> CameraRequest:
         azimuth, pitch, _ = view_from_rotation(axes.T @ bundle.camera.pose.R_ground_camera)
     kind = request.curvature or "bend"
     usual = None if kind == "none" else USUAL_REFRACTION
-    return replace(
-        request,
+    return request.replace(
         position=(x, y),
         altitude=float(altitude),
         look_at=None,

@@ -32,6 +32,7 @@ from photoplan.plan.sources import Share
 from photoplan.products.view.camera import ViewGround
 from photoplan.products.view.lines import Drawing, LineStyle
 from photoplan.project.scene import open_scene
+from photoplan.requests.view import ContentRequest
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.seen import LIFT_OF_POINTS, LinesOfSight, Seen, SeenLines, SeenSurface, best_photos
 from photoplan.targets.base import Target
@@ -54,50 +55,6 @@ Look = Callable[[Window], Seen]
 
 Colours = NDArray[np.float32]
 """Red, green, blue, shape (3, height, width), 0 to 255."""
-
-
-@dataclass(frozen=True)
-class ContentRequest:
-    """One layer of what a view shows; later ones lie over earlier ones."""
-
-    kind: str
-    """`shade`, `tint`, `slope`, `raster`, `photo` or `photos`."""
-    value: str = ""
-    """Of a raster its file, of a photo its name, of tints the ramp with its lowest and highest height."""
-    opacity: float = 1.0
-    classes: bool = False
-    """Whether the values of a raster are numbers of classes, whatever its file states."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.opacity <= 1:
-            raise UsageError(f"content {self.value or self.kind}: opacity {self.opacity}; above 0 and up to 1")
-
-    @classmethod
-    def parse(cls, text: str) -> ContentRequest:
-        """Read ``WHAT`` or ``WHAT@OPACITY``: ``shade``, ``slope``, ``photos``, ``photo:NAME``, ``tint``,
-        ``tint:RAMP``, ``tint:RAMP:LOW:HIGH``, or the file of a raster, with ``@classes`` if its values are classes.
-        """
-        opacity, classes = 1.0, False
-        while "@" in text and not Path(text).exists():
-            head, _, tail = text.rpartition("@")
-            try:
-                classes, opacity = (True, opacity) if tail == "classes" else (classes, float(tail))
-            except ValueError:
-                break
-            text = head
-        kind, _, value = text.partition(":")
-        known = "" if kind in ("shade", "slope", "photos") and not value else None
-        known = value if kind == "tint" or (kind == "photo" and value) else known
-        if known is not None:
-            if classes:
-                raise UsageError(f"content {text}@classes: only the file of a raster has classes; leave `@classes` out")
-            return cls(kind, known, opacity)
-        if not Path(text).is_file():
-            raise UsageError(
-                f"content {text!r}: no such file; other contents are shade, slope, tint, tint:RAMP:LOW:HIGH, photos "
-                "and photo:NAME, each with @OPACITY if you like, files also with @classes"
-            )
-        return cls("raster", text, opacity, classes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,9 @@ from photoplan.geometry.units import MetricSystem, agreed_metres, metric_system
 from photoplan.io.tables import Columns, read_table
 from photoplan.io.vector_layer import DrawnFeatures, read_drawn_features
 from photoplan.products.dtm.lines import contour_parts
-from photoplan.products.view.camera import CameraRequest, ViewGround
+from photoplan.products.view.camera import ViewGround
 from photoplan.project.ground import open_terrain
+from photoplan.requests.view import CameraRequest, LinesRequest, number_in
 from photoplan.surfaces.seen import Lines
 from photoplan.terrain.contours import trace_contours
 from photoplan.terrain.options import ContourOptions
@@ -31,44 +32,10 @@ NAMES: dict[str, Colour] = {
     "green": (0, 158, 115), "yellow": (240, 228, 66), "orange": (230, 159, 0), "purple": (204, 121, 167),
     "sky": (86, 180, 233), "brown": (122, 74, 30),
 }  # fmt: skip
-KEYS = ("colour", "width", "dash", "label", "height", "distance", "rank", "crs", "drape")
 #: Widths, dashes and sizes of marks, pixels.
 _WIDEST = 200.0
 #: Vertices that one layer may have.
 _MOST = 5_000_000
-
-
-@dataclass(frozen=True)
-class LinesRequest:
-    """A layer that is drawn: a file of features, or contours."""
-
-    path: Path | None
-    """None: contours of the terrain."""
-    layer: str | None = None
-    interval: float = 0.0
-    """Of contours, metres."""
-    options: tuple[tuple[str, str], ...] = ()
-    """Keys of `KEYS`, each a value or the name of an attribute."""
-
-    @classmethod
-    def parse(cls, text: str) -> LinesRequest:
-        """From ``FILE``, ``FILE:LAYER`` or ``contours:INTERVAL``, each with ``@KEY=VALUE,KEY=VALUE``."""
-        head, _, tail = text.rpartition("@") if "=" in text.rpartition("@")[2] else (text, "", "")
-        pairs = [tuple(part.strip() for part in each.split("=", 1)) for each in tail.split(",")] if tail else []
-        wrong = [each for each in pairs if len(each) != 2 or each[0] not in KEYS]
-        if wrong:
-            raise UsageError(f"lines {text!r}: {'='.join(wrong[0])!r}; options are KEY=VALUE with {', '.join(KEYS)}")
-        options = tuple((key, value) for key, value in pairs)
-        kind, _, value = head.partition(":")
-        if kind == "contours" and not Path(head).is_file():
-            interval = _number(value, f"lines {text!r}: interval", 1e-3, 1e5)
-            return cls(None, None, interval, options)
-        if Path(head).is_file():
-            return cls(Path(head), None, 0.0, options)
-        file, _, layer = head.rpartition(":")
-        if not (file and layer and Path(file).is_file()):
-            raise UsageError(f"lines {text!r}: no such file; give FILE, FILE:LAYER or contours:INTERVAL")
-        return cls(Path(file), layer, 0.0, options)
 
 
 @dataclass(frozen=True)
@@ -147,7 +114,7 @@ def _contours(request: LinesRequest, ground: ViewGround, reach: float, center: N
     options = dict(request.options)
     plain = LineStyle(
         _colour(options.get("colour", "brown"), "contours"),
-        _number(options.get("width", "0.8"), "contours: width", 0.1, _WIDEST),
+        number_in(options.get("width", "0.8"), "contours: width", 0.1, _WIDEST),
         _dash(options.get("dash", ""), "contours"),
     )
     number = np.repeat(np.arange(len(vertices)), [len(xy) for xy in vertices])
@@ -243,7 +210,7 @@ class _Values:
         where = f"{self.table.path}: feature {row + 1}"
         return LineStyle(
             self._of("colour", row, colour, lambda text: _colour(text, where), "color"),
-            self._of("width", row, width, lambda text: _number(text, f"{where}: width", 0.1, _WIDEST)),
+            self._of("width", row, width, lambda text: number_in(text, f"{where}: width", 0.1, _WIDEST)),
             self._of("dash", row, "", lambda text: _dash(text, where)),
         )
 
@@ -262,7 +229,7 @@ class _Values:
         text = self._text(name, row) if name else ""
         if not text:
             return float("nan")
-        return _number(text, f"{self.table.path}: feature {row + 1}: rank", -1e12, 1e12)
+        return number_in(text, f"{self.table.path}: feature {row + 1}: rank", -1e12, 1e12)
 
     def _of(self, key: str, row: int, default: str, read: Callable[[str], T], also: str = "") -> T:
         stated = self.options.get(key)
@@ -288,19 +255,9 @@ def _colour(text: str, where: str) -> Colour:
     return int(name[1:3], 16), int(name[3:5], 16), int(name[5:7], 16)
 
 
-def _number(text: str, where: str, least: float, most: float) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = least - 1
-    if not least <= value <= most:
-        raise InputError(f"{where} {text[:40]!r}; {least:g} to {most:g} is allowed")
-    return value
-
-
 def _dash(text: str, where: str) -> tuple[float, ...]:
     parts = [part for part in re.split(r"[-\s]+", text.strip()) if part]
-    dash = tuple(_number(part, f"{where}: dash", 0.1, _WIDEST) for part in parts)
+    dash = tuple(number_in(part, f"{where}: dash", 0.1, _WIDEST) for part in parts)
     if len(dash) % 2:
         raise InputError(f"{where}: dash {text[:40]!r}; strokes and gaps in pixels are needed, such as 6-3")
     return dash
@@ -350,5 +307,5 @@ def cameras(template: CameraRequest, places: _Floats, along: bool) -> list[Camer
     out = []
     for (x, y, z), way in zip(places.tolist(), azimuth.tolist()):
         altitude = template.altitude if math.isnan(z) else z + template.height
-        out.append(replace(template, position=(x, y), altitude=altitude, azimuth=way if along else template.azimuth))
+        out.append(template.replace(position=(x, y), altitude=altitude, azimuth=way if along else template.azimuth))
     return out

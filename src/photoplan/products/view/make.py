@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -17,6 +17,8 @@ from photoplan import __version__
 from photoplan.engine.executors import Workers
 from photoplan.engine.run import Made, Output, Tally, Work
 from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.grid import Placement, Window
 from photoplan.geometry.pose import dot
 from photoplan.io.disk import make_folder
@@ -30,7 +32,6 @@ from photoplan.plain import json_text, pick, plain
 from photoplan.plan.footprint import Tile, Tiles
 from photoplan.products.run import Run, refuse_inputs
 from photoplan.products.view.camera import (
-    CameraRequest,
     ViewCamera,
     ViewGround,
     map_axes,
@@ -39,8 +40,6 @@ from photoplan.products.view.camera import (
 )
 from photoplan.products.view.content import (
     Colours,
-    ContentRequest,
-    Lettering,
     Overlay,
     OverlayFacts,
     Resampled,
@@ -49,52 +48,26 @@ from photoplan.products.view.content import (
     open_layers,
     overlay,
 )
-from photoplan.products.view.lines import LinesRequest, open_drawing
-from photoplan.products.view.photo import PhotoRequest, ViewPhoto
+from photoplan.products.view.lines import open_drawing
+from photoplan.products.view.photo import ViewPhoto
+from photoplan.requests.view import (
+    USUAL_REFRACTION,
+    CameraRequest,
+    Colour,
+    ContentRequest,
+    LookRequest,
+    MatrixRequest,
+    PhotoRequest,
+    SightRequest,
+    Stereo,
+    ViewRequest,
+)
 from photoplan.surfaces.seen import LinesOfSight, Seen, SeenSurface, ground_size
 from photoplan.targets.view import Bundle, FrameBundle, ViewTarget
 from photoplan.terrain.options import Lighting
 from photoplan.terrain.shading import directions
 
-HOWS = ("side-by-side", "anaglyph")
-#: Base by the distance of the nearest ground, where none is stated.
-_USUAL = 1 / 30
 _LUMINANCE = (0.299, 0.587, 0.114)
-
-
-@dataclass(frozen=True)
-class Stereo:
-    """How a pair is made."""
-
-    how: str
-    """One of `HOWS`: left and right beside each other, or for red and cyan glasses."""
-    base: float | None = None
-    """Distance of both cameras, metres; None: a thirtieth of the distance of the nearest ground."""
-
-    def __post_init__(self) -> None:
-        if self.how not in HOWS:
-            raise UsageError(f"`stereo` {self.how!r}; allowed are {', '.join(HOWS)}")
-        if self.base is not None and not (math.isfinite(self.base) and self.base > 0):
-            raise UsageError(f"`base` {self.base} m; a positive number is needed")
-
-    @property
-    def beside(self) -> bool:
-        """Whether both pictures lie beside each other."""
-        return self.how == "side-by-side"
-
-    @property
-    def metres(self) -> float:
-        """The base, which must be stated."""
-        assert self.base is not None
-        return self.base
-
-    def stated(self, nearest: float | None) -> Stereo:
-        """With a number as base, rounded to two digits; `nearest`: distance of the nearest ground, metres."""
-        if self.base is not None:
-            return self
-        if nearest is None:
-            raise UsageError("no ground is seen from which a `base` would follow; state it")
-        return replace(self, base=float(f"{nearest * _USUAL:.2g}"))
 
 
 def eyes(camera: ViewCamera, base: float) -> tuple[CameraRequest, CameraRequest]:
@@ -103,7 +76,7 @@ def eyes(camera: ViewCamera, base: float) -> tuple[CameraRequest, CameraRequest]
     if not isinstance(target.bundle, FrameBundle):
         raise UsageError("a stereo pair needs a plane picture; panoramas have one place only")
     if request.image is not None:
-        return replace(request, aside=-base / 2), replace(request, aside=base / 2)
+        return request.replace(aside=-base / 2), request.replace(aside=base / 2)
     assert request.position is not None and request.altitude is not None
     right = map_axes(target.warps, target.center).T @ target.bundle.camera.pose.R_ground_camera[:, 0]
     at = np.array([*request.position, request.altitude])
@@ -113,7 +86,7 @@ def eyes(camera: ViewCamera, base: float) -> tuple[CameraRequest, CameraRequest]
 
 def _moved(request: CameraRequest, at: NDArray[np.float64]) -> CameraRequest:
     x, y, z = at.tolist()
-    return replace(request, position=(x, y), altitude=z)
+    return request.replace(position=(x, y), altitude=z)
 
 
 def anaglyph(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -126,52 +99,6 @@ def anaglyph(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.ui
     return out
 
 
-Colour = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class LookRequest:
-    """How a view looks."""
-
-    contents: tuple[ContentRequest, ...] = (ContentRequest("tint"), ContentRequest("shade", "", 0.8))
-    azimuth: float = 315.0
-    """Of the sun, degrees clockwise from grid north."""
-    altitude: float = 45.0
-    """Of the sun above the horizon, degrees."""
-    shadows: bool = False
-    """Whether terrain and objects cast shadows."""
-    haze: float = 0.0
-    """Coefficient α of eq. 5.8 of Ecker 1991, per kilometre."""
-    haze_colour: Colour = (200, 210, 222)
-    """The brightness of the horizon in that equation."""
-    sky: Colour = (186, 212, 238)
-    nodata: Colour = (214, 214, 214)
-    """Ground that no content shows."""
-    water_colour: Colour = (112, 150, 184)
-    """Water on which no raster or photo shows anything."""
-    samples: int = 2
-    """Rays along each side of a pixel, of which its colour is the mean."""
-    kernel: str = "bicubic"
-    tolerance: float = 0.02
-    """Largest error of places in rasters and photos, pixels of them; 0: every pixel is computed strictly."""
-    photo: PhotoRequest | None = None
-    """A photograph that the picture is compared with."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.haze <= 100:
-            raise UsageError(f"`haze` {self.haze} per kilometre; 0 to 100 are allowed, 0.1 is much")
-        if not 1 <= self.samples <= 8:
-            raise UsageError(f"`samples` {self.samples}; 1 to 8 rays along each side of a pixel are allowed")
-        if not (self.tolerance == 0 or 1e-6 <= self.tolerance <= 10):
-            raise UsageError(
-                f"`tolerance` {self.tolerance} px; it must be 0 (every pixel strictly) or 1e-6 to 10 (usual is 0.02)"
-            )
-        for name in ("haze_colour", "sky", "nodata", "water_colour"):
-            if not all(0 <= v <= 255 for v in getattr(self, name)):
-                raise UsageError(f"`{name}` {getattr(self, name)}; red, green and blue from 0 to 255 are needed")
-        Lighting(azimuth=self.azimuth, altitude=self.altitude)
-
-
 @dataclass(frozen=True)
 class ViewAddress:
     """All that a worker needs to make tiles of a view: small, hashable, pickles."""
@@ -182,6 +109,7 @@ class ViewAddress:
     water: float | None
     camera: CameraRequest
     look: LookRequest
+    photo: PhotoRequest | None
     heights: tuple[float, float]
     """Of what is seen, for tints."""
     farthest: float
@@ -221,12 +149,10 @@ def _open(address: ViewAddress) -> OpenView:
             raise InputError(f"{path}: has changed since the run was planned; run it again")
     ground = open_view_ground(Path(address.source), address.crs, address.water)
     camera = view_camera(address.camera, ground, force=True)
-    light = Lighting(
-        azimuth=address.look.azimuth, altitude=address.look.altitude, exaggeration=camera.request.exaggeration
-    )
+    light = address.look.light(camera.request.exaggeration)
     layers = open_layers(address.look.contents, ground, light, address.heights)
     matrix = None if address.matrix is None else MatrixFile(Path(address.matrix))
-    photo = None if address.look.photo is None else ViewPhoto.open(address.look.photo, camera.target.bundle.size)
+    photo = None if address.photo is None else ViewPhoto.open(address.photo, camera.target.bundle.size)
     surface = seen_surface(ground, address.farthest, address.bound)
     return OpenView(
         target=camera.target,
@@ -498,55 +424,8 @@ def first_look(target: ViewTarget, surface: SeenSurface) -> FirstLook:
 TILE = 512
 
 
-@dataclass(frozen=True)
-class ViewRequest:
-    """What is asked."""
-
-    source: Path
-    """Project file or terrain model."""
-    camera: CameraRequest | None
-    """None: that of `matrix`."""
-    output: Path | None = None
-    """The picture (``.png``, ``.jpg`` or ``.tif``), or the matrix (``.tif``); None: nothing is written."""
-    look: LookRequest = field(default_factory=LookRequest)
-    kind: str = "picture"
-    """`picture` or `matrix`."""
-    matrix: Path | None = None
-    """A coordinate matrix of the same view: nothing is looked for again."""
-    farthest: float = math.inf
-    """Beyond this distance nothing is seen, metres."""
-    bound: float = 0.01
-    """Largest error of ground coordinates across the line of sight, metres."""
-    crs: str | None = None
-    """CRS of a terrain model that does not state it."""
-    water: float | None = None
-    """Height of water that covers what is lower or has none, metres."""
-    force: bool = False
-    """Also where the point of view lies below the ground."""
-    lines: tuple[LinesRequest, ...] = ()
-    """What is drawn over the picture."""
-    text_size: float = 13.0
-    """Of labels, pixels."""
-    lettering: Lettering | None = None
-    """What draws texts; None: points have no labels."""
-    svg: Path | None = None
-    """A file for what is drawn, over the picture."""
-    stereo: Stereo | None = None
-    """A pair of pictures instead of one."""
-
-    def __post_init__(self) -> None:
-        if self.stereo is not None and (self.matrix or self.svg or self.look.photo or self.kind == "matrix"):
-            raise UsageError("a stereo pair has two cameras; give no matrix, `photo` or `svg`")
-        if self.svg is not None and not self.lines:
-            raise UsageError(f"{self.svg}: nothing is drawn; give `lines`, too")
-        if self.svg is not None and self.svg.suffix.lower() != ".svg":
-            raise UsageError(f"{self.svg}: what is drawn is written as .svg")
-        if not 4 <= self.text_size <= 400:
-            raise UsageError(f"`text_size` {self.text_size} pixels; 4 to 400 are allowed")
-
-
 @dataclass(frozen=True, eq=False)
-class ViewPlan:
+class ViewPlan(Result):
     """A view before its pixels."""
 
     request: ViewRequest
@@ -558,7 +437,7 @@ class ViewPlan:
     @property
     def placement(self) -> Placement:
         """Of what is written: wider than the picture where a photo lies beside it."""
-        photo, (width, height) = self.address.look.photo, self.camera.target.bundle.size
+        photo, (width, height) = self.address.photo, self.camera.target.bundle.size
         beside = (photo is not None and photo.how == "beside") or (self.stereo is not None and self.stereo.beside)
         return Placement((2 * width if beside else width, height))
 
@@ -570,7 +449,7 @@ class ViewPlan:
     @property
     def stereo(self) -> Stereo | None:
         """How a pair is made, its base in metres; None: there is one picture."""
-        return None if self.request.stereo is None else self.request.stereo.stated(self.first.nearest)
+        return None if self.request.pair is None else self.request.pair.stated(self.first.nearest)
 
     @property
     def field_of_view(self) -> tuple[float, float]:
@@ -585,8 +464,43 @@ class ViewPlan:
         across, along = (float(np.degrees(np.arccos(np.clip(d[k] @ d[k + 1], -1, 1)))) for k in (0, 2))
         return across, along
 
+    def written(self) -> Sequence[Path]:
+        """Return no file: none is written."""
+        return ()
+
+    def summary(self) -> Sequence[str]:
+        """Return the standpoint, the camera, and what a first look sees."""
+        x, y, z = self.camera.target.center
+        request, first = self.camera.request, self.first
+        width, height = self.camera.target.bundle.size
+        across, along = self.field_of_view
+        what = f"azimuth {request.azimuth:.3f}°, pitch {request.pitch:.3f}°" if request.image is None else ""
+        upright = f" × {along:.4g}" if along == along else ""
+        earth = "flat earth"
+        if request.image and self.camera.target.warps and self.camera.earth_radius is None:
+            earth = "earth and refraction as the project has them"
+        elif self.camera.earth_radius is not None:
+            k = USUAL_REFRACTION if request.refraction is None else request.refraction
+            earth = f"{request.curvature or 'bend'}: R = {self.camera.earth_radius / 1000:.0f} km, k = {k:g}"
+        if request.exaggeration != 1:
+            earth += f"; heights × {request.exaggeration:g} about {request.reference:.2f} m"
+        if self.stereo is not None:
+            earth += f"; {self.stereo.how}, base {self.stereo.base:g} m"
+        ground = "no ground is seen"
+        if first.nearest is not None:
+            ground = (
+                f"ground at {first.nearest:.4g} to {first.farthest:.4g} m, heights {first.lowest:.6g} to "
+                f"{first.highest:.6g} m, pixel {first.pixel:.3g} m in the median, {1 - first.ground:.0%} sky"
+            )
+        return [
+            f"standpoint {x:.2f} {y:.2f} {z:.2f}, {self.camera.above_ground:.2f} m above ground",
+            f"{what or f'image {request.image}'}; field of view {across:.4g}{upright}°; {width} × {height} pixels; "
+            f"{earth}",
+            ground,
+        ]
+
     def json_fields(self) -> dict[str, Any]:
-        """What will be seen."""
+        """Return what will be seen."""
         return {
             **self.camera.json_fields(),
             "size": list(self.camera.target.bundle.size),
@@ -613,7 +527,7 @@ def plan_view(request: ViewRequest) -> ViewPlan:
         The point of view lies below the ground, or sees none of it.
     """
     ground = open_view_ground(request.source, request.crs, request.water)
-    camera = view_camera(camera_request(request), ground, request.force)
+    camera = view_camera(camera_request(request, request.matrix), ground, request.force)
     _check_driver(request)
     surface = seen_surface(ground, request.farthest, request.bound)
     first = first_look(camera.target, surface)
@@ -621,13 +535,12 @@ def plan_view(request: ViewRequest) -> ViewPlan:
         raise GeometryError(_sees_nothing(camera, ground))
     heights = (0.0, 1.0) if first.lowest is None or first.highest is None else _rounded(first.lowest, first.highest)
     contents = () if request.kind == "matrix" else request.look.contents
-    light = Lighting(
-        azimuth=request.look.azimuth, altitude=request.look.altitude, exaggeration=camera.request.exaggeration
-    )
-    layers = open_layers(contents, ground, light, heights)
+    if contents and ground.project is not None and "contents" not in request.look.model_fields_set:
+        contents = (ContentRequest("photos"),)
+    layers = open_layers(contents, ground, request.look.light(camera.request.exaggeration), heights)
     matrix = None if request.matrix is None else _fitting(request.matrix, camera)
     files = dict.fromkeys([*ground.files, *(f for each in layers for f in each.files)])
-    photo = None if request.look.photo is None else ViewPhoto.open(request.look.photo, camera.target.bundle.size)
+    photo = None if request.photo is None else ViewPhoto.open(request.photo, camera.target.bundle.size)
     files |= {each: None for each in (matrix, None if photo is None else photo.reader.path) if each is not None}
     files |= {each.path: None for each in request.lines if each.path is not None}
     inputs = [input_entry(path) for path in files]
@@ -636,34 +549,36 @@ def plan_view(request: ViewRequest) -> ViewPlan:
         crs=request.crs,
         water=request.water,
         camera=camera.request,
-        look=replace(request.look, contents=contents),
+        look=request.look.replace(contents=contents),
+        photo=request.photo,
         heights=heights,
         farthest=request.farthest,
         bound=request.bound,
         matrix=None if matrix is None else str(matrix.resolve()),
         digests=tuple((str(Path(each["path"]).resolve()), each["sampled_sha256"]) for each in inputs),
     )
-    told: list[Any] = [camera.request, _look_facts(address.look), heights, request.farthest, request.bound, TILE]
+    told: list[Any] = [camera.request, _look_facts(address), heights, request.farthest, request.bound, TILE]
     if request.water is not None:
         told.append(("water", request.water))
     if request.lines:
         drawn = [(each.layer, each.interval, each.options) for each in request.lines]
         told += [drawn, request.text_size, request.lettering is not None]
-    if request.stereo is not None:
-        pair = request.stereo.stated(first.nearest)
+    if request.pair is not None:
+        pair = request.pair.stated(first.nearest)
         told += [pair, eyes(camera, pair.metres)]
     return ViewPlan(
         request=request, camera=camera, first=first, address=address, key=run_key(f"view {request.kind}", told, inputs)
     )
 
 
-def camera_request(request: ViewRequest) -> CameraRequest:
-    """The camera that is stated, or that of the matrix."""
-    if request.camera is not None:
-        return request.camera
-    if request.matrix is None:
+def camera_request(request: SightRequest, matrix: Path | None = None) -> CameraRequest:
+    """Return the camera that is stated, or that of the matrix."""
+    camera = None if request.camera is None else request.camera.read()
+    if camera is None and matrix is not None:
+        return CameraRequest.from_dict(_stated_camera(MatrixFile(matrix)), str(matrix))
+    if camera is None or (camera.image is None and camera.position is None):
         raise UsageError("a view needs one `camera`: an image of the project, or a standpoint `position` X Y")
-    return CameraRequest.from_dict(_stated_camera(MatrixFile(request.matrix)), str(request.matrix))
+    return camera
 
 
 def _stated_camera(file: MatrixFile) -> dict[str, Any]:
@@ -683,12 +598,14 @@ def _fitting(path: Path, camera: ViewCamera) -> Path:
     return path
 
 
-def _look_facts(look: LookRequest) -> dict[str, Any]:
-    """What decides colours: of files the content counts, which is among the inputs."""
+def _look_facts(address: ViewAddress) -> dict[str, Any]:
+    """Return what decides colours: of files the content counts, which is among the inputs."""
     contents = [
-        (each.kind, "" if each.kind == "raster" else each.value, each.opacity, each.classes) for each in look.contents
+        (each.kind, "" if each.kind == "raster" else each.value, each.opacity, each.classes)
+        for each in address.look.contents
     ]
-    return {**vars(look), "contents": contents, "photo": look.photo and (look.photo.how, look.photo.opacity)}
+    photo = address.photo and (address.photo.how, address.photo.opacity)
+    return {**address.look.json_fields(), "contents": contents, "photo": photo}
 
 
 def _check_driver(request: ViewRequest) -> None:
@@ -714,6 +631,51 @@ def _sees_nothing(camera: ViewCamera, ground: ViewGround) -> str:
         f"from {x:.2f} {y:.2f} {z:.2f} no ground is seen; the terrain is {covered}. Check position, height and "
         "direction (or say `force` for a picture of the sky)"
     )
+
+
+@dataclass(frozen=True, eq=False)
+class ViewReport(Result):
+    """A view that was made."""
+
+    plan: ViewPlan
+    made: ViewResult
+
+    def json_fields(self) -> dict[str, Any]:
+        """Return counts of rays, and the view."""
+        return {**self.made.json_fields(), "view": self.plan}
+
+    def written(self) -> Sequence[Path]:
+        """Return the picture, and the layer of what is drawn."""
+        return [path for path in (self.made.path, self.made.svg) if path is not None]
+
+    def messages(self) -> Sequence[str]:
+        """Return what is drawn, and how much is sky."""
+        made, lines = self.made, []
+        if (d := made.drawn) is not None:
+            room = f", no room for {d.unplaced}" if d.unplaced else ""
+            lines.append(f"{d.seen} of {d.features} lines and points are seen; {d.labels} labels{room}")
+        near = "" if made.nearest is None else f"; ground from {made.nearest:.4g} to {made.farthest:.6g} m"
+        lost = made.lost / made.rays
+        beyond = f" ({lost:.1%} downwards, past the terrain's border or through holes)" if lost else ""
+        size = f"{made.size[0]} × {made.size[1]} pixels in {made.seconds:.1f} s"
+        return [*lines, f"{size}, {made.sky / made.rays:.1%} sky{beyond}{near}"]
+
+
+def view_picture(request: ViewRequest, events: Events = SILENT) -> ViewPlan | ViewReport:
+    """Plan and make a picture; a run that was killed is continued by the same request. For errors see `make_view`."""
+    if request.output is None and not request.dry_run:
+        raise UsageError("no `output`; give the name of the picture, or `dry_run`")
+    plan = plan_view(request)
+    if request.dry_run:
+        return plan
+    for line in plan.summary():
+        events.talk(line)
+    return ViewReport(plan, make_view(plan, Run.of(request, events)))
+
+
+def view_matrix(request: MatrixRequest, events: Events = SILENT) -> ViewPlan | ViewReport:
+    """Plan and make the ground of every pixel of a view, a raster of nine bands. For errors see `make_view`."""
+    return view_picture(request.part(ViewRequest, kind="matrix"), events)
 
 
 def make_view(plan: ViewPlan, run: Run) -> ViewResult:
@@ -850,7 +812,10 @@ def _complete(
         run=ran,
         kind=f"view {plan.request.kind}",
         product=result,
-        settings={"look": plan.address.look, "farthest": plan.request.farthest},
+        settings={
+            "look": {**plan.address.look.json_fields(), "photo": plan.address.photo},
+            "farthest": plan.request.farthest,
+        },
         view=plan,
         bytes=made.bytes,
     )

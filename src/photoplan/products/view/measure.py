@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from photoplan.engine.executors import available_cpus
 from photoplan.engine.run import steps
 from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.product import check_output
 from photoplan.io.store import recording
@@ -23,7 +25,8 @@ from photoplan.io.vector_layer import label_polygons, write_features
 from photoplan.plain import pick as attributes
 from photoplan.products.dtm.rasters import GridOptions, write_grid
 from photoplan.products.view.camera import ViewCamera, ViewGround, open_view_ground, view_camera
-from photoplan.products.view.make import ViewRequest, camera_request, seen_surface
+from photoplan.products.view.make import camera_request, seen_surface
+from photoplan.requests.view import AreaRequest, PickRequest
 from photoplan.surfaces.seen import LinesOfSight, Seen, ground_size
 
 #: Side of the windows in which places are asked, pixels.
@@ -36,21 +39,8 @@ SEEN, HIDDEN, NO_TERRAIN = 1, 0, 255
 
 
 @dataclass(frozen=True)
-class AreaRequest:
-    """What is asked."""
-
-    view: ViewRequest
-    output: Path
-    """``.tif``: 1 seen, 0 not seen, 255 no terrain; ``.gpkg``: a multipolygon along the edges of those pixels."""
-    resolution: float | None = None
-    """Side of a pixel of the map, metres; None: a thousandth of its longer side, rounded to 1, 2 or 5."""
-    workers: int | None = None
-    overwrite: bool = False
-
-
-@dataclass(frozen=True)
-class VisibleArea:
-    """What came out."""
+class VisibleArea(Result):
+    """Areas of the map that a view shows."""
 
     output: Path
     seen: float
@@ -59,8 +49,14 @@ class VisibleArea:
     """Area of the map with terrain, m²."""
     resolution: float
 
+    def messages(self) -> Sequence[str]:
+        """Return the areas."""
+        share = self.seen / self.looked_at if self.looked_at else 0.0
+        areas = f"{self.seen / 1e6:.6g} of {self.looked_at / 1e6:.6g} km² are seen ({share:.1%})"
+        return [f"{areas}; pixel {self.resolution:g} m"]
+
     def json_fields(self) -> dict[str, Any]:
-        """Areas in m²."""
+        """Return areas in m²."""
         return attributes(self, "output", "resolution", visible_area="seen", area="looked_at")
 
 
@@ -79,17 +75,17 @@ def visible_area(request: AreaRequest, events: Events = SILENT) -> VisibleArea:
     GeometryError
         The point of view lies below the ground.
     """
-    view, output = request.view, request.output
+    output = request.output
     if output.suffix.lower() not in (".tif", ".tiff", ".gpkg"):
         raise UsageError(f"{output}: a visible area is written as .tif (a raster) or .gpkg (a polygon)")
-    inputs = [each for each in (view.source, view.matrix) if each is not None]
+    inputs = request.files_read()
     check_output(output, inputs, overwrite=request.overwrite)
     with recording("view area", request, inputs) as record:
-        ground = open_view_ground(view.source, view.crs, view.water)
+        ground = open_view_ground(request.source, request.crs, request.water)
         check_output(output, ground.files, overwrite=request.overwrite)
-        camera = view_camera(camera_request(view), ground, view.force)
+        camera = view_camera(camera_request(request, request.matrix), ground, request.force)
         grid = _grid(request, ground, camera)
-        sight = LinesOfSight(camera.target, seen_surface(ground, view.farthest, view.bound))
+        sight = LinesOfSight(camera.target, seen_surface(ground, request.farthest, request.bound))
         found = _all(partial(window_of_area, sight, grid), grid, request, events)
         result = VisibleArea(
             output,
@@ -129,7 +125,7 @@ def _all(window_of: Any, grid: MapGrid, request: AreaRequest, events: Events) ->
 
 def _grid(request: AreaRequest, ground: ViewGround, camera: ViewCamera) -> MapGrid:
     """The map of all terrain that is not too far away."""
-    far, (x, y, _) = request.view.farthest, camera.target.center.tolist()
+    far, (x, y, _) = request.farthest, camera.target.center.tolist()
     box = np.array([x - far, y - far, x + far, y + far])
     if ground.bounds is not None:
         box[:2], box[2:] = np.maximum(box[:2], ground.bounds[:2]), np.minimum(box[2:], ground.bounds[2:])
@@ -167,7 +163,7 @@ def _write_raster(
 ) -> None:
     options = GridOptions(
         kind="view area",
-        settings={**camera.json_fields(), "farthest_m": request.view.farthest, "error_bound_m": request.view.bound},
+        settings={**camera.json_fields(), "farthest_m": request.farthest, "error_bound_m": request.bound},
         inputs=ground.files,
         workers=request.workers,
         overwrite=request.overwrite,
@@ -182,22 +178,6 @@ _SAME, _SAME_METRES = 1e-5, 0.05
 #: Columns and rows beyond this belong to no picture.
 _FAR = 1e6
 NUMBERS = ("x", "y", "E", "N", "H", "distance", "incidence_deg", "pixel_m")
-
-
-@dataclass(frozen=True)
-class PickRequest:
-    """What is asked."""
-
-    view: ViewRequest
-    pixels: tuple[tuple[float, float], ...] = ()
-    """Column, row."""
-    points: tuple[tuple[float, ...], ...] = ()
-    """X, Y or X, Y, Z; without Z on the ground."""
-    file: Path | None = None
-    """More ground points: a table with columns x, y and optionally z, name."""
-    output: Path | None = None
-    """Table of what was picked; None: it is only returned."""
-    overwrite: bool = False
 
 
 @dataclass(frozen=True)
@@ -221,13 +201,42 @@ class Picked:
     seen: bool
     """Of a pixel whether it shows ground; of a point whether it is in the picture and nothing hides it."""
 
+    def __str__(self) -> str:
+        if self.E != self.E:
+            return f"{self.name}: {self.x:.3f} {self.y:.3f} = sky: sky"
+        if self.H != self.H:
+            return f"{self.name}: {self.E:.3f} {self.N:.3f}: not seen (the terrain has no height there)"
+        where = f"{self.E:.3f} {self.N:.3f} {self.H:.3f}"
+        if self.x != self.x:
+            return f"{self.name}: behind the camera = {where}: not seen"
+        state = self.surface if self.seen else f"not seen ({self.surface})"
+        away = f"{self.distance:.2f} m away, pixel {self.pixel_m:.3g} m"
+        return f"{self.name}: {self.x:.3f} {self.y:.3f} = {where}: {state}, {away}"
+
     def json_fields(self) -> dict[str, Any]:
-        """All of it."""
+        """Return all of it."""
         return vars(self)
 
 
+@dataclass(frozen=True)
+class PickReport(Result):
+    """Pixels and points with the ground that belongs to them."""
+
+    picked: tuple[Picked, ...]
+    output: Path | None
+
+    def summary(self) -> Sequence[str]:
+        """Return a line for each, unless they are written as a table."""
+        return [str(each) for each in self.picked] if self.output is None else ()
+
+
 def pick(request: PickRequest) -> tuple[Picked, ...]:
-    """Ground of pixels, and pixels of ground points, in the order of the request.
+    """Return the ground of pixels, and pixels of ground points, in the order of the request; see `pick_points`."""
+    return pick_points(request).picked
+
+
+def pick_points(request: PickRequest, events: Events = SILENT) -> PickReport:
+    """Find the ground of pixels, and pixels of ground points, and write them as a table if it is asked for.
 
     Raises
     ------
@@ -244,11 +253,10 @@ def pick(request: PickRequest) -> tuple[Picked, ...]:
         if not max(abs(x), abs(y)) <= _FAR:
             raise UsageError(f"`pixel` {x:g} {y:g}; positions up to {_FAR:g} are allowed, also outside the picture")
     if request.output is not None:
-        check_output(request.output, [request.view.source], overwrite=request.overwrite)
-    inputs = [request.view.source, request.file, request.view.matrix]
-    with recording("view pick", request, inputs) as record:
-        ground = open_view_ground(request.view.source, request.view.crs, request.view.water)
-        camera = view_camera(camera_request(request.view), ground, request.view.force)
+        check_output(request.output, [request.source], overwrite=request.overwrite)
+    with recording("view pick", request, request.files_read()) as record:
+        ground = open_view_ground(request.source, request.crs, request.water)
+        camera = view_camera(camera_request(request, request.matrix), ground, request.force)
         found = [*_of_pixels(request, ground, camera), *_of_points(request, ground, camera)]
         if request.output is not None:
             write_table(
@@ -257,13 +265,13 @@ def pick(request: PickRequest) -> tuple[Picked, ...]:
                 [[_text(v) for v in vars(each).values()] for each in found],
             )
         record([request.output], {"camera": camera, "picked": len(found), "seen": sum(each.seen for each in found)})
-    return tuple(found)
+    return PickReport(tuple(found), request.output)
 
 
 def _of_pixels(request: PickRequest, ground: ViewGround, camera: ViewCamera) -> list[Picked]:
     if not request.pixels:
         return []
-    surface = seen_surface(ground, request.view.farthest, request.view.bound)
+    surface = seen_surface(ground, request.farthest, request.bound)
     seen = surface.at(camera.target, np.array(request.pixels, float))
     names = [f"pixel {k}" for k in range(1, len(request.pixels) + 1)]
     return _told(names, ground, camera, seen, seen.owner >= 0)
@@ -275,12 +283,12 @@ def _of_points(request: PickRequest, ground: ViewGround, camera: ViewCamera) -> 
         return []
     target = camera.target
     uvh = target.to_view(XYZ)
-    surface = seen_surface(ground, request.view.farthest, request.view.bound)
+    surface = seen_surface(ground, request.farthest, request.bound)
     met = surface.at(target, uvh[:, :2])
     with np.errstate(invalid="ignore"):
         inside = ((uvh[:, :2] >= -0.5) & (uvh[:, :2] <= np.array(target.bundle.size) - 0.5)).all(axis=1)
         free = ~(met.uvh[:, 2] < uvh[:, 2] * (1 - _SAME) - _SAME_METRES)
-    shown = inside & free & (uvh[:, 2] > 0) & (target.distance(uvh) <= request.view.farthest)
+    shown = inside & free & (uvh[:, 2] > 0) & (target.distance(uvh) <= request.farthest)
     own = Seen(XYZ=XYZ, uvh=uvh, normal=met.normal, towards=met.towards, owner=met.owner, lost=met.lost)
     return _told(names, ground, camera, own, shown)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,44 +26,16 @@ from photoplan.io.tables import Columns, read_table
 from photoplan.matching.features import GreyImage
 from photoplan.matching.sky_edge import edge_strength, sky_edge
 from photoplan.orientation.skyline import SkylineFit, fit_skyline
-from photoplan.products.view.camera import CameraRequest, ViewCamera, ViewGround, map_axes
+from photoplan.products.view.camera import ViewCamera, ViewGround, map_axes
 from photoplan.products.view.content import Colours, Overlay, OverlayFacts, grey_span, in_colours
 from photoplan.products.view.lines import LineStyle
 from photoplan.project.cameras import stated_pose
+from photoplan.requests.view import CameraRequest, PhotoRequest, SkylineRequest
 from photoplan.surfaces.seen import Seen
 from photoplan.targets.view import FrameBundle, ViewTarget
 
-HOWS = ("over", "squares", "beside")
 #: Squares along the longer side of a picture.
 _SQUARES = 16
-
-
-@dataclass(frozen=True)
-class PhotoRequest:
-    """A photograph that has the pixels of the picture."""
-
-    path: str
-    how: str = "over"
-    """One of `HOWS`."""
-    opacity: float = 0.5
-    """Of what lies over the picture."""
-
-    def __post_init__(self) -> None:
-        if self.how not in HOWS:
-            raise UsageError(f"photo {self.path}: {self.how!r}; allowed are {', '.join(HOWS)}, or an opacity")
-        if not 0 < self.opacity <= 1:
-            raise UsageError(f"photo {self.path}: opacity {self.opacity}; above 0 and up to 1")
-
-    @classmethod
-    def parse(cls, text: str) -> PhotoRequest:
-        """From ``FILE``, ``FILE@OPACITY``, ``FILE@squares`` or ``FILE@beside``."""
-        head, _, tail = text.rpartition("@")
-        if not head or Path(text).is_file():
-            return cls(text)
-        try:
-            return cls(head, "over", float(tail))
-        except ValueError:
-            return cls(head, tail)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,38 +97,6 @@ _OF_TERRAIN, _OF_PHOTO = (230, 60, 0), (0, 90, 200)
 
 
 @dataclass(frozen=True)
-class PhotoSkylineRequest:
-    """What is asked of a photograph."""
-
-    photo: Path
-    """It has the pixels of the picture."""
-    border: int = 0
-    """Pixels along its edges that are no picture."""
-    search: int | None = None
-    """Rows above and below the skyline of the terrain where the edge is looked for; None: a tenth of the height."""
-    control: Path | None = None
-    """A table of points in the photograph and on the ground: x, y, E, N, H, name."""
-    picture: Path | None = None
-    """The photograph with both lines, PNG."""
-    refine: bool = False
-    """Whether the camera is turned until both agree."""
-    focal: bool = False
-    """Whether its camera constant changes, too."""
-    refined: Path | None = None
-    """A TOML file for the camera found: a standpoint's camera, or the orientation of an image."""
-
-    def __post_init__(self) -> None:
-        for name in ("focal", "refined"):
-            if getattr(self, name) and not self.refine:
-                raise UsageError(f"`{name}` belongs to a camera that is turned; say `refine`, too")
-        if self.border < 0 or (self.search is not None and self.search < 2):
-            raise UsageError(f"`border` {self.border}, `search` {self.search}; pixels from 0 and from 2 are needed")
-        for path, suffix in ((self.picture, ".png"), (self.refined, ".toml")):
-            if path is not None and path.suffix.lower() != suffix:
-                raise UsageError(f"{path}: is written as {suffix}")
-
-
-@dataclass(frozen=True)
 class ControlResidual:
     """A point of control in the photograph."""
 
@@ -206,9 +146,7 @@ class PhotoMatch:
         return out
 
 
-def against_photo(
-    request: PhotoSkylineRequest, camera: ViewCamera, find: Finder
-) -> tuple[PhotoMatch, PhotoMatch | None]:
+def against_photo(request: SkylineRequest, camera: ViewCamera, find: Finder) -> tuple[PhotoMatch, PhotoMatch | None]:
     """Both lines with the camera as it is, and with the one that the skyline asks for; None: that was not asked for."""
     target, size = camera.target, camera.target.bundle.size
     if camera.request.exaggeration != 1.0:
@@ -285,7 +223,7 @@ def _control(path: Path) -> tuple[list[str], _Floats, _Floats]:
 
 
 def _matched(
-    request: PhotoSkylineRequest, reader: RasterReader, control: Any, target: ViewTarget, line: Seen, search: int
+    request: SkylineRequest, reader: RasterReader, control: Any, target: ViewTarget, line: Seen, search: int
 ) -> PhotoMatch:
     edge = _edge(request, reader, line, search)
     residuals = edge[line.uvh[:, 0].astype(int)] - line.uvh[:, 1]
@@ -297,7 +235,7 @@ def _matched(
     return PhotoMatch(edge=edge, residuals=residuals, control=points, target=target, line=line)
 
 
-def _edge(request: PhotoSkylineRequest, reader: RasterReader, line: Seen, search: int) -> _Floats:
+def _edge(request: SkylineRequest, reader: RasterReader, line: Seen, search: int) -> _Floats:
     """Rows of the sky's edge around a skyline, shape (width,)."""
     width, height = reader.size
     x, y = line.uvh[:, 0].astype(int), line.uvh[:, 1]
@@ -440,10 +378,9 @@ def _camera_text(request: CameraRequest, after: _Floats) -> str:
     """A file that is taken in place of an image as the camera of a view."""
     names = ("azimuth", "pitch", "roll", "field_of_view")
     values: dict[str, Any] = dict(zip(names, (round(float(v), 7) for v in after)))
-    found = replace(request, **values)
+    found = request.replace(**values)
     lines = ["# A camera of views, turned onto the skyline of a photograph; angles in degrees, lengths in metres."]
-    stated = ((f.name, getattr(found, f.name)) for f in fields(found))
-    told = ((n, list(v) if isinstance(v, tuple) else v) for n, v in stated if v is not None)
+    told = ((n, list(v) if isinstance(v, tuple) else v) for n, v in found.json_fields().items() if v is not None)
     return "\n".join([*lines, *(f"{n} = {toml_value(v)}" for n, v in told), ""])
 
 

@@ -12,55 +12,57 @@ from typing import Any
 from photoplan.engine.executors import Workers
 from photoplan.engine.run import Kept, Work
 from photoplan.errors import PhotoplanError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.io.product import check_output
 from photoplan.io.store import give_name, recorded_result, run_key, scratch, together
 from photoplan.products.run import Run
-from photoplan.products.view.camera import CameraRequest, open_view_ground
+from photoplan.products.view.camera import open_view_ground
 from photoplan.products.view.lines import cameras, stations
-from photoplan.products.view.make import ViewPlan, ViewRequest, plan_view, view_work
+from photoplan.products.view.make import ViewPlan, plan_view, view_work
+from photoplan.requests.view import CameraRequest, SequenceRequest, ViewRequest
+
+
+@dataclass(frozen=True, eq=False)
+class SequencePlan(Result):
+    """Pictures of a sequence before they are made."""
+
+    plans: list[ViewPlan]
+
+    def written(self) -> list[Path]:
+        """Return no file: none is written."""
+        return []
+
+    def summary(self) -> list[str]:
+        """Return how many pictures there are, and the first and the last of them."""
+        first, last = self.plans[0], self.plans[-1]
+        return [f"{len(self.plans)} pictures, the first and the last of them:", *first.summary(), *last.summary()]
+
+    def json_fields(self) -> dict[str, Any]:
+        """Return counts, and the first and the last picture."""
+        tiles = sum(len(plan.tiles) for plan in self.plans)
+        return {"frames": len(self.plans), "tiles": tiles, "first": self.plans[0], "last": self.plans[-1]}
 
 
 @dataclass(frozen=True)
-class SequenceRequest:
-    """What is asked."""
-
-    view: ViewRequest
-    """All pictures have this look; it has no camera of its own and no output."""
-    template: CameraRequest
-    """The camera but for its standpoint."""
-    path: Path
-    output: Path
-    """A folder for `frame_00001.png` and so on."""
-    along: bool = False
-    """Whether it looks along the path, whatever azimuth it has."""
-    layer: str | None = None
-    step: float | None = None
-    """Between stations of a line, metres."""
-    video: Path | None = None
-    """A film ``.mp4`` of the pictures, made by ffmpeg."""
-    rate: float = 25.0
-    """Pictures of the film per second."""
-
-    def __post_init__(self) -> None:
-        if self.video is not None and self.video.suffix.lower() != ".mp4":
-            raise UsageError(f"{self.video}: a film is written as .mp4")
-        if not 0.1 <= self.rate <= 240:
-            raise UsageError(f"`rate` {self.rate}; 0.1 to 240 pictures per second are allowed")
-        if self.view.stereo is not None and self.view.stereo.base is None:
-            raise UsageError("pairs of a sequence have one `base`; state it")
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """What came out."""
+class Sequence(Result):
+    """Pictures of a sequence, and the film of them."""
 
     frames: tuple[Path, ...]
     kept: int
     """Pictures of an earlier run."""
     video: Path | None
 
+    def written(self) -> list[Path]:
+        """Return the film, or the folder of the pictures."""
+        return [self.frames[0].parent if self.video is None else self.video]
+
+    def messages(self) -> list[str]:
+        """Return how many pictures there are."""
+        return [f"{len(self.frames)} pictures in {self.frames[0].parent}, {self.kept} of them of an earlier run"]
+
     def json_fields(self) -> dict[str, Any]:
-        """Files and counts."""
+        """Return files and counts."""
         folder = self.frames[0].parent
         return {"folder": folder, "frames": len(self.frames), "kept": self.kept, "video": self.video}
 
@@ -82,14 +84,14 @@ def plan_sequence(request: SequenceRequest) -> list[ViewPlan]:
             f"{request.video}: a film needs ffmpeg, which is not found on the PATH; install it, or leave `video` out "
             "(the pictures are numbered, so that any program can join them)"
         )
-    places = stations(
-        request.path, request.layer, request.step, open_view_ground(request.view.source, request.view.crs)
-    )
+    places = stations(request.path, request.layer, request.step, open_view_ground(request.source, request.crs))
+    looking = {"azimuth": 0.0} if request.along else {}
+    template = (request.camera or CameraRequest()).part(CameraRequest, position=(0.0, 0.0), **looking)
     plans = []
-    for k, camera in enumerate(cameras(request.template, places, request.along), 1):
+    for k, camera in enumerate(cameras(template, places, request.along), 1):
         name = request.output / f"frame_{k:05d}.png"
         try:
-            plans.append(plan_view(replace(request.view, camera=camera, output=name)))
+            plans.append(plan_view(request.part(ViewRequest, camera=camera, output=name)))
         except PhotoplanError as error:
             raise type(error)(f"picture {k} of {len(places)}: {error}") from None
     # One range of heights for all, or colours would change from one picture to the next.
@@ -101,6 +103,14 @@ def plan_sequence(request: SequenceRequest) -> list[ViewPlan]:
         )
         for plan in plans
     ]
+
+
+def view_sequence(request: SequenceRequest, events: Events = SILENT) -> SequencePlan | Sequence:
+    """Plan and make pictures along a path, and a film of them; those that are there already are kept. For errors see
+    `make_sequence`.
+    """
+    plans = plan_sequence(request)
+    return SequencePlan(plans) if request.dry_run else make_sequence(request, plans, Run.of(request, events))
 
 
 def make_sequence(request: SequenceRequest, plans: list[ViewPlan], run: Run) -> Sequence:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,21 +11,23 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from photoplan.events import SILENT, Events
+from photoplan.findings import Result
 from photoplan.io.product import check_output
 from photoplan.io.store import recording
 from photoplan.io.tables import write_table
 from photoplan.io.vector_layer import check_vectors, write_features
 from photoplan.products.view.camera import ViewCamera, ViewGround, open_view_ground, view_camera
-from photoplan.products.view.make import ViewRequest, camera_request, seen_surface
+from photoplan.products.view.make import camera_request, seen_surface
 from photoplan.products.view.photo import (
     PhotoMatch,
-    PhotoSkylineRequest,
     RefinedCamera,
     against_photo,
     draw_match,
     refined_camera,
     write_refined,
 )
+from photoplan.requests.view import SkylineRequest
 from photoplan.surfaces.seen import Seen, skyline_of
 from photoplan.targets.view import ViewTarget
 
@@ -33,20 +36,8 @@ COLUMNS = ("x", "y", "E", "N", "H", "distance", "azimuth_deg")
 OF_PHOTO = ("y_photo", "residual")
 
 
-@dataclass(frozen=True)
-class SkylineRequest:
-    """What is asked."""
-
-    view: ViewRequest
-    output: Path
-    """``.csv``: a table; ``.gpkg``: points on the map."""
-    overwrite: bool = False
-    photo: PhotoSkylineRequest | None = None
-    """A photograph that it is compared with."""
-
-
 @dataclass(frozen=True, eq=False)
-class Skyline:
+class Skyline(Result):
     """The skyline of a view."""
 
     points: NDArray[np.float64]
@@ -55,8 +46,8 @@ class Skyline:
     surfaces: tuple[str, ...]
     """What is there: `terrain`, or the name of an object."""
     columns: int
-    """Of the picture."""
-    output: Path
+    """Width of the picture, pixels."""
+    request: SkylineRequest
     before: PhotoMatch | None = None
     match: PhotoMatch | None = None
     """A photograph beside it, with the camera as stated and with the one that this skyline belongs to; None: there is
@@ -64,9 +55,51 @@ class Skyline:
     refined: RefinedCamera | None = None
     """The camera that the photograph asks for; None: it was not asked."""
 
+    def written(self) -> Sequence[Path]:
+        """Return the skyline, the photograph with both lines, and the camera that was found."""
+        asked = self.request
+        return [path for path in (asked.output, asked.picture, asked.refined) if path is not None]
+
+    def remarks(self) -> Sequence[str]:
+        """Return what speaks against a turn."""
+        return [] if self.match is None or self.match.doubt is None else [self.match.doubt]
+
+    def summary(self) -> Sequence[str]:
+        """Return how much is seen, how far away, and what the photograph says."""
+        lines = [f"none of {self.columns} columns shows ground with sky above it"]
+        if len(self.points):
+            away = self.points[:, 5]
+            lines = [f"{len(self.points)} of {self.columns} columns, {away.min():.0f} to {away.max():.0f} m away"]
+        for name, match in (("as stated", self.before), ("turned", self.match if self.refined else None)):
+            if match is None:
+                continue
+            f = match.figures
+            if "median_px" in f:
+                lines.append(
+                    f"{name}: edge of the sky in {f['columns_compared']} columns, {f['median_distance_px']:.2f} px "
+                    f"from the skyline in the median, shifted by {f['median_px']:+.2f} px, spread "
+                    f"{f['spread_px']:.2f} px"
+                )
+            else:
+                lines.append(f"{name}: no edge of the sky was found near the skyline")
+            if "control_points" in f:
+                worst = max(match.control, key=lambda c: (c.dx == c.dx, abs(c.dx) + abs(c.dy)))
+                lines.append(
+                    f"{name}: {f['control_points']} control points, rms {f['control_rms_px']:.2f} px per coordinate, "
+                    f"largest {worst.name}: {worst.dx:+.2f} {worst.dy:+.2f} px"
+                )
+        if (r := self.refined) is not None:
+            for name, after, sigma, before in zip(r.names, r.after, r.sigma, r.before):
+                lines.append(f"{name} {after:.4f} ±{sigma:.4f} {r.unit} (was {before:.4f})")
+            if r.constant is not None:
+                lines.append(f"camera constant {r.constant[0]:.6f} ±{r.constant[1]:.6f} times that of its camera")
+            err = f"of which about {r.correlated:.0f} err together; the standpoint was held"
+            lines.append(f"from {r.used} columns, {err}")
+        return lines
+
     def json_fields(self) -> dict[str, Any]:
-        """Counts, and what the photograph says."""
-        out = {"output": self.output, "columns": self.columns, "points": len(self.points)}
+        """Return counts, and what the photograph says."""
+        out = {"output": self.request.output, "columns": self.columns, "points": len(self.points)}
         if self.before is not None and self.match is not None:
             out |= {"photo": self.before.figures, "control": self.match.control}
         if self.refined is not None and self.match is not None:
@@ -74,7 +107,7 @@ class Skyline:
         return out
 
 
-def skyline(request: SkylineRequest) -> Skyline:
+def skyline(request: SkylineRequest, events: Events = SILENT) -> Skyline:
     """Find the skyline of a view, compare it with that of a photograph if there is one, and write it.
 
     Raises
@@ -86,22 +119,20 @@ def skyline(request: SkylineRequest) -> Skyline:
     GeometryError
         The point of view lies below the ground, or the skyline does not determine the camera that is to be turned.
     """
-    view, photo = request.view, request.photo
-    inputs = [view.source, view.matrix, *([] if photo is None else [photo.photo, photo.control])]
-    outputs = [request.output, *([] if photo is None else [photo.picture, photo.refined])]
+    inputs = request.files_read()
+    outputs = [path for path in (request.output, request.picture, request.refined) if path is not None]
     for each in outputs:
-        if each is not None:
-            check_output(each, [name for name in inputs if name is not None], overwrite=request.overwrite)
+        check_output(each, inputs, overwrite=request.overwrite)
     if request.output.suffix.lower() != ".csv":
         check_vectors(request.output)
     with recording("view skyline", request, inputs) as record:
-        ground = open_view_ground(view.source, view.crs, view.water)
-        camera = view_camera(camera_request(view), ground, view.force)
-        surface = seen_surface(ground, view.farthest, view.bound)
-        if photo is None:
+        ground = open_view_ground(request.source, request.crs, request.water)
+        camera = view_camera(camera_request(request, request.matrix), ground, request.force)
+        surface = seen_surface(ground, request.farthest, request.bound)
+        if request.photo is None:
             found = _skyline(request, ground, camera.target, skyline_of(camera.target, surface))
         else:
-            matches = against_photo(photo, camera, lambda target, beyond: skyline_of(target, surface, beyond))
+            matches = against_photo(request, camera, lambda target, beyond: skyline_of(target, surface, beyond))
             found = _beside(request, ground, camera, *matches)
         _write(found, ground.crs)
         record(outputs, {"camera": camera, **found.json_fields()})
@@ -115,7 +146,7 @@ def _skyline(request: SkylineRequest, ground: ViewGround, target: ViewTarget, se
     numbers = (seen.uvh[:, 0], seen.uvh[:, 1], *seen.XYZ.T, target.distance(seen.uvh), azimuth)
     names = ("sky", "terrain", *ground.objects)
     surfaces = tuple(names[owner + 1] for owner in seen.owner)
-    return Skyline(np.column_stack(numbers), surfaces, target.bundle.size[0], request.output)
+    return Skyline(np.column_stack(numbers), surfaces, target.bundle.size[0], request)
 
 
 def _beside(
@@ -124,22 +155,22 @@ def _beside(
     """A skyline with what a photograph says of it; the files of both are written."""
     assert request.photo is not None
     last = before if after is None else after
-    refined = None if after is None else refined_camera(camera, after, ground, request.photo.refined)
-    if request.photo.refined is not None and refined is not None:
-        write_refined(request.photo.refined, refined)
-    if request.photo.picture is not None:
-        draw_match(request.photo.picture, request.photo.photo, last)
+    refined = None if after is None else refined_camera(camera, after, ground, request.refined)
+    if request.refined is not None and refined is not None:
+        write_refined(request.refined, refined)
+    if request.picture is not None:
+        draw_match(request.picture, request.photo, last)
     found = _skyline(request, ground, last.target, last.line)
     return replace(found, before=before, match=last, refined=refined)
 
 
 def _write(found: Skyline, crs: str) -> None:
-    if found.output.suffix.lower() == ".csv":
+    if found.request.output.suffix.lower() == ".csv":
         rows = [[*(f"{v:.4f}" for v in row), name] for row, name in zip(found.points.tolist(), found.surfaces)]
         if found.match is not None:
             for row, y, apart in zip(rows, found.points[:, 1], found.match.residuals.tolist()):
                 row += [f"{y + apart:.4f}", f"{apart:.4f}"] if apart == apart else ["", ""]
-        write_table(found.output, (*COLUMNS, "surface", *([] if found.match is None else OF_PHOTO)), rows)
+        write_table(found.request.output, (*COLUMNS, "surface", *([] if found.match is None else OF_PHOTO)), rows)
         return
     columns = {name: found.points[:, k] for k, name in enumerate(COLUMNS) if name not in ("E", "N", "H")}
     shapes = [shapely.Point(row) for row in found.points[:, 2:5].tolist()]
@@ -147,4 +178,4 @@ def _write(found: Skyline, crs: str) -> None:
         apart = found.match.residuals
         columns |= dict(zip(OF_PHOTO, (found.points[:, 1] + apart, apart)))
     columns["surface"] = np.array(found.surfaces, object)
-    write_features(found.output, "Point Z", shapes, columns, crs, "skyline")
+    write_features(found.request.output, "Point Z", shapes, columns, crs, "skyline")
