@@ -57,7 +57,7 @@ class Estimate:
     """One number that was found."""
 
     name: str
-    """As in JSON: small letters with the unit, such as ``read_noise_e``."""
+    """Its name in JSON: small letters with the unit, such as ``read_noise_e``."""
     value: float
     sigma: float = math.nan
     """Its standard deviation; NaN if none can be stated."""
@@ -69,7 +69,7 @@ class Estimate:
     at: str = ""
     """Condition, if there are several: ``500 nm``."""
     remark: str = ""
-    """Such as its source."""
+    """Remark, such as its source."""
     stated: float | None = None
     """Value that is stated elsewhere, to compare."""
 
@@ -131,7 +131,7 @@ class Bars:
     caption: str
     values: Mapping[str, float]
     label: str
-    """Of the values, with their unit."""
+    """Name of the values, with their unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,11 +143,11 @@ class Picture:
     values: NDArray[Any]
     """Shape (h, w)."""
     label: str
-    """Of the scale."""
+    """Name of the scale."""
     points: tuple[tuple[float, float], ...] = ()
     """(x, y) in pixels of `values`; drawn as circles."""
     limits: tuple[float, float] | None = None
-    """Of the scale; None: 0.5 % and 99.5 % of the values."""
+    """Limits of the scale [0.5 % and 99.5 % of the values]."""
     factor: int = 1
     """Side of the block of pixels of which each value is the mean, see `shrunk`; positions count whole pixels."""
     extent: tuple[float, float, float, float] | None = field(default=None)
@@ -163,38 +163,38 @@ def shrunk(values: NDArray[Any]) -> tuple[NDArray[np.float64], int]:
 
 
 def spaced(*parts: str) -> str:
-    """Parts that say something, with spaces between them."""
+    """Return the parts that are not empty, with spaces between them."""
     return " ".join(filter(None, parts))
 
 
 @dataclass(frozen=True)
 class Subject:
-    """Of what figures are: a colour plane and a condition, either of which may be empty."""
+    """Subject of figures: a colour plane and a condition, either of which may be empty."""
 
     plane: str = ""
     at: str = ""
 
     def figure(self, name: str, value: float, sigma: float, label: str, unit: str = "", remark: str = "") -> Estimate:
-        """A figure of it."""
+        """Return a figure of it."""
         return Estimate(
             name=name, value=value, sigma=sigma, label=label, unit=unit, plane=self.plane, at=self.at, remark=remark
         )
 
     def under(self, condition: str) -> Subject:
-        """The same under one more condition."""
+        """Return the same under one more condition."""
         return Subject(self.plane, spaced(self.at, condition))
 
     def named(self, *words: str) -> str:
-        """Words and what it is, as a title or the key of a refusal."""
+        """Return words with the subject, as a title or the key of a refusal."""
         return spaced(*words, self.plane, self.at)
 
     def key(self, word: str) -> str:
-        """The same as a name among the details."""
+        """Return words with the subject as a name among the details."""
         return self.named(word).replace(" ", "_")
 
 
 def known(*figures: Estimate) -> tuple[Estimate, ...]:
-    """Those whose value is known, not NaN."""
+    """Return the figures whose value is known, not NaN."""
     return tuple(figure for figure in figures if math.isfinite(figure.value))
 
 
@@ -217,7 +217,7 @@ class Table:
 
     @classmethod
     def of(cls, caption: str, **columns: Any) -> Table:
-        """Rows of columns by their heads; a text or a number stands in every row, yes and no become 1 and 0."""
+        """Return rows from columns by their heads; a single value stands in every row, yes and no become 1 and 0."""
         lists = {head: v.tolist() if hasattr(v, "tolist") else v for head, v in columns.items()}
         count = next(len(v) for v in lists.values() if isinstance(v, list | tuple))
         filled = (v if isinstance(v, list | tuple) else [v] * count for v in lists.values())
@@ -260,7 +260,7 @@ class Findings:
 
 
 def joined(outcomes: Sequence[Findings]) -> Findings:
-    """Several outcomes (of planes, of wavelengths) as one; later tables of one name are put below earlier ones."""
+    """Join findings of planes or wavelengths; tables of one name are put below each other."""
     tables: dict[str, Table] = {}
     for outcome in outcomes:
         for name, table in outcome.tables.items():
@@ -279,7 +279,7 @@ def joined(outcomes: Sequence[Findings]) -> Findings:
 
 
 class Result:
-    """What an operation returns, a data class; its JSON holds its fields, see `photoplan.plain`."""
+    """Result of an operation, a data class; its JSON holds its fields, see `photoplan.plain`."""
 
     def written(self) -> Sequence[Path]:
         """Return the files that were written; the first is the product. By default all fields that are paths."""

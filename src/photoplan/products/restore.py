@@ -91,7 +91,7 @@ class DesignedPart:
     """The filter of one band in one part of the field."""
 
     band: int | None
-    """None: all bands."""
+    """Its number; None if the filter is for all bands."""
     at: tuple[float, float] | None
     """Column and row of the middle of the part; None: the whole field."""
     edges: int
@@ -101,12 +101,12 @@ class DesignedPart:
     missing: tuple[str, ...]
     """``x`` or ``y`` where no edges show the sharpness along rows or columns and that of the other stands for it."""
     scenes: tuple[SceneStatistics, ...]
-    """What the images may show: more than one where noise and texture are not told apart."""
+    """Scenes that the images may show: more than one if noise and texture cannot be separated."""
     design: Design
 
     @property
     def scene(self) -> SceneStatistics:
-        """What the filter is judged by."""
+        """The scene that the filter is judged by."""
         return self.design.scene or self.scenes[0]
 
     def facts(self) -> dict[str, Any]:
@@ -141,7 +141,7 @@ class MeasuredFilter:
     parts: tuple[DesignedPart, ...]
     mtf: MtfReport
     notes: tuple[str, ...]
-    """What a user should know: edge enhancement, parts of the field without edges."""
+    """Remarks: edge enhancement, parts of the field without edges."""
 
 
 def design_restoration(request: RestoreRequest, events: Events = SILENT) -> MeasuredFilter:
@@ -266,14 +266,14 @@ def _designed(
 
 @dataclass(frozen=True, eq=False)
 class SceneSpectrum:
-    """What images show of their scenes, in their light."""
+    """Statistics of the scenes of images, in their light."""
 
     power: NDArray[np.float64]
     """Mean spectrum of their blocks."""
     noise: float
     """Standard deviation in the most even blocks; 0 if there is none."""
     kept: NDArray[np.float64]
-    """What compression has left of them, shape (8, 8)."""
+    """Part of the frequencies of a block that compression has left, shape (8, 8)."""
 
 
 def _spectrum(images: Sequence[LightImage], channel: int) -> SceneSpectrum:
@@ -304,7 +304,7 @@ def _spectrum(images: Sequence[LightImage], channel: int) -> SceneSpectrum:
 
 
 def _kept(image: LightImage, channel: int) -> NDArray[np.float64]:
-    """What compression has left of an image."""
+    """Return the part of the frequencies that compression has left of an image."""
     size = image.size[0] // BLOCK * BLOCK, image.size[1] // BLOCK * BLOCK
     if image.reader.dtype != np.uint8 or 0 in size:
         return np.ones((BLOCK, BLOCK))
@@ -370,7 +370,7 @@ class FoundFilter:
     origin: str
     """In words: "the file …"; empty: there is no filter."""
     measured: MeasuredFilter | None = None
-    """What was measured, where it was."""
+    """The measurement that it follows from, if there was one."""
 
 
 def requested_filter(request: RestoreRequest, events: Events = SILENT) -> FoundFilter:
@@ -445,7 +445,7 @@ class Job:
     """Digest of image, filter and settings: finished tiles of another key are of no use."""
     nodata: Nodata
     digest: str
-    """Of the image."""
+    """Digest of the image."""
     tools: tuple[Path, ...]
     """Files of the filter and of corrections: with the image they are what the result is made from."""
     inputs: tuple[Path, ...]
@@ -459,7 +459,7 @@ class Job:
 
     @property
     def chromatic_file(self) -> Path:
-        """Where a measured model of lateral chromatic aberration is written."""
+        """File of a measured model of lateral chromatic aberration."""
         return self.target.with_name(self.target.stem.removesuffix("_restored") + "_chromatic.toml")
 
     @property
@@ -470,7 +470,7 @@ class Job:
 
 @dataclass(frozen=True)
 class RestoredImage(Result):
-    """What became of one image."""
+    """One restored image."""
 
     image: str
     path: Path
@@ -562,7 +562,7 @@ def earlier_result(job: Job, settings: dict[str, Any]) -> RestoredImage | None:
 
 @dataclass(frozen=True, eq=False)
 class RestoreJob:
-    """What a worker is told once."""
+    """Restoration of one image, as workers get it once."""
 
     reader: SteppedReader
 
@@ -574,7 +574,7 @@ class RestoreJob:
 
 
 def restoration(job: Job, how: RestoreRequest, events: Events) -> Work[RestoredImage | None]:
-    """What there is to do for an image, or for what an earlier run has left of it."""
+    """Return the work for an image, or for the part of it that an earlier run has left."""
     reader = job.reader
     for note in reader.info.warnings:
         events.talk(f"note: {note}")
@@ -646,7 +646,7 @@ def _complete(
 
 
 def _tags(job: Job) -> dict[str, str]:
-    """What the file itself says of its origin."""
+    """Return the tags that state the origin in the file itself."""
     return {
         "PHOTOPLAN_VERSION": __version__,
         "PHOTOPLAN_IMAGE": job.reader.info.path.name,
@@ -657,7 +657,7 @@ def _tags(job: Job) -> dict[str, str]:
 
 
 def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: ProductFacts) -> dict[str, Any]:
-    """What a person needs to answer for the result, and to make it again."""
+    """Return what is needed to check the result, and to make it again."""
     restorer = restoration_of(job.reader).restorer
     aligned, lit = job.reader.step(AlignStep), job.reader.step(FallOffStep)
     return {
@@ -699,7 +699,7 @@ BASE_MEMORY = 416 * 2**20
 
 @dataclass(frozen=True, eq=False)
 class RestoreReport(Result):
-    """What became of all images."""
+    """Restored images, and why others failed."""
 
     images: tuple[RestoredImage, ...]
     failed: dict[str, str]
@@ -736,7 +736,7 @@ def filter_figures(filter_: RestorationFilter) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class OpticalCorrections:
-    """What is corrected before the filter: light fall-off, then lateral chromatic aberration."""
+    """Corrections before the filter: light fall-off, then lateral chromatic aberration."""
 
     fall_off: FallOffFile | None
     chromatic: ChromaticModel | Literal["measure"] | None
@@ -744,7 +744,7 @@ class OpticalCorrections:
 
     @classmethod
     def of(cls, request: RestoreRequest, light: Linearisation) -> OpticalCorrections:
-        """Those that are asked for, their files read."""
+        """Read the corrections of a request."""
         fall_off = None if request.fall_off is None else load_fall_off(request.fall_off)
         model = load_chromatic(request.chromatic) if isinstance(request.chromatic, Path) else request.chromatic
         return cls(fall_off, cast("ChromaticModel | Literal['measure'] | None", model), light)

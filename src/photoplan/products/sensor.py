@@ -38,7 +38,7 @@ class SensorReport(Result):
 
     described: SensorDescription
     sections: tuple[Findings, ...]
-    """Of each table of the description."""
+    """Figures of each table of the description."""
     csv: Path | None
     """Table that was written."""
 

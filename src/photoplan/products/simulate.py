@@ -52,7 +52,7 @@ _EVEN = BeforeValidator(lambda value: (value, value) if isinstance(value, float 
 
 
 def entry_of(part: Any) -> type[Entry]:
-    """What a TOML table may say of a part: an entry for each field; what is left out stands for the default."""
+    """Return the TOML table of a part: an entry for each field; defaults stand for entries that are left out."""
     kinds = get_type_hints(part)
     entries: dict[str, Any] = {}
     for field in dataclasses.fields(part):
@@ -112,7 +112,7 @@ class SimulatedImage:
 
 
 def is_kept(store: Store, frame: int, path: Path) -> bool:
-    """Whether an earlier run has written a frame, and it is there."""
+    """Return whether an earlier run has written a frame, and it is there."""
     return store.index(("frame", frame)) in store.finished and path.is_file()
 
 
@@ -175,7 +175,7 @@ class SimulateReport(Result):
     bands: int
     dtype: str
     mtf50: tuple[float, float]
-    """What the model puts in, along x and y in the middle of the image, cycles per pixel; NaN: above 20."""
+    """MTF50 of the model along x and y in the middle of the image, cycles per pixel; NaN if above 20."""
     notes: tuple[str, ...]
     record: Path | None
 
@@ -212,9 +212,9 @@ class Forming:
 
     _: KW_ONLY
     kind: str
-    """What they are, for the record."""
+    """Kind of the images, for the record."""
     name: str
-    """Of the scene."""
+    """Name of the scene."""
     scene: LightScene
     model: ImageModel
     dtype: str
@@ -222,13 +222,13 @@ class Forming:
     frames: Sequence[tuple[Path, float]]
     """File and exposure of each."""
     output: Path
-    """What the record and the log of the run stand beside."""
+    """File beside which the record and the log of the run stand."""
     inputs: Sequence[Path]
     """Files that decide what is formed."""
     settings: Mapping[str, Any]
     """All else that does."""
     notes: tuple[str, ...] = ()
-    """What a user should know of the scene."""
+    """Remarks on the scene."""
     workers: int = 1
     overwrite: bool = False
 
@@ -239,11 +239,11 @@ class Forming:
 
     @property
     def begun(self) -> bool:
-        """Whether an earlier run has left what it knew; its frames are among the outputs."""
+        """Whether an earlier run has left its log; its frames are among the outputs."""
         return ResultLog.place(self.output).exists()
 
     def planned(self) -> SimulateReport:
-        """What would be made."""
+        """Return the report of a dry run."""
         for path, _ in self.frames:
             check_output(path, self.inputs, overwrite=self.overwrite)
         return self._report(
@@ -316,7 +316,7 @@ def check_fit(scene: LightScene, name: str, model: ImageModel, described: Path |
 
 
 def _notes(images: list[SimulatedImage]) -> list[str]:
-    """What a user should know of what came out."""
+    """Return remarks on the images."""
     notes = []
     clipped = [i for i in images if i.facts.get("saturated_pixels")]
     if clipped:
@@ -663,7 +663,7 @@ def _works(
 
 
 def _facts(project: Project, name: str | None) -> dict[str, Any]:
-    """What a project says of its scene and of one image; None: of the scene alone."""
+    """Return what a project states of its scene and, unless `name` is None, of one image."""
     said = project.model_dump_json(include={"crs", "terrain", "objects", "orientation"}, exclude_none=True)
     found: dict[str, Any] = json.loads(said)
     if name is not None:

@@ -34,7 +34,7 @@ _LEGEND, _HANDLE = 84, 7
 
 
 def _columns(labels: list[str]) -> int:
-    """How many columns of a legend fit across a chart."""
+    """Return the number of columns of a legend that fit across a chart."""
     wide = [len(label) + _HANDLE for label in labels]
     return len(labels) if sum(wide) <= _LEGEND else max(1, min(4, len(labels), _LEGEND // max(wide)))
 
@@ -139,7 +139,7 @@ def _draw_vectors(axes: Any, x: Array, y: Array, curve: Trace, options: dict[str
 
 
 def _limits(known: NDArray[np.float64]) -> tuple[float, float]:
-    """What a scale shows: nearly all values; where nearly all are equal, all."""
+    """Return the limits of a scale: of nearly all values, or of all if nearly all are equal."""
     if not known.size:
         return 0.0, 1.0
     low, high = (float(v) for v in np.percentile(known, [0.5, 99.5]))

@@ -315,7 +315,7 @@ def _label(group: EdgeGroup) -> str:
 
 
 def _extent(at: Array, value: Array) -> float:
-    """How far a line spread function reaches, pixels; what is drawn."""
+    """Return the distance to which a line spread function is drawn, pixels."""
     large = np.abs(at[np.abs(value) > 0.02 * np.abs(value).max()])
     return float(np.clip(1.6 * large.max(initial=1.0), 3.0, float(np.abs(at).max())))
 
@@ -459,5 +459,5 @@ def _light(result: PatternResult, linearisation: Linearisation) -> NDArray[np.fl
 
 
 def _thinning(window: Window) -> int:
-    """Of how many pixels along a side one is in the picture."""
+    """Return the number of pixels along a side of which one is in the picture."""
     return max(1, -(-max(window.width, window.height) // _SIDE))

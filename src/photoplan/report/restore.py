@@ -229,7 +229,7 @@ def draw_details(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> bytes:
 
 @styled
 def draw_ends(picture: HistogramEnds) -> bytes:
-    """How many pixels have the darkest and the brightest grey values, before and after."""
+    """Numbers of pixels with the darkest and the brightest grey values, before and after."""
     fig = figure_of(_WIDTH, 2.6)
     shares = np.concatenate([*picture.before, *picture.after])
     low = float(shares[shares > 0].min()) / 2 if (shares > 0).any() else 1e-3
@@ -277,7 +277,7 @@ class Compared:
     """(height, width) or (height, width, 3)."""
     after: NDArray[np.uint8]
     ends: HistogramEnds | None
-    """None: no pixel is valid."""
+    """None if no pixel is valid."""
 
 
 def compare(before: RasterReader, after: RasterReader) -> Compared:
@@ -501,7 +501,7 @@ def _pair(values: Sequence[float]) -> str:
 
 
 def origin(found: FoundFilter) -> str:
-    """Where the filter comes from, in a sentence."""
+    """Return the origin of the filter in a sentence."""
     if found.measured is None:
         return f"The filter comes from {found.origin}." if found.origin else "There is no filter."
     names = [image.name for image in found.measured.mtf.images]
@@ -588,7 +588,7 @@ def part_rows(part: DesignedPart) -> list[tuple[str, ...]]:
 
 
 def plain_facts(used: RestorationFilter) -> list[tuple[str, str]]:
-    """What a filter's file says of its making."""
+    """Return what the file of a filter states of its making."""
     facts = []
     for name, value in used.facts.items():
         listed = isinstance(value, list | tuple) and any(isinstance(v, dict) for v in value)

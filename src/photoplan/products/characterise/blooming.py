@@ -19,7 +19,7 @@ _MOST = 150_000_000
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     return no_run(data, ("scene",), _LEAST, "blooming")
 
 

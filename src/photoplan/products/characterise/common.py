@@ -1,4 +1,4 @@
-"""What several analyses of a camera share: series of settings, black levels, refusals."""
+"""Shared parts of the analyses of a camera: series of settings, black levels, refusals."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class SettingsRun:
 
     settings: tuple[Setting, ...]
     name: str
-    """Of the condition, such as ``exposure_ms``."""
+    """Name of the condition, such as ``exposure_ms``."""
     axis: str
     unit: str
     label: str
-    """What they have in common, such as ``500 nm``."""
+    """Common condition of the settings, such as ``500 nm``."""
 
     @property
     def values(self) -> tuple[float, ...]:
@@ -87,7 +87,7 @@ def no_pair(data: SeriesData) -> str | None:
 def of_runs(
     data: SeriesData, kinds: Sequence[str], least: int, what: str, analyse: Callable[..., Findings]
 ) -> Findings:
-    """What an analysis finds in every run and plane: of data, run, plane, and what figures are of."""
+    """Return findings in every run and plane; `analyse` takes data, run, plane and the subject of the figures."""
     of = [(run, plane) for run in exposure_runs(data, kinds, least) for plane in data.planes]
     subjects = [Subject(plane.name, run.label) for run, plane in of]
     return joined([tried(s.named(what), analyse, data, *each, s) for each, s in zip(of, subjects)])
@@ -120,9 +120,9 @@ class Black:
     mean: float
     sigma: float
     level: Level | None
-    """Of the dark frames it comes from; None: it was stated."""
+    """Setting of the dark frames that it comes from; None if it was stated."""
     rule: str
-    """Where it comes from, for notes."""
+    """Its origin, for notes."""
 
 
 def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
@@ -180,7 +180,7 @@ def _sigma(level: Level) -> float:
 
 
 def of_one_temperature(dark: Setting, setting: Setting) -> bool:
-    """Whether dark frames fit to a setting: where both state a temperature, to half a degree."""
+    """Return whether dark frames fit a setting: to half a degree, if both state a temperature."""
     a, b = dark.first.temperature_c, setting.first.temperature_c
     return a is None or b is None or abs(a - b) <= 0.5
 

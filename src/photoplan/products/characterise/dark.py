@@ -17,7 +17,7 @@ _LEAST = 3
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     exposures = {setting.first.exposure_ms for setting in data.settings("dark")} - {None}
     if len(exposures) >= _LEAST:
         return None

@@ -16,7 +16,7 @@ WINDOW = 6
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     groups = frame_groups(data, "drift")
     if not groups:
         return f"frames of kind drift: an even surface at {LEAST_MEASUREMENTS} or more times"

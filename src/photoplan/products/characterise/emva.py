@@ -31,7 +31,7 @@ _Point = tuple[float, float | None, Level]
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     if len(data.series.reduced_of("flat")) >= _LEAST:
         return None if data.series.reduced_of("dark") else "reduced figures of dark frames"
     if not any(sum(len(s.frames) >= 2 for s in run.settings) >= _LEAST for run in _runs(data)):

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     return (
         None if data.series.of("flat") else "flat frames: an evenly lit surface without structure, all over the image"
     )
@@ -104,7 +104,7 @@ def _whole(data: SeriesData, setting: Setting, plane: Plane, pixels: Array) -> A
 
 
 def _settings(data: SeriesData, setting: Setting, plane: Plane, dark: float) -> FallOffSettings:
-    """What the camera's facts and the entry's values say."""
+    """Return what the camera and the values of the entry state."""
     camera, group = data.series.camera, FrameGroup(setting.first.group, setting.frames)
     point = camera.principal_point_px
     if point is not None:

@@ -15,7 +15,7 @@ from photoplan.quality.camera.video import GainControl, compare_transitions, gai
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     groups = frame_groups(data, "step")
     if not groups:
         return f"frames of kind step: one entry per transition, with {LEAST_VALUES} or more frames after it"

@@ -31,9 +31,9 @@ class Edge:
     window: Window
     fitted: EdgeLines
     jitter: LineJitter
-    """Of the least-squares positions."""
+    """Jitter of the least-squares positions."""
     correlated: LineJitter
-    """Of the positions by correlation and parabola."""
+    """Jitter of the positions by correlation and parabola."""
 
     @property
     def first_line(self) -> int:
@@ -122,7 +122,7 @@ def _deviations(edge: Edge) -> Chart:
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     if not data.series.of("plumb"):
         return "plumb frames: a straight vertical edge, two parallel ones, or a horizontal one as control"
     if data.series.camera.bayer is not None:
@@ -223,7 +223,7 @@ def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: li
 
 
 def _periodic(data: SeriesData, edges: list[Edge], at: str) -> list[Estimate]:
-    """Of the first frame in which there is one; the table holds all frames."""
+    """Return the findings of the first frame that has some; the table holds all frames."""
     edge = next((e for e in edges if e.jitter.harmonics), None)
     if edge is None:
         return []

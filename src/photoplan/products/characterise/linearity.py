@@ -27,7 +27,7 @@ _LEAST = 3
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     return no_run(data, _KINDS, _LEAST, "linearity")
 
 

@@ -15,7 +15,7 @@ _KINDS = ("dark", "flat", "scene", "wedge", "drift")
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     return (
         None
         if data.settings(*_KINDS, least=2)

@@ -24,7 +24,7 @@ class Analysis:
     """One analysis."""
 
     name: str
-    """As users spell it."""
+    """Its name on the command line."""
     title: str
     needs: str
     """Which frames it needs, for the documentation and dry runs."""
@@ -32,7 +32,7 @@ class Analysis:
     """Holds `missing` and `analyse`; imported when it is asked."""
 
     def missing(self, data: SeriesData) -> str | None:
-        """What the series lacks for it; None: nothing."""
+        """Return what the series lacks for it, or None."""
         return cast(Callable[[SeriesData], str | None], self._function("missing"))(data)
 
     def analyse(self, data: SeriesData) -> Findings:

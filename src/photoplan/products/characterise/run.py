@@ -40,7 +40,7 @@ def with_full_wells(data: SeriesData) -> SeriesData:
 
 
 def full_well_notes(data: SeriesData) -> tuple[str, ...]:
-    """What to tell of them."""
+    """Return notes on the full wells."""
     largest = data.series.saturation_dn
     below = f", below the largest grey value {largest:g}" if isfinite(largest) else ""
     return tuple(
@@ -72,7 +72,7 @@ def with_grey_step(data: SeriesData) -> SeriesData:
 
 
 def step_notes(data: SeriesData) -> tuple[str, ...]:
-    """What to tell of them."""
+    """Return notes on the steps of grey values."""
     if data.step < 2:
         return ()
     return (f"grey values come in steps of {data.step:g} DN: rounding is taken as that coarse",)
@@ -80,12 +80,12 @@ def step_notes(data: SeriesData) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class AnalysisRun:
-    """What became of one analysis."""
+    """One analysis with its findings, or the reason why there are none."""
 
     analysis: Analysis
     outcome: Findings | None = None
     missing: str | None = None
-    """What the series lacks for it."""
+    """Data that the series lacks for it."""
     failed: str | None = None
     """Why it stopped."""
 
@@ -112,7 +112,7 @@ class CharacteriseReport(Result):
     tables: tuple[Path, ...]
     """Tables that were written, and what goes with them."""
     notes: tuple[str, ...] = ()
-    """What concerns all analyses."""
+    """Notes on all analyses."""
     levels: tuple[float, ...] = ()
     """Grey value at which each plane saturates."""
 

@@ -23,7 +23,7 @@ _FULL = "the elements are full, below the largest grey value"
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     return no_run(data, _KINDS, _LEAST, "saturation")
 
 

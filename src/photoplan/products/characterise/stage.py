@@ -31,7 +31,7 @@ class _Points:
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     if any(p.entry.kind == "stage" for p in data.series.positions) or len(data.series.of("stage")) >= LEAST_POINTS:
         return None
     return f"{LEAST_POINTS} or more stage frames with stage_x and stage_y, or a table of positions of kind stage"

@@ -15,7 +15,7 @@ _LEAST = 3
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     pairs = len(data.settings("flat", least=2))
     if max(pairs, len(data.series.reduced_of("flat"))) >= _LEAST:
         return None

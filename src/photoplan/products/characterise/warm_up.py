@@ -44,7 +44,7 @@ class _Input:
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     if data.series.of("target") or any(p.entry.kind == "target" for p in data.series.positions):
         return None
     return f"target frames (or a table of positions) at {LEAST_VALUES} or more times after switching on"

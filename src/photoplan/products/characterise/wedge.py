@@ -27,7 +27,7 @@ class _Patch:
 
 
 def missing(data: SeriesData) -> str | None:
-    """What the series lacks."""
+    """Return what the series lacks."""
     frames = data.series.of("wedge")
     densities = {frame.density for frame in frames} - {None}
     densities |= {step.density for frame in frames for step in frame.group.entry.steps}

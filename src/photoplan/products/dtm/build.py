@@ -383,7 +383,7 @@ def _totals(built: Built, measured: MeasuredTerrain, findings: Sequence[Finding]
 
 
 def _class(found: ClassFigures, spacing: float) -> dict[str, Any]:
-    """What was held out in a class, as plain values: distances in metres (`to` None: and further), or parts of 1."""
+    """Return the held-out errors of a class: distances in metres (`to` is None for all beyond), or parts of 1."""
     to = found.furthest * spacing
     return {
         "from": round(found.nearest * spacing, 4),
@@ -398,13 +398,13 @@ def _class(found: ClassFigures, spacing: float) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class RefineReport(Result):
-    """What came out."""
+    """A terrain model that was refined."""
 
     path: Path
     units: int
     """Units of the model that have a surface."""
     changed: int
-    """Those that differ from the coarse model's."""
+    """Units that differ from those of the coarse model."""
     lines: int
     largest: float
     """Largest change of a post that both have, metres; NaN: there is none."""
@@ -475,7 +475,7 @@ class _Model:
     header: ModelHeader
     units: ModelReader | RasterUnits
     reader: ModelReader | None
-    """None: a raster."""
+    """None for a raster."""
 
     @classmethod
     def open(cls, path: Path, crs: str | None) -> _Model:

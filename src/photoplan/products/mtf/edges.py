@@ -162,10 +162,10 @@ def _bounds(cell: tuple[int, int], size: tuple[int, int], cells: int) -> tuple[f
 
 #: Channel 0.
 LUMINANCE = 0
+#: Weights of red, green and blue light in the luminance (ITU-R BT.709).
 _WEIGHTS = np.array([0.2126, 0.7152, 0.0722])
 #: Weights of red, green and blue in the luminance of JPEG (ITU-R BT.601).
 _LUMA = (0.299, 0.587, 0.114)
-"""Of red, green and blue light (ITU-R BT.709)."""
 _CLIPS = tuple(float(2**bits - 1) for bits in (8, 10, 11, 12, 13, 14, 15, 16))
 """Values with which sensors of so many bits end."""
 _OFTEN = 20
@@ -199,7 +199,7 @@ class LightImage:
         return self.reader.size
 
     def channel_name(self, channel: int) -> str:
-        """How messages call a channel."""
+        """Return the name of a channel in messages."""
         if channel == LUMINANCE:
             return "luminance" if self.reader.bands >= 3 else "band 1"
         return f"band {channel}"
@@ -457,7 +457,7 @@ def join_lines(lines: Iterable[StraightEdge]) -> list[StraightEdge]:
 
 
 def _goes_on(line: StraightEdge, other: StraightEdge) -> bool:
-    """Whether another line begins where this one ends, or the reverse, in the same direction."""
+    """Return whether another line begins at the end of this one, or the reverse, in the same direction."""
     reach = (line.length + other.length) / 2 + _ALONG
     if hypot(line.x - other.x, line.y - other.y) > reach:
         return False
@@ -523,7 +523,7 @@ _SHORT = 40.0
 
 @dataclass(frozen=True, eq=False)
 class Measuring:
-    """How the images are measured."""
+    """Settings of the measurement of an image."""
 
     rois: tuple[tuple[int, int, int, int], ...]
     """Column, row, width, height; none: the whole image is searched."""
@@ -651,7 +651,7 @@ def _why(found: FoundEdges) -> str:
 
 
 def _nothing(image: LightImage, rejected: Counter[str], how: Measuring, refusals: Counter[str]) -> str:
-    """What is said where no edge can be measured."""
+    """Return the message if no edge can be measured."""
     words = rejected_words(dict(rejected))
     reason = f"rejected: {words}" if words else "the image holds no straight brightness step long enough"
     if refusals:

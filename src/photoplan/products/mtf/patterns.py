@@ -40,7 +40,7 @@ class PatternResult:
     """All that was measured lies in it."""
     found: BarCurve | StarMtf | UsafResult
     parts: tuple[Window, ...] = ()
-    """Of bars: the window of each frequency group, in the order of these."""
+    """Window of each frequency group of bars, in their order."""
     coltman: bool = False
     """Convert the contrast transfer of bars into an MTF."""
     pixel_um: float | None = None
@@ -222,7 +222,7 @@ class ImagePattern:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know."""
+        """Remarks on the patterns."""
         return tuple(dict.fromkeys(note for result in self.results for note in result.notes))
 
     def json_fields(self) -> dict[str, Any]:
@@ -232,7 +232,7 @@ class ImagePattern:
 
 @dataclass(frozen=True, eq=False)
 class PatternReport(Result):
-    """What became of all images."""
+    """Patterns of all images."""
 
     pattern: str
     images: tuple[ImagePattern, ...]

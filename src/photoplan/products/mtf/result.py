@@ -1,4 +1,4 @@
-"""What became of MTF measurements: edges, their means by direction, channel and place, as values, lines and JSON."""
+"""Results of MTF measurements: edges, their means by direction, channel and place, as values, tables and JSON."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ class ImageMtf:
     grid: int
     """Cells of the field in each direction."""
     rejected: dict[str, int]
-    """How many edges were rejected, by reason."""
+    """Number of edges that were rejected, by reason."""
     notes: tuple[str, ...]
 
     @property
@@ -245,14 +245,14 @@ def _number(value: float) -> str:
 
 
 def rejected_words(rejected: dict[str, int]) -> str:
-    """How many edges were rejected for what, most frequent first; empty if none."""
+    """Return the numbers of edges that were rejected, by reason, the most frequent first; empty if none was."""
     ordered = sorted(rejected.items(), key=lambda item: -item[1])
     return ", ".join(f"{count} {REASONS.get(reason, reason)}" for reason, count in ordered if count)
 
 
 @dataclass(frozen=True, eq=False)
 class MtfReport(Result):
-    """What became of all images."""
+    """Edges of all images, and their means."""
 
     images: tuple[ImageMtf, ...]
     failed: dict[str, str]
