@@ -18,7 +18,9 @@ from pathlib import Path
 
 RUNS = 7
 
-IMPORTS = "import os; from photoplan.cli import main; main.start(); import photoplan.cli.running; os._exit(0)"
+IMPORTS = (
+    "import os; from photoplan.cli import main; main.start(); import photoplan.products.orthophoto.make; os._exit(0)"
+)
 TWICE = """
 import sys, time
 from photoplan.cli import main

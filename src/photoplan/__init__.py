@@ -31,7 +31,7 @@ __getattr__, __dir__, __all__ = public(
         "io.project.file": "load_project",
         "products.orthophoto.plan": "plan_orthophotos render",
         "products.orthophoto.execution": "execute",
-        "products.orthophoto.make": "make_orthophotos make_mosaic make_objects run_plan",
+        "products.orthophoto.make": "make_products run_plan",
         "products.orthophoto.mosaic": "plan_mosaic plan_objects",
         "products.orthophoto.plan_file": "read_plan",
         "products.run": "Run",

@@ -160,7 +160,7 @@ VERBS: dict[str, str | Verb] = {
         The same command continues a run that was interrupted.
         """,
         "requests.ortho:OrthoRequest",
-        "products.orthophoto.make:make_orthophotos",
+        "products.orthophoto.make:make_products",
         each="report.products:draw_product",
         figures_first=True,
     ),
@@ -172,7 +172,7 @@ VERBS: dict[str, str | Verb] = {
         was interrupted.
         """,
         "requests.ortho:MosaicRequest",
-        "products.orthophoto.make:make_mosaic",
+        "products.orthophoto.make:make_products",
         each="report.products:draw_product",
         figures_first=True,
     ),
@@ -195,7 +195,7 @@ VERBS: dict[str, str | Verb] = {
         taken from the best image that sees it. The same command continues a run that was interrupted.
         """,
         "requests.ortho:ObjectRequest",
-        "products.orthophoto.make:make_objects",
+        "products.orthophoto.make:make_products",
         each="report.products:draw_product",
         figures_first=True,
     ),

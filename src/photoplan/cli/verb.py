@@ -50,35 +50,39 @@ class Verb:
 
     def command(self, name: str) -> click.Command:
         """Return the click command."""
-        return self.command_of(load(self.request), name, partial(run, self))
+        return self.command_of(load(self.request), name, partial(command, self))
 
     def command_of(self, kind: type[Request], name: str, call: Callable[..., None]) -> click.Command:
         """Return the click command of a request; `call` takes the request and the two options of what is printed."""
-
-        def callback(as_json: bool, quiet: bool, **given: Any) -> None:
-            context = click.get_current_context()
-            for name, option in ((each.name or "", each) for each in command.params):
-                # A value that nobody gave may be the project's.
-                if context.get_parameter_source(name) is ParameterSource.DEFAULT and given.get(name) == option.default:
-                    given.pop(name, None)
-            call(_request(kind, given), as_json=as_json, quiet=quiet)
-
-        command = VerbCommand(name, callback=callback, help=self.help)
-        command.params = [
-            *_parameters(kind, command.section_of),
+        made = VerbCommand(name, callback=call, help=self.help)
+        made.kind = kind
+        made.params = [
+            *_parameters(kind, made.section_of),
             click.Option(["--json", "as_json"], is_flag=True, help="Print one JSON object on stdout."),
             click.Option(["-q", "--quiet"], is_flag=True, help="No progress on stderr; warnings stay."),
         ]
-        return command
+        return made
 
 
 class VerbCommand(click.Command):
-    """A command whose help lists options by section."""
+    """A command made from a request; its help lists options by section."""
+
+    kind: type[Request]
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.section_of: dict[str, str] = {"as_json": "run", "quiet": "run", "help": "run"}
         """Section of each option, by its name."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Call the operation with the request; a value that nobody gave is left out, since it may be the project's."""
+        given = dict(ctx.params)
+        as_json, quiet = given.pop("as_json"), given.pop("quiet")
+        for name, option in ((each.name or "", each) for each in self.params):
+            if ctx.get_parameter_source(name) is ParameterSource.DEFAULT and given.get(name) == option.default:
+                given.pop(name, None)
+        assert self.callback is not None
+        return ctx.invoke(self.callback, request=_request(self.kind, given), as_json=as_json, quiet=quiet)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, those of a section together."""
@@ -97,7 +101,7 @@ def load(place: str) -> Any:
     return getattr(importlib.import_module(f"photoplan.{module}"), name)
 
 
-def run(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
+def command(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     """Run the operation of a verb, draw what is drawn, and print the result."""
     from photoplan.cli.telling import Telling
     from photoplan.findings import Result

@@ -26,7 +26,6 @@ from photoplan.requests.ortho import (
     DemoRequest,
     MosaicRequest,
     ObjectRequest,
-    OrthoRequest,
     ProductRequest,
     RunRequest,
 )
@@ -96,8 +95,10 @@ def _area(parts: Sequence[float]) -> str:
     return f"{whole:,.0f}" if whole >= 1000 else f"{whole:.4g}"
 
 
-def make_orthophotos(request: OrthoRequest, events: Events = SILENT) -> ProductsReport | PlanReport:
-    """Make an orthophoto of each image of a project, or show the plan; images whose files cannot be used are left out.
+def make_products(request: ProductRequest, events: Events = SILENT) -> ProductsReport | PlanReport:
+    """Make orthophotos, a mosaic or products of single objects, or show the plan.
+
+    Images whose files cannot be used are left out.
 
     Raises
     ------
@@ -108,26 +109,38 @@ def make_orthophotos(request: OrthoRequest, events: Events = SILENT) -> Products
     GeometryError
         No image sees the terrain, or an orientation cannot be right.
     """
-    return _make(request, plan_orthophotos, events)
+    project, images, plan = load_project(request.project), request.images or None, _planner(request)
+    attempts, again = Attempts(project, images), False
+    for attempt in attempts:
+        with attempt as usable:
+            planned = plan(usable, images, events=events, force=request.force, **request.changes)
+            left = {"unusable": attempts.left_out, "asked": len(project.select(images))}
+            if request.dry_run or request.plan_file is not None:
+                # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
+                from photoplan.products.orthophoto.plan_file import show_plan  # noqa: PLC0415
+
+                report: ProductsReport | PlanReport = show_plan(planned, request, events, **left)
+            else:
+                execution, again = _Execution(planned, request.folder, Run.of(request, events, again)), True
+                report = execution.report(execute_all(planned, request.folder, execution.run), **left)
+    return report
 
 
-def make_mosaic(request: MosaicRequest, events: Events = SILENT) -> ProductsReport | PlanReport:
-    """Make one orthophoto of many images, or show the plan; raises as `make_orthophotos`."""
-    from photoplan.products.orthophoto.mosaic import plan_mosaic  # noqa: PLC0415  # loads vector files
+def _planner(request: ProductRequest) -> Callable[..., OrthoPlan]:
+    """Return what plans the products of a request; mosaics load vector files."""
+    if isinstance(request, MosaicRequest):
+        from photoplan.products.orthophoto.mosaic import plan_mosaic  # noqa: PLC0415
 
-    return _make(request, plan_mosaic, events)
-
-
-def make_objects(request: ObjectRequest, events: Events = SILENT) -> ProductsReport | PlanReport:
-    """Make a product of each object alone, or show the plan; raises as `make_orthophotos`."""
+        return plan_mosaic
+    if not isinstance(request, ObjectRequest):
+        return plan_orthophotos
     from photoplan.io.project.model import Objects  # noqa: PLC0415
     from photoplan.products.orthophoto.mosaic import plan_objects  # noqa: PLC0415
 
     names = ("layer", "crs", "height_system", "offset", "sigma")
     stated = {name: value for name, value in pick(request, *names).items() if value is not None}
     polygons = Objects(file=str(request.polygons.absolute()), **stated)
-    plan = partial(plan_objects, polygons=polygons, objects=request.objects, below=request.below)
-    return _make(request, plan, events)
+    return partial(plan_objects, polygons=polygons, objects=request.objects, below=request.below)
 
 
 def run_plan(request: RunRequest, events: Events = SILENT) -> ProductsReport:
@@ -146,7 +159,8 @@ def run_plan(request: RunRequest, events: Events = SILENT) -> ProductsReport:
     folder = request.output or folder
     if folder is None:
         raise UsageError(f"{request.plan}: states a folder of products outside its own folder; give `output`")
-    return _executed(plan, folder, request, events)
+    execution = _Execution(plan, folder, Run.of(request, events))
+    return execution.report(execute_all(plan, folder, execution.run))
 
 
 def make_demo(request: DemoRequest, events: Events = SILENT) -> ProductsReport:
@@ -196,7 +210,8 @@ def make_demo(request: DemoRequest, events: Events = SILENT) -> ProductsReport:
     events.talk(str(check_project(project)))
     events.talk(_command("ortho", made.path, resolution=f"{request.resolution:g}"))
     plan = plan_orthophotos(project, resolution=request.resolution, events=events)
-    return _executed(plan, folder / "products", request, events)
+    execution = _Execution(plan, folder / "products", Run.of(request, events))
+    return execution.report(execute_all(plan, execution.folder, execution.run))
 
 
 def _command(verb: str, argument: Path, **options: object) -> str:
@@ -204,53 +219,34 @@ def _command(verb: str, argument: Path, **options: object) -> str:
     return f"$ photoplan {verb} {argument}" + "".join(f" --{n.replace('_', '-')} {v}" for n, v in options.items())
 
 
-def _make(request: ProductRequest, plan: Callable[..., OrthoPlan], events: Events) -> ProductsReport | PlanReport:
-    """Plan products and make them, or show what would be made, without the images whose files cannot be used."""
-    project, images = load_project(request.project), request.images or None
-    attempts, again = Attempts(project, images), False
-    for attempt in attempts:
-        with attempt as usable:
-            planned = plan(usable, images, events=events, force=request.force, **request.changes)
-            left = {"unusable": attempts.left_out, "asked": len(project.select(images))}
-            if request.dry_run or request.plan_file is not None:
-                # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
-                from photoplan.products.orthophoto.plan_file import show_plan  # noqa: PLC0415
+class _Execution:
+    """The execution of a plan: it is announced, timed and reported."""
 
-                report: ProductsReport | PlanReport = show_plan(planned, request, events, **left)
-            else:
-                begun, again = again, True
-                report = _executed(planned, request.folder, request, events, begun, **left)
-    return report
+    def __init__(self, plan: OrthoPlan, folder: Path, run: Run) -> None:
+        self.plan, self.folder, self.run = plan, folder, run
+        self._started = time.perf_counter()
+        self._compiled = COMPILATIONS.kernels, COMPILATIONS.seconds
+        settings = plan.settings
+        run.events.talk(
+            f"plan: {plan.what}, {sum(len(p.plan.tiles) for p in plan.products)} tiles · {settings.resolution:g} m · "
+            f"kernel {settings.kernel} · {settings.exactness} · nodata {settings.nodata} · "
+            f"hidden {settings.hidden}{settings.filling} · {run.workers} {run.executor}"
+        )
+        for line in plan.blind:
+            run.events.talk(f"  note: left out: {line}")
 
-
-def _executed(
-    plan: OrthoPlan,
-    folder: Path,
-    request: ProductRequest | RunRequest | DemoRequest,
-    events: Events,
-    again: bool = False,
-    **left: Any,
-) -> ProductsReport:
-    """Execute a plan; products whose tiles failed are among the results."""
-    started, kernels, compiled = time.perf_counter(), COMPILATIONS.kernels, COMPILATIONS.seconds
-    settings, run = plan.settings, Run.of(request, events, again)
-    events.talk(
-        f"plan: {plan.what}, {sum(len(p.plan.tiles) for p in plan.products)} tiles · {settings.resolution:g} m · "
-        f"kernel {settings.kernel} · {settings.exactness} · nodata {settings.nodata} · "
-        f"hidden {settings.hidden}{settings.filling} · {run.workers} {run.executor}"
-    )
-    for line in plan.blind:
-        events.talk(f"  note: left out: {line}")
-    products = execute_all(plan, folder, run)
-    report = ProductsReport(
-        plan=plan,
-        products=tuple(products),
-        folder=folder,
-        seconds=time.perf_counter() - started,
-        compiled=(COMPILATIONS.kernels - kernels, COMPILATIONS.seconds - compiled),
-        quicklook=run.quicklook,
-        **left,
-    )
-    for line in report.figures:
-        events.talk(line)
-    return report
+    def report(self, products: Sequence[ProductResult], **left: Any) -> ProductsReport:
+        """Return the products, also those whose tiles failed, with their figures, which are messages, too."""
+        kernels, seconds = self._compiled
+        report = ProductsReport(
+            plan=self.plan,
+            products=tuple(products),
+            folder=self.folder,
+            seconds=time.perf_counter() - self._started,
+            compiled=(COMPILATIONS.kernels - kernels, COMPILATIONS.seconds - seconds),
+            quicklook=self.run.quicklook,
+            **left,
+        )
+        for line in report.figures:
+            self.run.events.talk(line)
+        return report
