@@ -295,7 +295,10 @@ class Result:
         return [line for each in self.outcome() for line in each.lines()]
 
     def raise_failures(self) -> None:
-        """Raise if a part of the inputs failed, after the rest is written."""
+        """Raise if a part of the inputs failed, after the rest is written; by default for the `failed` of `images`."""
+        failed = getattr(self, "failed", None)
+        if isinstance(failed, Mapping):
+            raise_failed(failed, len(getattr(self, "images", ())))
 
     def remarks(self) -> Sequence[str]:
         """Return what to mind in any case, printed on stderr as it is."""

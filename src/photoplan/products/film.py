@@ -165,10 +165,6 @@ class FiducialsReport(Result):
         changed = [f"{self.project}: fiducial marks of {len(self.images)} images written"] if self.project else []
         return [*noted(notes), *changed]
 
-    def raise_failures(self) -> None:
-        """Name the images that failed."""
-        raise_failed(self.failed, len(self.images))
-
 
 def _reasons(failed: Mapping[str, str]) -> list[dict[str, str]]:
     return [{"image": name, "reason": reason} for name, reason in failed.items()]
@@ -441,10 +437,6 @@ class InteriorResult(Result):
         lines = [f"note: marks not measured in {names}: `photoplan fiducials` finds them"] if names else []
         model = self.images[0].fit.model if self.images else ""
         return [*lines, *(f"camera {name!r}: interior = {model!r} written to the project" for name in self.cameras)]
-
-    def raise_failures(self) -> None:
-        """Name the scans that failed."""
-        raise_failed(self.failed, len(self.images))
 
 
 def interior_orientations(request: InteriorRequest, events: Events = SILENT) -> InteriorResult:

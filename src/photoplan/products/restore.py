@@ -716,10 +716,6 @@ class RestoreReport(Result):
         """Return the restored images."""
         return [image.path for image in self.images]
 
-    def raise_failures(self) -> None:
-        """Name the images that failed."""
-        raise_failed(self.failed, len(self.images))
-
 
 def filter_figures(filter_: RestorationFilter) -> dict[str, Any]:
     """Size, noise gain and making of a filter as plain values."""

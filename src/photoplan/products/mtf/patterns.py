@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.findings import Findings, Result, Table, raise_failed, with_sigma
+from photoplan.findings import Findings, Result, Table, with_sigma
 from photoplan.geometry.grid import Window
 from photoplan.io.tables import write_table
 from photoplan.plain import pick
@@ -264,10 +264,6 @@ class PatternReport(Result):
     def remarks(self) -> list[str]:
         """Return the notes of each image."""
         return [f"{image.name}: {note}" for image in self.images for note in image.notes]
-
-    def raise_failures(self) -> None:
-        """Name the images that failed."""
-        raise_failed(self.failed, len(self.images))
 
     @property
     def csv_rows(self) -> tuple[Sequence[str], list[list[object]]]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.findings import Findings, Result, Table, raise_failed
+from photoplan.findings import Findings, Result, Table
 from photoplan.plain import pick
 from photoplan.quality.edges.find import REASONS
 from photoplan.quality.edges.groups import CombinedValue, Enhancement, GaussianFit
@@ -289,10 +289,6 @@ class MtfReport(Result):
         if len(self.images) > 1 and self.enhancement is not None and self.enhancement.enhanced:
             notes.append(f"all images: {self.enhancement.warning}")
         return notes
-
-    def raise_failures(self) -> None:
-        """Name the images that failed."""
-        raise_failed(self.failed, len(self.images))
 
     def _summary(self, groups: Sequence[EdgeGroup]) -> list[dict[str, Any]]:
         if self.pixel_um is None:

@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.events import SILENT, Events
-from photoplan.findings import Result
+from photoplan.findings import Result, with_sigma
 from photoplan.io.product import check_output
 from photoplan.io.store import recording
 from photoplan.io.tables import write_table
@@ -90,9 +90,9 @@ class Skyline(Result):
                 )
         if (r := self.refined) is not None:
             for name, after, sigma, before in zip(r.names, r.after, r.sigma, r.before):
-                lines.append(f"{name} {after:.4f} ±{sigma:.4f} {r.unit} (was {before:.4f})")
+                lines.append(f"{name} {with_sigma(after, sigma, r.unit)} (was {before:.4f})")
             if r.constant is not None:
-                lines.append(f"camera constant {r.constant[0]:.6f} ±{r.constant[1]:.6f} times that of its camera")
+                lines.append(f"camera constant {with_sigma(*r.constant)} times that of its camera")
             err = f"of which about {r.correlated:.0f} err together; the standpoint was held"
             lines.append(f"from {r.used} columns, {err}")
         return lines
