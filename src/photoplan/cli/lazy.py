@@ -25,7 +25,7 @@ class LazyGroup(click.Group):
         super().__init__(*arguments, **options)
         self.verbs = verbs
         self.package = package
-        """What a verb's name is appended to, to give the module that holds its `command`."""
+        """Start of the name of the module that holds the `command` of a verb."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a verb; its errors name parameters as the verb's options."""
@@ -121,5 +121,5 @@ def _split(words: list[str]) -> list[str]:
 
 
 def _is_numbers(word: str) -> bool:
-    """Whether a word holds nothing but numbers and what separates them."""
+    """Return True if a word holds nothing but numbers and what separates them."""
     return all(_NUMBER.fullmatch(part) for part in _split([word]))

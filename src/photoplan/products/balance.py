@@ -148,7 +148,7 @@ class Reference:
     """Side of its pixels, units of its CRS."""
 
     def pixels(self, grid: MapGrid, window: Window) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
-        """What it holds for a window of the map, (bands, height, width), and where; None: nothing."""
+        """Return its pixels in a window of the map, (bands, height, width), and where there are any; None if none."""
         rule = AnchorRule.of(_KERNEL, _TOLERANCE)
         plan = ProductPlan(
             name="reference",
@@ -221,13 +221,13 @@ class Survey:
 
     @property
     def tile_bytes(self) -> int:
-        """What a tile takes at most that is looked at: a window of an image, and all images of the tile."""
+        """Memory of a tile that is looked at, at most: a window of an image, and all images of the tile."""
         bands = self.looked[0].scene.reader.bands
         return 3 * MOST_SOURCE_BYTES + max(8 * bands * tile.pixels * len(tile.sources) for tile in self.tiles)
 
     @property
     def kept_bytes(self) -> int:
-        """What the cells of all tiles take that are kept, and their adjustment."""
+        """Memory of the cells of all tiles, and of their adjustment."""
         rows = sum(tile.pixels * len(tile.sources) for tile in self.tiles) // SIDE**2
         return _KEPT * self.looked[0].scene.reader.bands * rows
 
@@ -257,7 +257,7 @@ def survey(project: Project, names: Sequence[str], resolution: float | None, eve
 
 
 def sample(found: Survey, reference: Reference | None, workers: int, executor: str, events: Events, at: Path) -> Cells:
-    """What all images show, cell by cell; tiles are looked at one by one and forgotten. `at`: folder of the product."""
+    """Return what all images show, cell by cell; tiles are read one by one. `at`: folder of the product."""
     seen = [_Seen(tile, tuple(found.looked[row].scene.address for row in tile.sources)) for tile in found.tiles]
     job = _Sampling(found.grid, found.tiles.side, found.looked[0].scene.reader.bands, reference)
     events.begin("comparing", len(seen), "tiles")
@@ -277,7 +277,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Sampling:
-    """From a tile to its cells."""
+    """Job that makes the cells of a tile."""
 
     grid: MapGrid
     side: int

@@ -1,4 +1,4 @@
-"""How every product that is made of images runs, and what it may not do to its inputs."""
+"""Execution of products that are made of images, and protection of their inputs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def tile_bytes(tolerance: float, side: int) -> int:
 
 @dataclass(frozen=True)
 class Run:
-    """How a plan is executed; none of it changes a pixel."""
+    """Options of the execution of a plan; none of them changes a pixel."""
 
     workers: int = 1
     """Threads or processes."""
@@ -39,13 +39,13 @@ class Run:
     memory: int | None = None
     """Bytes the run should stay under; None: no bound but the tiles in flight."""
     overwrite: bool = False
-    """Whether finished products may be replaced."""
+    """True if finished products may be replaced."""
     again: bool = False
-    """Whether an earlier attempt of the same command made some products, which are kept without objection."""
+    """True if an earlier attempt of the same command made some products, which are kept without objection."""
     quicklook: bool = True
-    """Whether to write a preview of the products, such as `ortho_overview.png`."""
+    """True if a preview of the products is written, such as `ortho_overview.png`."""
     events: Events = SILENT
-    """Told of tiles that are done, and of each product's result, also if some of its tiles failed."""
+    """Receiver of tiles that are done, and of each product's result, also if some of its tiles failed."""
 
     @classmethod
     def of(cls, request: Any, events: Events, again: bool = False) -> Run:
@@ -70,8 +70,8 @@ class Run:
 
     @contextmanager
     def runner(self, inputs: Iterable[Path], folder: Path, each: int = _EACH) -> Iterator[Runner[Any]]:
-        """What makes products whose tiles take `each` bytes; workers of a cluster must see the inputs, and may see the
-        folder of the products. For errors see `open_workers`."""
+        """Yield what makes products whose tiles take `each` bytes; workers of a cluster must see the inputs, and may
+        see the folder of the products. For errors see `open_workers`."""
         with open_workers(self.executor, self.workers, question(inputs, folder), self.events) as workers:
             yield Runner(workers, self.in_flight(workers, each), self.events)
 
@@ -90,7 +90,7 @@ def refuse_inputs(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
 
 
 def _identity(path: Path) -> object:
-    """What two names of one file have in common."""
+    """Return what two names of one file have in common."""
     try:
         state = path.stat()
         return state.st_dev, state.st_ino
@@ -99,5 +99,5 @@ def _identity(path: Path) -> object:
 
 
 def question(files: Iterable[Path], folder: Path) -> Question:
-    """What workers of a cluster are asked: whether they see the files, and the folder of the product."""
+    """Return the question to workers of a cluster: do they see the files, and the folder of the product?"""
     return Question(versions, tuple(str(path.resolve()) for path in files), str(folder.resolve()))

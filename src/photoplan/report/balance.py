@@ -79,7 +79,7 @@ def _tables(axes: Any, found: Balanced, band: int) -> None:
 
 
 def _maps(fig: Any, row: Any, pairs: Pairs) -> None:
-    """Where on the map images differ, before and after, with the same colours."""
+    """Draw where on the map images differ, before and after, with the same colours."""
     col, line = (np.round(pairs.places.T - pairs.places.min(axis=0)[:, None]) // SIDE).astype(int)
     most = float(np.quantile(pairs.before_there, 0.98))
     cells = row.subgridspec(1, 2)

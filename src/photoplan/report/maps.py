@@ -182,7 +182,7 @@ def draw_surface(heights: Path, coordinates: tuple[str, str] = ("X", "Y")) -> by
 
 
 def _most(values: NDArray[np.float64], percent: float) -> tuple[float, float]:
-    """Between what values lie but so many percent on either side; 1 and 2 where there are none."""
+    """Return between what values lie but so many percent on either side; 1 and 2 if there are none."""
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, (percent, 100 - percent)) if known.size else (1.0, 2.0)
     return float(low), float(max(high, low + 1e-9))

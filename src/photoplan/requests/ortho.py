@@ -128,7 +128,7 @@ class OrthoSettings(SingleOptions, PixelOptions):
     """Choices that change the pixels or the file of an orthophoto or mosaic; they go together."""
 
     choice: Choice | None = None
-    """How images are chosen for one mosaic of them; None: an orthophoto of each."""
+    """Choice among the images of a mosaic; None for an orthophoto of each image."""
     sources: bool = _SOURCES
 
     def check(self) -> None:
@@ -168,17 +168,17 @@ class OrthoSettings(SingleOptions, PixelOptions):
 
     @property
     def exactness(self) -> str:
-        """How exactly positions are computed, in words."""
+        """Exactness of positions, in words."""
         return f"tolerance {self.tolerance:g} px" if self.tolerance else "every pixel strictly by its camera"
 
     @property
     def asks_hidden(self) -> bool:
-        """Whether hidden ground is searched for."""
+        """True if hidden ground is searched for."""
         return self.hidden != "show" or self.choice is not None
 
     @property
     def filling(self) -> str:
-        """Which hidden holes are filled, in words; empty if none are."""
+        """Hidden holes that are filled, in words; empty if none are."""
         return f", hidden holes up to {self.fill_hidden} px filled" if self.fill_hidden else ""
 
     @property

@@ -38,7 +38,7 @@ class SurfaceSettings(Request):
 
     @property
     def seen(self) -> str:
-        """What images see, as messages call it."""
+        """Name of the target in messages: ground or target."""
         return "ground" if self.target == "map" else "target"
 
     @property

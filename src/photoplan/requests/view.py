@@ -41,7 +41,7 @@ class CameraRequest(Request):
     image: str | None = opt("Image of the project, or a TOML file of the options below.", None, flag="camera",
                             metavar="IMAGE|FILE", section="input")  # fmt: skip
     aside: float | None = None
-    """How far the camera of an image is moved to the right along its rows, metres: an eye of a stereo pair."""
+    """Distance by which the camera of an image is moved to the right along its rows, metres: an eye of a pair."""
     position: tuple[float, float] | None = opt("Standpoint.", None, flag="from", metavar="X Y")
     height: float = opt("Height of the eye above ground, metres [1.7].", 1.7)
     altitude: float | None = opt("Height of the eye in the terrain's system instead.", None)
@@ -113,7 +113,7 @@ class CameraRequest(Request):
 
     @property
     def is_file(self) -> bool:
-        """Whether a file states the camera."""
+        """True if a file states the camera."""
         return self.image is not None and self.image.lower().endswith(".toml")
 
     def read(self) -> Self:
@@ -168,7 +168,7 @@ class ContentRequest:
     """File of a raster, name of a photo, or ramp of tints with its lowest and highest height."""
     opacity: float = 1.0
     classes: bool = False
-    """Whether the values of a raster are numbers of classes, whatever its file states."""
+    """True if the values of a raster are numbers of classes, whatever its file states."""
 
     def __post_init__(self) -> None:
         if not 0 < self.opacity <= 1:
@@ -207,7 +207,7 @@ class LinesRequest:
     """A layer that is drawn: a file of features, or contours."""
 
     path: Path | None
-    """None: contours of the terrain."""
+    """File of features; None for contours of the terrain."""
     layer: str | None = None
     interval: float = 0.0
     """Interval of contours, metres."""
@@ -334,7 +334,7 @@ class Stereo:
 
     @property
     def beside(self) -> bool:
-        """Whether both pictures lie beside each other."""
+        """True if both pictures lie next to each other."""
         return self.how == "side-by-side"
 
     @property
@@ -389,7 +389,7 @@ class PictureOptions(SightRequest):
     stereo: Literal["side-by-side", "anaglyph"] | None = opt("A pair: left and right, or red-cyan.", None)
     base: float | None = opt("Distance of both eyes, metres [a thirtieth of that of the nearest ground].", None)
     lettering: Any = None
-    """What draws texts; None: points have no labels."""
+    """Function that draws texts; None if points have no labels."""
     dry_run: bool = DRY_RUN
     workers: int = ONE_WORKER
     executor: str = EXECUTOR
@@ -459,7 +459,7 @@ class SequenceRequest(PictureOptions):
 
     @property
     def along(self) -> bool:
-        """Whether it looks along the path: neither a point nor a direction is set."""
+        """True if it looks along the path: neither a point nor a direction is set."""
         return self.camera is None or not self.camera.model_fields_set & {"look_at", "azimuth"}
 
 

@@ -160,7 +160,7 @@ def _tell_of_one_colour(products: Sequence[OrthoProduct], project: Project, even
 def _work(
     plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, kept: ProductResult | None, workers: Workers
 ) -> Work[ProductResult] | Kept[ProductResult]:
-    """What there is to do for a product."""
+    """Return the work of a product, or its result if it is finished."""
     if kept is not None:
         return Kept(kept, len(product.plan.tiles))
     settings, address = plan.settings, product.address(plan.project)
@@ -290,7 +290,7 @@ def _complete(
 
 
 def _kept(made: Sequence[ProductFacts]) -> dict[str, Any]:
-    """What a record keeps of tiles, by file; nothing where nothing is kept."""
+    """Return the tiles that a record keeps, by file; nothing if none are kept."""
     found = {each.path.name: each.kept for each in made if each.kept}
     return {"tiles": found} if found else {}
 
@@ -316,7 +316,7 @@ def _left_out(product: OrthoProduct, address: ScenesAddress) -> float:
 
 
 def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:
-    """What the file itself says of its origin."""
+    """Return the tags by which a file states its origin."""
     return {
         "PHOTOPLAN_VERSION": __version__,
         "PHOTOPLAN_IMAGE": ", ".join(product.images),
@@ -326,7 +326,7 @@ def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:
 
 
 def _record(plan: OrthoPlan, product: OrthoProduct, scenes: Scenes, result: ProductResult) -> dict[str, Any]:
-    """What a person needs to answer for the product, and to make it again."""
+    """Return all that a person needs to answer for the product, and to make it again."""
     scene = scenes[0]
     return {
         "product": result,

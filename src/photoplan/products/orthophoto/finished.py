@@ -1,4 +1,4 @@
-"""What became of the products of a plan, and which of them an earlier run has made."""
+"""Results of the products of a plan, and products of an earlier run that are kept."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ProductResult(Result):
     hidden: float | None
     """Ground in the images that none of them sees, m²; None: nobody has asked."""
     filled: dict[str, float] | None
-    """Of the hidden ground, m² that are filled from `images` and from `surroundings`; None: nobody has asked."""
+    """Hidden ground that is filled from `images` and from `surroundings`, m²; None if nobody has asked."""
     bare: float | None
     """Ground of a mosaic that lies in none of its images, m²; None: it is no mosaic."""
     gaps: float | None
@@ -96,7 +96,7 @@ def seams_path(picture: Path) -> Path:
 
 
 def stale_files(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> list[Path]:
-    """Where another kind of run would have put files beside a product, which would belong to another orthophoto."""
+    """Return where another kind of run would have put files next to a product, for another orthophoto."""
     path = outputs(folder, product, settings)["picture"]
     every = [
         *(path.with_name(f"{path.stem}_{name}.tif") for name in ("hidden", "sources", "accuracy")),

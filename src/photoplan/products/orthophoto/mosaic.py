@@ -208,7 +208,7 @@ def _product(
 
 
 def _meet(bounds: tuple[float, float, float, float] | None, grid: MapGrid) -> bool:
-    """Whether a footprint reaches into a grid."""
+    """Return True if a footprint reaches into a grid."""
     xmin, ymin, xmax, ymax = grid.bounds
     return bounds is not None and bounds[0] < xmax and bounds[2] > xmin and bounds[1] < ymax and bounds[3] > ymin
 
@@ -323,7 +323,7 @@ class _Single:
     grid: MapGrid
 
     def below(self) -> _Single:
-        """What lies below it."""
+        """Return the ground below it."""
         assert self.surface.part is not None
         return replace(self, surface=replace(self.surface, part=replace(self.surface.part, below=True)))
 
@@ -334,7 +334,7 @@ class _Single:
 
     @property
     def shown(self) -> ObjectSurface | Faces:
-        """What knows the heights of all that it shows."""
+        """Surface with the heights of all that it shows."""
         faces = self.surface.shown
         return self.surface if faces is None or self.surface.shows_ground else faces
 

@@ -53,7 +53,7 @@ def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: Si
 
 
 def known_errors(address: ScenesAddress, plan: ProductPlan, settings: OrthoSettings) -> ScenesErrors:
-    """What is known of the errors of a product's images and of its ground."""
+    """Return what is known of the errors of a product's images and of its ground."""
     sigma = in_image(settings.kernel, plan.rule.tolerance)
     return ScenesErrors(address, (sigma,) * len(address.scenes))
 
@@ -91,7 +91,7 @@ def tile_keys(address: ScenesAddress, plan: ProductPlan, settings: OrthoSettings
 
 
 def _rows(drawn: Drawn | None, window: Window) -> str | None:
-    """Of what is drawn in a window of a product."""
+    """Return the digest of what is drawn in a window of a product."""
     return None if drawn is None else hashlib.sha256(drawn.rows(window).tobytes()).hexdigest()
 
 
@@ -110,7 +110,7 @@ def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions
 
 
 def _common(plan: ProductPlan, settings: OrthoSettings) -> dict[str, Any]:
-    """What all tiles of a product depend on, whatever its images."""
+    """Return what all tiles of a product depend on, whatever its images."""
     assert isinstance(plan.target, MapTarget)
     grid = plan.target.grid
     return {
@@ -130,7 +130,7 @@ def _digest(facts: Any) -> str:
 
 
 def _facts(choice: Choice, regions: str | None) -> dict[str, Any]:
-    """What of a choice decides pixels: of files what they say, not their names."""
+    """Return the parts of a choice that decide pixels: the contents of files, not their names."""
     return {**plain(choice), "name": "", "seams": regions, "sheets": None}
 
 
@@ -140,14 +140,14 @@ _FINER = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What an image sees of the terrain."""
+    """View of an image on the terrain."""
 
     footprint: Footprint
-    """Where it lies."""
+    """Place of what it sees."""
     gsd: float
     """Its mean ground sampling distance, metres."""
     blur: float = 0.0
-    """By how many powers of two its fine detail, beside the coarser, is weaker than that of the sharpest image of the
+    """Powers of two by which its fine detail, beside the coarser, is weaker than that of the sharpest image of the
     same ground; 0 where nobody has asked."""
 
 
@@ -218,7 +218,7 @@ def _refuse_feet(scenes: Sequence[Scene]) -> None:
 
 
 def heights_in_feet(surface: Terrain, cameras: Sequence[Camera]) -> str | None:
-    """What to say of objects that rise above every camera, but would stand on the ground in feet; None: none does."""
+    """Return a sentence on objects above every camera that would stand on the ground in feet, or None."""
     highest = max(float(camera.vantage.point[2]) for camera in cameras)
     tall = as_if_in_feet(surface, highest)
     if not tall:
@@ -298,11 +298,11 @@ class OrthoProduct:
     plan: ProductPlan
     """Grid, table of sources, tiles and anchors' rule."""
     looks: tuple[Look, ...]
-    """What each of its images sees, by row of the table of sources."""
+    """Views of its images, by row of the table of sources."""
     key: str
     """Hash of all that decides the pixels: inputs, orientation, settings, version."""
     part: SingleObject | None = None
-    """What it shows, where it is the product of a single object."""
+    """Object that it shows, if it is the product of a single object."""
 
     @property
     def images(self) -> tuple[str, ...]:
@@ -310,7 +310,7 @@ class OrthoProduct:
         return self.plan.sources
 
     def address(self, project: Project) -> ScenesAddress:
-        """What its images and its ground are opened by."""
+        """Return the address by which its images and its ground are opened."""
         return ScenesAddress.of(project, self.images, self.part)
 
     @property
@@ -337,7 +337,7 @@ class OrthoPlan:
 
     @property
     def of_objects(self) -> bool:
-        """Whether its products are those of single objects."""
+        """True if its products are those of single objects."""
         return any(product.part is not None for product in self.products)
 
     @property
@@ -347,7 +347,7 @@ class OrthoPlan:
 
     @property
     def what(self) -> str:
-        """What it makes, counted."""
+        """Its products, counted."""
         count, several = len(self.products), "" if len(self.products) == 1 else "s"
         if self.of_objects:
             return f"{count} product{several} of single objects"
@@ -517,7 +517,7 @@ def product_plan(
 def _best(
     images: tuple[str, ...], settings: OrthoSettings, choice: Choice, looks: Sequence[Look], regions: Drawn | None
 ) -> BestImage:
-    """Who of many images paints a pixel."""
+    """Return the rule by which one of many images paints a pixel."""
     ranges = np.array([look.footprint.height_range for look in looks])
     first, weights = choice.prefer, choice.weights
     ranks = [float(first.index(name) - len(first)) * PREFERRED if name in first else 0.0 for name in images]
@@ -541,7 +541,7 @@ def check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettin
 
 
 def painting(product: OrthoProduct, settings: OrthoSettings) -> Direct | None:
-    """What paints the tiles of a product, where it is not the engine's resampling."""
+    """Return what paints the tiles of a product, if it is not the engine's resampling."""
     return None if settings.method == "indirect" else Direct(product.looks[0].footprint.height_range, settings.fill)
 
 

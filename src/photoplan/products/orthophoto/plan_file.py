@@ -39,7 +39,7 @@ from photoplan.surfaces.objects import SingleObject
 
 @dataclass(frozen=True, eq=False)
 class PlanFigures:
-    """What compiling every tile of a plan tells, one row a tile, in the plan's order."""
+    """Figures of the compiled tiles of a plan, one row a tile, in the plan's order."""
 
     product: NDArray[np.uint32]
     """Place of the tile's product in the plan."""
@@ -328,7 +328,7 @@ def _look(entry: dict[str, Any]) -> Look:
 def _product(
     entry: dict[str, Any], listed: dict[str, dict[int, tuple[int, ...]]], settings: OrthoSettings, project: Project
 ) -> OrthoProduct:
-    """What `_product_header` says, with the tiles that the layer lists.
+    """Return the product that `_product_header` states, with the tiles that the layer lists.
 
     A person may have deleted some: it is then another product.
     """

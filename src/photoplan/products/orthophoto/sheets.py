@@ -39,10 +39,10 @@ class Sheet:
     """A part of a mosaic that is a file of its own."""
 
     end: str
-    """Of its name."""
+    """End of its name."""
     grid: MapGrid
     clip: Regions | None = None
-    """What of the grid it shows; None: all."""
+    """Part of the grid that it shows; None for all."""
 
 
 def drawn_sheets(grid: MapGrid, path: Path) -> list[Sheet]:

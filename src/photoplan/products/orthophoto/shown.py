@@ -1,4 +1,4 @@
-"""What single images show of a map, where nothing hides the ground: in memory, at a coarse resolution."""
+"""Ground that single images show where nothing hides it: in memory, at a coarse resolution."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _KERNEL, _TOLERANCE = "bilinear", 0.5
 
 
 def shown(scene: Scene, grid: MapGrid, window: Window, side: int) -> Painted:
-    """What an image shows of a window of a map whose tiles have a side; nothing where anything hides the ground."""
+    """Return what an image shows of a window of a map whose tiles have a side; nothing where the ground is hidden."""
     rule = AnchorRule.of(_KERNEL, _TOLERANCE)
     plan = ProductPlan(
         name="shown",

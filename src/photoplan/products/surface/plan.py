@@ -82,7 +82,7 @@ _CLASSES, _LEAST, _LARGEST = 256, -24.0, 8.0
 
 
 def counted(sigmas: NDArray[np.floating]) -> list[int]:
-    """How many standard deviations (metres, NaN: none) lie in each class; those beyond lie in the last."""
+    """Count the standard deviations (metres, NaN: none) in each class; those beyond lie in the last."""
     known = sigmas[np.isfinite(sigmas)].astype(float)
     exponents = np.log2(np.clip(known, 2.0**_LEAST, 2.0**_LARGEST))
     return np.histogram(exponents, _CLASSES, (_LEAST, _LARGEST))[0].tolist()
@@ -105,28 +105,28 @@ _SAME = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class SeenTarget:
-    """What an image sees of a target."""
+    """View of an image on a target."""
 
     name: str
     camera: Camera
     """In the target's coordinates."""
     bounds: Bounds
-    """Of everything that it sees there."""
+    """Bounds of everything that it sees there."""
     heights: tuple[float, float]
-    """Between which that lies."""
+    """Heights between which that lies."""
     gsd: float
     """Its mean ground sampling distance, metres."""
 
 
 def seen_places(one: SeenTarget, bounds: Bounds) -> NDArray[np.bool_]:
-    """Which points of a lattice over the bounds, the same for all, an image sees on the mean of its heights."""
+    """Return True for points of a lattice over the bounds, the same for all, that an image sees on its mean height."""
     u, v = (bounds[k] + (bounds[k + 2] - bounds[k]) * (np.arange(_POINTS) + 0.5) / _POINTS for k in (0, 1))
     at = project_points(one.camera, np.stack([*np.meshgrid(u, v), np.full((_POINTS,) * 2, sum(one.heights) / 2)], -1))
     return _inside(one.camera, at)
 
 
 def _inside(camera: Camera, at: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which image points (..., 2) lie on pixels; NaN does not."""
+    """Return True for image points (..., 2) that lie on pixels; NaN does not."""
     return np.asarray(((at > -0.5) & (at < np.array(camera.size) - 0.5)).all(axis=-1))
 
 
@@ -196,7 +196,7 @@ class StartGap:
     """Heights of a start less those of the project's terrain inside the bounds of a surface."""
 
     median: float = 0.0
-    """Of all places where both have a height, metres; 0 if there is none, or the start is the terrain."""
+    """Median of all places where both have a height, metres; 0 if there is none, or the start is the terrain."""
     share: float = 0.0
     """Part of these places at which they differ by more than the reach, 0 to 1."""
 
@@ -307,7 +307,7 @@ def pixels_of_places(
 
 
 def _reach(settings: SurfaceSettings, looked: Sequence[SeenTarget], frame: Frame | None, height_error: float) -> float:
-    """How far the start may be wrong, metres."""
+    """Return by how much the start may be wrong, metres."""
     flying = _flying_height(looked)
     if 0 < _MOST_WRONG * flying < (settings.reach or 0.0):
         raise UsageError(
@@ -345,7 +345,7 @@ def _heights_of_a_pixel(looked: Sequence[SeenTarget], gsd: float) -> tuple[float
 
 
 def _slope(one: SeenTarget, XY: np.ndarray) -> np.ndarray:
-    """By how much the ground point of a pixel moves on the map per metre of height, at a place, shape (2,)."""
+    """Return the move of the ground point of a pixel on the map per metre of height, at a place, shape (2,)."""
     low, high = one.heights
     level = (low + high) / 2
     J = one.camera.derivatives(np.array([*XY, level]))
@@ -386,7 +386,7 @@ def _pixels_beyond_two(pixels: NDArray[np.float64]) -> float:
 
 
 def _images_of_a_place(looked: Sequence[SeenTarget], grid: MapGrid) -> float:
-    """How many images see a place of a grid in the mean, by their footprints."""
+    """Return the mean number of images that see a place of a grid, by their footprints."""
     b = np.array(grid.bounds)
     seen = np.array([one.bounds for one in looked])
     sides = np.minimum(seen[:, 2:], b[2:]) - np.maximum(seen[:, :2], b[:2])
@@ -394,7 +394,7 @@ def _images_of_a_place(looked: Sequence[SeenTarget], grid: MapGrid) -> float:
 
 
 def _search(looked: Sequence[SeenTarget], pixels: float, height_error: float, reach: float, most: int) -> Search:
-    """How heights are searched whose facets have so many pixels of usual images along a side; `most` levels."""
+    """Return the search for heights whose facets have so many pixels of usual images along a side; `most` levels."""
     at = float(np.median([sum(one.heights) / 2 for one in looked]))
     vantages = [one.camera.vantage for one in looked]
     central = all(vantage.central for vantage in vantages)
@@ -441,7 +441,7 @@ class SurfaceJob:
     residuals: bool = False
     """See `SurfaceSettings.residuals`."""
     frame: Frame | None = None
-    """Of the target; None: the map."""
+    """Frame of the target; None for the map."""
     bands: tuple[int, ...] = ()
     """See `SurfaceSettings.bands`."""
     finer: tuple[int, ...] = ()
@@ -589,7 +589,7 @@ class SurfacePlan(Result):
     grid: MapGrid
     """Its pixels are the height posts."""
     frame: Frame | None
-    """Of the target, in the height system of the cameras; None: the map."""
+    """Frame of the target, in the height system of the cameras; None for the map."""
     scheme: Scheme
     begun: tuple[str, str] | None
     """Path and content digest of the file of heights with which it begins; None: it begins with none."""
@@ -598,7 +598,7 @@ class SurfacePlan(Result):
     gsd: float
     """Median ground sampling distance of the images, metres."""
     height_error: float
-    """What one pixel of parallax between the outermost images is in height, metres."""
+    """Height of one pixel of parallax between the outermost images, metres."""
     gap: StartGap
     """Heights of a start that is not the project's terrain less those of the terrain."""
     seen_share: float
@@ -610,11 +610,11 @@ class SurfacePlan(Result):
     key: str
     """Hash of all that decides the product."""
     force: bool = False
-    """Whether it is also written if the images contradict it."""
+    """True if it is also written if the images contradict it."""
 
     @property
     def address(self) -> ScenesAddress:
-        """What its images and the ground are opened by."""
+        """Address by which its images and the ground are opened."""
         return ScenesAddress.of(self.project, self.images)
 
     @property
@@ -817,7 +817,7 @@ def _on_frame(settings: SurfaceSettings, bounds: Bounds | None) -> SurfaceSettin
 
 
 def _key(project: Project, images: tuple[str, ...], settings: SurfaceSettings, **stated: object) -> str:
-    """What all decides about heights: files, what the project says of the images, settings."""
+    """Return the key of all that decides heights: files, what the project says of the images, settings."""
     address = ScenesAddress.of(project, images)
     files = [Path(path) for path, _ in address.digests]
     if settings.start_file is not None:

@@ -89,7 +89,7 @@ def contradicted(plan: SurfacePlan, totals: Mapping[str, Any]) -> str:
 
 
 def _of_images(plan: SurfacePlan, sigma0: dict[str, float | None], contrast: float) -> Iterator[str]:
-    """What standard deviations of grey values tell."""
+    """Yield lines on the standard deviations of grey values."""
     known = {name: value for name, value in sigma0.items() if value is not None}
     others = {
         name: float(np.median([v for other, v in known.items() if other != name])) for name in known if len(known) > 2
@@ -122,7 +122,7 @@ def _of_images(plan: SurfacePlan, sigma0: dict[str, float | None], contrast: flo
 
 
 def _of_fits(plan: SurfacePlan, misfit_share: float, astray: float) -> Iterator[str]:
-    """What heights tell that fit badly, or went too far."""
+    """Yield lines on heights that fit badly, or went too far."""
     if misfit_share > _MISFITS:
         searched = plan.scheme.search is not None
         helps = "`search`, or a better `start` with a smaller `reach`"
@@ -142,7 +142,7 @@ def _of_fits(plan: SurfacePlan, misfit_share: float, astray: float) -> Iterator[
 
 
 def _of_moves(plan: SurfacePlan, correction: float, sigma_px: float | None) -> Iterator[str]:
-    """What the last corrections tell."""
+    """Yield lines on the last corrections."""
     # Reduced images are all that a coarse surface sees: their pixels count.
     pixel = 2**plan.scheme.base
     if correction > _MOVING * pixel:
@@ -157,7 +157,7 @@ def _of_moves(plan: SurfacePlan, correction: float, sigma_px: float | None) -> I
 
 
 def _of_noise(plan: SurfacePlan, sigma_px: float | None, misfit_share: float) -> Iterator[str]:
-    """What the median standard deviation of the heights tells."""
+    """Yield lines on the median standard deviation of the heights."""
     if sigma_px is None or not sigma_px > _VAGUE * 2**plan.scheme.base:
         return
     part = sigma_px * plan.height_error / plan.scheme.reach
@@ -215,7 +215,7 @@ class SurfaceResult(Result):
     corrections: tuple[float, ...]
     """Mean last correction of the heights on each level, the finest first, pixels of parallax."""
     notes: tuple[str, ...]
-    """What speaks against it, and what helps."""
+    """Sentences that speak against it, with what helps."""
     tiles: int
     resumed: int
     """Tiles taken over from an earlier run."""

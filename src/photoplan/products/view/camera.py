@@ -37,7 +37,7 @@ class ViewGround:
     """Terrain, and the project that it belongs to if there is one."""
 
     terrain: Terrain
-    """With the objects that are painted."""
+    """Terrain with the objects that are painted."""
     bounds: tuple[float, float, float, float] | None
     """Outer edges of the terrain; None: it has no end."""
     crs: str
@@ -109,7 +109,7 @@ class ViewCamera:
     """A camera that has found its place."""
 
     request: CameraRequest
-    """With numbers instead of what depends on the ground: the same view, made again, is the same."""
+    """Camera in numbers instead of what depends on the ground: the same view, made again, is the same."""
     target: ViewTarget
     above_ground: float
     """Height of the point of view above the ground below it, metres; NaN: there is none."""
@@ -118,7 +118,7 @@ class ViewCamera:
     earth_radius: float | None
 
     def json_fields(self) -> dict[str, Any]:
-        """What a record states of it."""
+        """Return what a record states of it."""
         c = self.target.center
         return {
             "standpoint": [float(v) for v in c],

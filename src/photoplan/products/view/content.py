@@ -91,11 +91,11 @@ class ViewScene:
 
 
 class ViewLayer(Protocol):
-    """What gives colours to a part of a view."""
+    """Source of colours for a part of a view."""
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """What it reads."""
+        """Files that it reads."""
         ...
 
     def paint(self, scene: ViewScene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
@@ -145,7 +145,7 @@ class Resampled:
     """Values that become black and white."""
     photos: bool
     classes: bool = False
-    """Whether its values are numbers of classes, which are never mixed."""
+    """True if its values are numbers of classes, which are never mixed."""
 
     def paint(self, scene: ViewScene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
         """See `ViewLayer`."""
@@ -316,7 +316,7 @@ class Label:
     letters: Letters
     column: int
     row: int
-    """Of the upper left pixel of the text."""
+    """Place of the upper left pixel of the text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,12 +337,12 @@ class Stroke:
 
 @dataclass(frozen=True)
 class OverlayFacts:
-    """What became of what was to be drawn."""
+    """Counts of what was drawn."""
 
     features: int
     """Lines and points."""
     seen: int
-    """Those of which something is seen."""
+    """Features of which something is seen."""
     labels: int
     """Labels that are drawn."""
     unplaced: int
@@ -391,7 +391,7 @@ class Overlay:
                     _blend(picture[at], part, colour)
 
     def svg(self, picture: str | None) -> str:
-        """As an SVG of the picture's size; `picture` is the name of the file that lies below it, beside the SVG."""
+        """Return an SVG of the picture's size; `picture` is the file that lies below it, next to the SVG."""
         width, height = self.size
         out = [
             '<?xml version="1.0" encoding="UTF-8"?>',
@@ -542,7 +542,7 @@ def placed(
 
 
 def _fits(box: Box, leader: Box, boxes: Sequence[Box], lines: Sequence[Box]) -> bool:
-    """Whether a label and its leader keep away from what is there."""
+    """Return True if a label and its leader keep away from what is there."""
     if any(_meet(box, other, 2 * _MARGIN) or _meet(leader, other, _MARGIN) for other in boxes):
         return False
     return not any(_meet(box, other, _MARGIN) for other in lines)

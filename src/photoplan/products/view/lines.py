@@ -40,7 +40,7 @@ _MOST = 5_000_000
 
 @dataclass(frozen=True)
 class LineStyle:
-    """How a line looks; of points the width is the diameter of the mark."""
+    """Look of a line; the width of a point is the diameter of its mark."""
 
     colour: Colour
     width: float
@@ -51,7 +51,7 @@ class LineStyle:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """What is drawn, on the map of the ground."""
+    """Lines and points that are drawn, on the map of the ground."""
 
     styles: tuple[LineStyle, ...]
     lines: Lines
@@ -61,9 +61,9 @@ class Drawing:
     """Shape (k, 3); NaN height: on the ground."""
     point_style: NDArray[np.int64]
     labels: tuple[str, ...]
-    """Of the points; ``{H}`` and ``{distance}`` in them stand for numbers that the view knows."""
+    """Labels of the points; ``{H}`` and ``{distance}`` in them stand for numbers that the view knows."""
     rank: NDArray[np.float64]
-    """Of the points; labels of lower ranks come first. NaN: by height."""
+    """Ranks of the points; labels of lower ranks come first, NaN by height."""
 
 
 def open_drawing(requests: Sequence[LinesRequest], ground: ViewGround, reach: float, center: Any) -> Drawing:

@@ -111,7 +111,7 @@ class ViewAddress:
     look: LookRequest
     photo: PhotoRequest | None
     heights: tuple[float, float]
-    """Of what is seen, for tints."""
+    """Heights of what is seen, for tints."""
     farthest: float
     bound: float
     matrix: str | None
@@ -197,17 +197,17 @@ class _Finer:
 
 @dataclass(frozen=True)
 class ViewJob:
-    """What a worker is told once of a view."""
+    """Job of a worker."""
 
     address: ViewAddress
     matrix: bool = False
-    """Whether tiles are those of the coordinate matrix, or of the picture."""
+    """True if tiles are those of the coordinate matrix, not of the picture."""
     overlay: Overlay | None = None
-    """What is drawn over the picture."""
+    """Lines and labels over the picture."""
     right: ViewJob | None = None
     """The right picture of a stereo pair, of which this is the left one."""
     beside: bool = False
-    """Whether the right picture lies beside this one, or both make an anaglyph."""
+    """True if the right picture lies next to this one, False if both make an anaglyph."""
 
     def __call__(self, tile: Tile) -> Made:
         """Colours or ground of a tile, and counts of its pixels."""
@@ -316,7 +316,7 @@ def matrix_bands(target: ViewTarget, seen: Seen) -> Output | None:
 
 
 def from_matrix(view: OpenView, window: Window) -> Seen:
-    """What pixels show, as a coordinate matrix has it."""
+    """Return what pixels show, as a coordinate matrix has it."""
     assert view.matrix is not None
     bands = view.matrix.read(window)
     XYZ = np.moveaxis(bands[:3], 0, -1)
@@ -350,7 +350,7 @@ def _counts(target: ViewTarget, seen: Seen) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class ViewResult:
-    """What came out."""
+    """File and counts of a picture or matrix."""
 
     path: Path
     size: tuple[int, int]
@@ -359,7 +359,7 @@ class ViewResult:
     """Pixels that show no ground (of a picture with several rays to a pixel: rays)."""
     rays: int
     lost: int
-    """Those of them that point downwards: they pass the border of the terrain, or a hole of it."""
+    """Sky pixels whose rays point downwards: they pass the border of the terrain, or a hole of it."""
     nearest: float | None
     farthest: float | None
     """Distances of ground, metres."""
@@ -368,7 +368,7 @@ class ViewResult:
     seconds: float
     svg: Path | None = None
     drawn: OverlayFacts | None = None
-    """What became of lines and labels."""
+    """Counts of lines and labels."""
 
     def json_fields(self) -> dict[str, Any]:
         """Counts of rays."""
@@ -384,7 +384,7 @@ _FIRST_LOOK = 64
 
 @dataclass(frozen=True)
 class FirstLook:
-    """What a few rays tell of a view."""
+    """Estimate of a view from a few rays."""
 
     ground: float
     """Share of pixels that show ground, 0 to 1."""
@@ -399,7 +399,7 @@ class FirstLook:
 
 
 def first_look(target: ViewTarget, surface: SeenSurface) -> FirstLook:
-    """What some rays over the whole picture meet."""
+    """Return what some rays over the whole picture meet."""
     width, height = target.bundle.size
     step = max(1.0, max(width, height) / _FIRST_LOOK)
     u, v = (np.arange((side % step) / 2 if side > step else 0.0, side, step) for side in (width, height))
@@ -436,7 +436,7 @@ class ViewPlan(Result):
 
     @property
     def placement(self) -> Placement:
-        """Of what is written: wider than the picture where a photo lies beside it."""
+        """Size of what is written: wider than the picture if a photo lies next to it."""
         photo, (width, height) = self.address.photo, self.camera.target.bundle.size
         beside = (photo is not None and photo.how == "beside") or (self.stereo is not None and self.stereo.beside)
         return Placement((2 * width if beside else width, height))
@@ -448,7 +448,7 @@ class ViewPlan(Result):
 
     @property
     def stereo(self) -> Stereo | None:
-        """How a pair is made, its base in metres; None: there is one picture."""
+        """The pair with its base in metres; None if there is one picture."""
         return None if self.request.pair is None else self.request.pair.stated(self.first.nearest)
 
     @property
@@ -582,7 +582,7 @@ def camera_request(request: SightRequest, matrix: Path | None = None) -> CameraR
 
 
 def _stated_camera(file: MatrixFile) -> dict[str, Any]:
-    """Which camera a matrix says it is of."""
+    """Return the camera that a matrix states."""
     try:
         return dict(json.loads(file.description)["camera"])
     except (ValueError, KeyError, TypeError, RecursionError) as error:
@@ -746,7 +746,7 @@ def view_work(plan: ViewPlan, run: Run, workers: Workers) -> Work[ViewResult]:
 
 
 def _job(plan: ViewPlan) -> ViewJob:
-    """What workers are told; of a pair for both pictures."""
+    """Return the job of workers; that of a pair makes both pictures."""
     if plan.stereo is None:
         return ViewJob(plan.address, plan.request.kind == "matrix", draw(plan, plan.camera))
     ground = open_view_ground(plan.request.source, plan.request.crs, plan.request.water)
@@ -758,7 +758,7 @@ def _job(plan: ViewPlan) -> ViewJob:
 
 
 def draw(plan: ViewPlan, camera: ViewCamera) -> Overlay | None:
-    """What is drawn over the picture of a camera; None: nothing."""
+    """Return what is drawn over the picture of a camera; None for nothing."""
     request = plan.request
     if not request.lines:
         return None

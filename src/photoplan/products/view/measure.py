@@ -199,7 +199,7 @@ class Picked:
     surface: str
     """`terrain`, the name of an object, or `sky`; of a hidden point what hides it."""
     seen: bool
-    """Of a pixel whether it shows ground; of a point whether it is in the picture and nothing hides it."""
+    """True if a pixel shows ground, or if a point is in the picture and nothing hides it."""
 
     def __str__(self) -> str:
         if self.E != self.E:

@@ -126,7 +126,7 @@ class PhotoMatch:
     turn: _Floats | None = None
     """All of it, by `orientation.skyline.UNKNOWNS`, (3,) or (4,)."""
     doubt: str | None = None
-    """What speaks against the turn; None: nothing."""
+    """Sentence that speaks against the turn; None if nothing does."""
 
     @property
     def figures(self) -> dict[str, Any]:
@@ -172,7 +172,7 @@ def against_photo(request: SkylineRequest, camera: ViewCamera, find: Finder) -> 
 
 
 def doubt(stated: ViewTarget, now: ViewTarget, XYZ: _Floats, search: int) -> str | None:
-    """Of a camera whose skyline XYZ (n, 3) went round by round to an edge beyond `search` rows; None: it did not."""
+    """Return a doubt if the skyline XYZ (n, 3) of a camera went round by round to an edge beyond `search` rows."""
     rows = np.abs(now.to_view(XYZ)[:, 1] - stated.to_view(XYZ)[:, 1])
     if not np.nanmedian(rows) > search:
         return None
@@ -183,7 +183,7 @@ def doubt(stated: ViewTarget, now: ViewTarget, XYZ: _Floats, search: int) -> str
 
 
 def _turn(target: ViewTarget, turn: _Floats, line: Seen, edge: _Floats) -> SkylineFit:
-    """What is to be added to a turn so that a skyline, found with it, lies on the edge."""
+    """Return what is to be added to a turn so that a skyline, found with it, lies on the edge."""
 
     def pixels(step: _Floats) -> _Floats:
         return turned(target, turn + step).to_view(line.XYZ)[:, :2]
@@ -200,7 +200,7 @@ def turned(target: ViewTarget, step: _Floats) -> ViewTarget:
 
 
 def _moved(target: ViewTarget, step: _Floats) -> float:
-    """By how much a turn moves the middle and the corners of a picture at most, nearly, pixels."""
+    """Return by how much a turn moves the middle and the corners of a picture at most, nearly, pixels."""
     width, height = target.bundle.size
     corners = np.array([(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)], float)
     places = target.bundle.center + target.bundle.directions(np.vstack([corners, corners.mean(axis=0)]))
@@ -290,7 +290,7 @@ class RefinedCamera:
     after: tuple[float, ...]
     sigma: tuple[float, ...]
     unit: str
-    """Of all of them: deg, gon or rad."""
+    """Unit of all of them: deg, gon or rad."""
     used: int
     """Columns of the photograph that decided."""
     correlated: float
@@ -298,7 +298,7 @@ class RefinedCamera:
     text: str
     """The file that holds it."""
     constant: tuple[float, float] | None = None
-    """Of an image, where it was free: the factor of its camera's constant, and the standard deviation of that."""
+    """Factor of an image's camera constant, if it was free, and its standard deviation."""
 
     def json_fields(self) -> dict[str, Any]:
         """Its numbers."""

@@ -44,7 +44,7 @@ class Skyline(Result):
     """A row for each column that shows both ground and sky above it, by `COLUMNS`: place in the picture (pixels), the
     ground there (metres), its distance (metres), its direction from grid north (degrees); shape (n, 7)."""
     surfaces: tuple[str, ...]
-    """What is there: `terrain`, or the name of an object."""
+    """Surface there: `terrain`, or the name of an object."""
     columns: int
     """Width of the picture, pixels."""
     request: SkylineRequest
