@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -106,6 +107,50 @@ def test_options_of_the_command_come_from_the_fields() -> None:
     assert titles == ["Input:", "Result:", "Method:", "Run:"]
     assert text.index("Input:") < text.index("--bounds") < text.index("Result:") < text.index("--output")
     assert "[d8|dinf]" in text and "[default: d8]" in text and "--scene [auto|z<0]" in text
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A value that reads itself from text."""
+
+    a: int
+    b: int
+
+    @classmethod
+    def parse(cls, text: str) -> Pair:
+        return cls(*map(int, text.split(":")))
+
+
+class Both(Request):
+    """A request that may hold another one, with an option that one of its classes judges."""
+
+    inner: Inner | None = None
+    pairs: tuple[Pair, ...] = opt("Pairs; may be repeated.", (), flag="pair")
+    at: tuple[float, ...] | None = opt("A place.", None, nargs=2)
+    roof: bool = opt("Show the roof, or the ground.", False, other="ground")
+    limit: float = opt("Limit.", 1.0, nan=True)
+    hidden: int = 3
+    project: Path = arg(project=True)
+
+
+def test_values_read_themselves_from_text_and_only_given_options_are_set(tmp_path: Path) -> None:
+    made: list[Both] = []
+    command = Verb("", "", "x", "y").command_of(Both, "both", lambda request, **_: made.append(request))
+    (tmp_path / "project.toml").touch()
+    for words in ((), ("--pair", "1:2", "--pair", "3:4", "--at", "1", "2", "--ground"), ("--width", "1")):
+        command.main([str(tmp_path), *words], standalone_mode=False)
+    bare, full, inner = made
+    assert bare.model_fields_set == {"project"} and bare.inner is None and bare.project.name == "project.toml"
+    assert full == Both(tmp_path, pairs=["1:2", Pair(3, 4)], at=(1, 2), roof=False) and full.inner is None
+    assert full.model_fields_set == {"project", "pairs", "at", "roof"}
+    assert inner.inner == Inner() and inner.inner.model_fields_set == {"width"}
+    assert full.replace(at=None).model_fields_set == full.model_fields_set
+    assert Both(tmp_path, inner={"width": 2}).inner == Inner(width=2)
+    assert full.part(Inner, width=3) == Inner(width=3)
+    assert not [p.name for p in command.params if p.name == "hidden"]
+    assert Both(tmp_path, limit=float("nan")).limit != 1
+    with pytest.raises(UsageError, match="NaN"):
+        Inner(width=float("nan"))
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,13 @@ import pytest
 import rasterio
 import rasterio.enums
 from numpy.typing import NDArray
+from tools.command import inside
 from tools.kinds import FEW
 from tools.kinds import NAMES as KERNELS
 from tools.small_block import FOCAL, NAMES, SIZE, X0, Y0, YAML, Z0, Block, make_project, write_image, write_terrain
 from tools.thinned import some
 
+import photoplan as pp
 from photoplan.cameras.base import project
 from photoplan.errors import GeometryError, UsageError
 from photoplan.io.project.file import load_project
@@ -271,3 +273,19 @@ def test_bands_keep_their_names_and_colours(small: Block) -> None:
     with rasterio.open(path) as file:
         assert file.descriptions == ("B", "G", "R", "near infrared")
         assert list(file.colorinterp) == colours
+
+
+def test_options_that_are_not_set_are_those_of_the_project(small: Block) -> None:
+    """Also on the command line, where an option may be given its usual value."""
+    text = small.project.read_text()
+    small.project.write_text(text.replace("\n[ortho]\n", '\n[ortho]\nkernel = "nearest"\nresolution = 3.0\n'))
+    for given, kernel in (({}, "nearest"), ({"kernel": "bicubic"}, "bicubic")):
+        plan = pp.make_products(pp.OrthoRequest(small.project, dry_run=True, **given)).plan
+        assert (plan.settings.kernel, plan.settings.resolution) == (kernel, 3.0)
+        words = [word for name, value in given.items() for word in (f"--{name}", value)]
+        assert f"kernel {kernel}" in inside("ortho", small.project, "--dry-run", *words).out
+    request = pp.OrthoRequest(small.project, images=("one",), output=small.folder / "made", quicklook=False)
+    (path, *_) = pp.make_products(request).written()
+    assert path == small.folder / "made" / "one_ortho.tif" and path.is_file()
+    with pytest.raises(UsageError, match="exists"):
+        pp.make_products(request)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from photoplan.cli.lazy import LazyGroup
 from photoplan.cli.verb import Verb
 
-VERBS: dict[str, str | Verb] = {
+VERBS: dict[str, Verb] = {
     "build": Verb(
         "Predict a terrain model from points and lines.",
         """Predict a terrain model from files of points and lines: text, LAS, LandXML, GeoPackage, Shapefile, DXF.
@@ -135,7 +135,6 @@ VERBS: dict[str, str | Verb] = {
 command = LazyGroup(
     name="dtm",
     verbs=VERBS,
-    package="photoplan.cli.dtm_",
     help="""Terrain models with breaklines.
 
     A job goes: build → info → sample, contours … A MODEL is a file of `dtm build`, or a GeoTIFF of heights.

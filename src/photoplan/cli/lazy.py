@@ -21,11 +21,9 @@ GROUPS = ("dtm", "view")
 class LazyGroup(click.Group):
     """Lists verbs without importing them."""
 
-    def __init__(self, *arguments: Any, verbs: Mapping[str, str | Verb], package: str, **options: Any) -> None:
+    def __init__(self, *arguments: Any, verbs: Mapping[str, str | Verb], **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.verbs = verbs
-        self.package = package
-        """Start of the name of the module that holds the `command` of a verb."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a verb; its errors name parameters as the verb's options."""
@@ -39,7 +37,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The verb and what follows it, with the numbers of options that take several written apart."""
+        """Return the verb and what follows it, with the numbers of options that take several written apart."""
         if args and args[0] not in self.verbs and not args[0].startswith("-"):
             ctx.fail(f"No such command {args[0]!r}{self._meant(args[0], ctx)}")
         name, command, rest = super().resolve_command(ctx, args)
@@ -56,21 +54,19 @@ class LazyGroup(click.Group):
         return f"; did you mean {' or '.join(meant[:3])}?" if meant else f"; see `{ctx.command_path} --help`"
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """The verbs, in the order of a job."""
+        """Return the verbs, in the order of a job."""
         return list(self.verbs)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of a verb, imported now."""
-        if cmd_name not in self.verbs:
-            return None
-        verb = self.verbs[cmd_name]
-        if isinstance(verb, Verb):
-            return verb.command(cmd_name)
-        command: click.Command = importlib.import_module(self.package + cmd_name).command
-        return command
+        """Return the command of a verb, made now; that of a group is imported."""
+        verb = self.verbs.get(cmd_name)
+        if isinstance(verb, str):
+            command: click.Command = importlib.import_module(f"photoplan.cli.{cmd_name}").command
+            return command
+        return None if verb is None else verb.command(cmd_name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """One line for each verb."""
+        """Write one line for each verb."""
         with formatter.section("Verbs"):
             formatter.write_dl(
                 [(name, verb if isinstance(verb, str) else verb.short) for name, verb in self.verbs.items()]
@@ -84,7 +80,7 @@ _NUMBERS = (type(click.INT), type(click.FLOAT))
 
 
 def apart(command: click.Command, args: list[str]) -> list[str]:
-    """Arguments in which `1,2,3,4` and `1, 2, 3, 4` of an option of several numbers are four words."""
+    """Return arguments in which `1,2,3,4` and `1, 2, 3, 4` of an option of several numbers are four words."""
     counts = {
         word: option.nargs
         for option in command.params

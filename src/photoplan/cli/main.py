@@ -1,4 +1,4 @@
-"""The command `photoplan`: one file per verb, loaded when it is called."""
+"""The command `photoplan`: a table of verbs, errors, exit codes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from photoplan.cli.output import printable
 from photoplan.cli.verb import Verb
 from photoplan.errors import PhotoplanError, PhotoplanWarning, ResourceError
 
-#: Verb and its one-line help, in the order of a job; the command is `photoplan.cli.<verb>:command`.
+#: A row for each command, in the order of a job; a group is a module of its own with one line here.
 VERBS: dict[str, str | Verb] = {
     "init": Verb(
         "Write a project file from the files you have.",
@@ -331,7 +331,6 @@ VERBS: dict[str, str | Verb] = {
 @click.group(
     cls=LazyGroup,
     verbs=VERBS,
-    package="photoplan.cli.",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(package_name="photoplan")

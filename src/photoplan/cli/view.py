@@ -8,7 +8,7 @@ from photoplan.cli.lazy import LazyGroup
 from photoplan.cli.verb import Verb
 
 #: A row for each command.
-VERBS: dict[str, str | Verb] = {
+VERBS: dict[str, Verb] = {
     "picture": Verb(
         "A picture of terrain, rasters or photos (this word may be left out).",
         """Make a picture of SOURCE, a project or terrain model, from a standpoint or with an image's own camera.
@@ -84,7 +84,6 @@ class _Views(LazyGroup):
 command = _Views(
     name="view",
     verbs=VERBS,
-    package="photoplan.cli.view_",
     help="""Perspective views of a project or a terrain model: photoplan view FILE --from X Y --look-at X Y -o PICTURE.
 
     `photoplan view panorama` looks all around (picture --panorama cylinder; --panorama sphere comes after it).

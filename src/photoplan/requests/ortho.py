@@ -105,8 +105,9 @@ class PixelOptions(Request):
         "Compression of the file: deflate, zstd, lzw, jpeg or none [deflate].", "deflate", metavar="NAME",
         section="result"
     )  # fmt: skip
-    nodata: str = opt("Value without data: a number, mask, or auto: 0 for integers, NaN for floats.", "auto",
-                      section="result")  # fmt: skip
+    nodata: Annotated[str | float, BeforeValidator(str)] = opt(
+        "Value without data: a number, mask, or auto: 0 for integers, NaN for floats.", "auto", section="result"
+    )
     overviews: bool = opt("Write overviews into the file [yes].", True, section="result")
     tile: int = opt("Side of a tile, a multiple of 16.", 512, metavar="PX", section="run")
 
