@@ -242,7 +242,9 @@ def filter_toml(folder: Path) -> Path:
 
 
 def run_record(folder: Path) -> Path:
-    (folder / "m.run.json").write_text(json.dumps({"product": "m.tif", "photoplan": "0", "inputs": [{"file": "a"}]}))
+    (folder / "m.run.json").write_text(
+        json.dumps({"key": "0", "versions": {"photoplan": "0"}, "inputs": [{"file": "a"}]})
+    )
     return folder / "m.run.json"
 
 
