@@ -113,6 +113,18 @@ class Request(BaseModel):
         """Pictures and reports whose places follow from other options, by their keys in the table of verbs."""
         return {}
 
+    @classmethod
+    def may_be_stated(cls) -> list[str]:
+        """Return the options that a project file may state: those that choose a method, and write and run nothing."""
+        names: list[str] = []
+        for name, field in cls.model_fields.items():
+            how = how_of(field)
+            if isinstance(field.annotation, type) and issubclass(field.annotation, Request):
+                names += field.annotation.may_be_stated()
+            elif not (set(how) & {"argument", "writes", "folder"} or how.get("section", "method") != "method"):
+                names.append(name)
+        return names
+
     def files_read(self) -> list[Path]:
         """Return the files that it reads, in the order of the fields."""
         return [path for paths in self._files(False).values() for path in paths]

@@ -16,6 +16,7 @@ from click.core import ParameterSource
 
 from photoplan.cli.options import BYTES, NEW_FOLDER, PATH, all_cores, listed
 from photoplan.cli.output import can_draw, say, show, show_json, spelled, talking
+from photoplan.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from photoplan.report.page import ReportFile
@@ -78,11 +79,45 @@ class VerbCommand(click.Command):
         """Call the operation with the request; a value that nobody gave is left out, since it may be the project's."""
         given = dict(ctx.params)
         as_json, quiet = given.pop("as_json"), given.pop("quiet")
-        for name, option in ((each.name or "", each) for each in self.params):
+        place, stated = self._stated(ctx)
+        for option in self.params:
+            name = option.name or ""
             if ctx.get_parameter_source(name) is ParameterSource.DEFAULT and given.get(name) == option.default:
                 given.pop(name, None)
+                if name in stated:
+                    given[name] = self._checked(ctx, option, f"{place} {name}", stated[name])
+            else:
+                stated.pop(name, None)
         assert self.callback is not None
-        return ctx.invoke(self.callback, request=_request(self.kind, given), as_json=as_json, quiet=quiet)
+        try:
+            request = _request(self.kind, given)
+        except UsageError as error:
+            if any(f"`{name}`" in str(error) for name in stated):
+                raise InputError(f"{place} {error}") from None
+            raise
+        return ctx.invoke(self.callback, request=request, as_json=as_json, quiet=quiet)
+
+    def _stated(self, ctx: click.Context) -> tuple[str, dict[str, Any]]:
+        """Return where the project states options of the command, ``[defaults.VERB]``, and these."""
+        from photoplan.request import how_of
+
+        fields, known = self.kind.model_fields, self.kind.may_be_stated()
+        project = next((ctx.params[name] for name in fields if how_of(fields[name]).get("project")), None)
+        if project is None or not known:
+            return "", {}
+        from photoplan.io.project.file import stated_defaults
+
+        place, values = stated_defaults(project, self.name or "")
+        for name in values:
+            if name not in known:
+                raise InputError(f"{place} {name}: no option that a project may state; these are {', '.join(known)}")
+        return place, dict(values)
+
+    def _checked(self, ctx: click.Context, option: click.Parameter, place: str, value: Any) -> Any:
+        try:
+            return option.process_value(ctx, value)
+        except click.BadParameter as error:
+            raise InputError(f"{place}: {error.message}") from None
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, those of a section together."""

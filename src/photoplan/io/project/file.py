@@ -70,6 +70,7 @@ def project_text(project: Project) -> str:
         *_observations(project.observations),
         *_adjustment(project.adjustment),
         *_ortho(project.ortho),
+        *(line for verb, options in project.defaults.items() for line in _defaults(verb, options)),
     ]
     for name, camera in project.cameras.items():
         lines += camera_lines(name, camera)
@@ -209,6 +210,10 @@ def _ortho(ortho: OrthoDefaults) -> list[str]:
     ]
 
 
+def _defaults(verb: str, options: Mapping[str, Any]) -> list[str]:
+    return [f"[defaults.{toml_key(verb)}]", *_entries((name, value, "") for name, value in options.items()), ""]
+
+
 def camera_lines(name: str, camera: CameraEntry) -> list[str]:
     """The ``[cameras.NAME]`` table of a camera."""
     comments = {**camera.comments, "restore": "filter that its images are restored with", "lens": "", "sigma": ""}
@@ -245,6 +250,17 @@ def load_project(path: str | Path) -> Project:
     data, text = read_toml(path)
     folder = path.resolve().parent
     return parse_project(_with_sizes(data, folder), folder, str(path), text)
+
+
+def stated_defaults(path: str | Path, verb: str) -> tuple[str, dict[str, Any]]:
+    """Return where a project file states options of a command, and these; of a file with faults none."""
+    try:
+        data, _ = read_toml(Path(path))
+    except InputError:
+        return "", {}
+    tables = data.get("defaults")
+    values = tables.get(verb) if isinstance(tables, dict) else None
+    return f"{path}: [defaults.{verb}]", values if isinstance(values, dict) else {}
 
 
 def _with_sizes(data: dict[str, Any], folder: Path) -> dict[str, Any]:

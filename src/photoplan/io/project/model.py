@@ -693,6 +693,8 @@ class Project(Entry):
     cameras: dict[Name, Camera] = Field(default_factory=dict)
     images: tuple[AnyImage, ...]
     ortho: OrthoDefaults = OrthoDefaults()
+    defaults: dict[Name, dict[Name, Any]] = Field(default_factory=dict)
+    """Options of commands, by the command's name, that hold unless others are given."""
     folder: SkipJsonSchema[Path] = Field(default=Path(), exclude=True)
     """Folder of the project file, from which relative paths start; not an entry of the file."""
     _unusable: dict[str, str] = PrivateAttr(default_factory=dict)
