@@ -38,7 +38,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.camera.csm_frame import read_frame
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.line.file import read_line
-from photoplan.io.camera.rpc.file import read_rpc
+from photoplan.io.camera.rpc import read_rpc
 from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.objects import read_objects
 from photoplan.io.orientation.file import read_orientation_block, write_orientation

@@ -19,7 +19,7 @@ from photoplan.io.camera.csm_frame import is_frame, read_frame
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.line.correction import read_line_correction
 from photoplan.io.camera.line.file import describe_line, is_line
-from photoplan.io.camera.rpc.file import is_rpc, read_rpc, rpc_beside, rpc_in
+from photoplan.io.camera.rpc import is_rpc, read_rpc, rpc_beside, rpc_in
 from photoplan.io.files import looks_like, raster_driver, read_json, read_toml
 from photoplan.io.objects import read_objects
 from photoplan.io.orientation.file import choose_format, read_orientation_block

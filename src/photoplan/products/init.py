@@ -34,7 +34,7 @@ from photoplan.geometry.units import metric_heights, unit_label
 from photoplan.io.camera.file import CameraFile, read_cameras
 from photoplan.io.camera.model import CameraEntry, Triple
 from photoplan.io.camera.opensfm import resized
-from photoplan.io.camera.rpc.file import read_rpc, rpc_beside, rpc_in
+from photoplan.io.camera.rpc import read_rpc, rpc_beside, rpc_in
 from photoplan.io.disk import make_parents, received
 from photoplan.io.files import ImageNames, check_input_name, crs_beside, relative_path, shortest_paths
 from photoplan.io.orientation.file import read_orientation

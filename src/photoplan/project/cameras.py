@@ -24,7 +24,7 @@ from photoplan.io.camera.line.correction import read_line_correction, read_pose_
 from photoplan.io.camera.line.file import read_line
 from photoplan.io.camera.line.model import StatedLine
 from photoplan.io.camera.model import CameraEntry
-from photoplan.io.camera.rpc.file import read_rpc
+from photoplan.io.camera.rpc import read_rpc
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.project.model import (
     FrameImage,

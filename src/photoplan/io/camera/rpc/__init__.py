@@ -1,1 +1,0 @@
-"""Rational polynomials of satellite images, from the files that they are delivered in; one file per format."""
