@@ -1,7 +1,7 @@
 """Oriented images together with their cameras, and what a file format for them is.
 
-How a format is added: a module in this folder defines `FORMAT`, an `OrientationFormat` of four functions, and
-`photoplan.io.orientation.file.FORMATS` gets a line. Nothing else changes.
+To add a format, define an `OrientationFormat` of four functions in a module of its family, and add a line to
+`photoplan.io.orientation.file.FORMATS`. Nothing else changes.
 """
 
 from __future__ import annotations

@@ -15,18 +15,18 @@ from photoplan.io.orientation.table import OrientationTable
 from photoplan.io.product import check_output
 from photoplan.io.store import together, write_atomically
 
-#: Module of every format, by name; each defines `FORMAT` (see `photoplan.io.orientation.block`).
+#: Module and value of every format, by name; the value is `FORMAT` unless it is named.
 FORMATS: dict[str, str] = {
-    "csv": "photoplan.io.orientation.csv",
+    "csv": "photoplan.io.orientation.text:CSV",
     "toml": "photoplan.io.orientation.toml",
     "opensfm": "photoplan.io.orientation.opensfm",
-    "patb": "photoplan.io.orientation.patb",
-    "bingo": "photoplan.io.orientation.bingo",
-    "bluh": "photoplan.io.orientation.bluh",
+    "patb": "photoplan.io.orientation.text:PATB",
+    "bingo": "photoplan.io.orientation.text:BINGO",
+    "bluh": "photoplan.io.orientation.text:BLUH",
     "inpho": "photoplan.io.orientation.inpho",
     "metashape": "photoplan.io.orientation.metashape",
     "pix4d": "photoplan.io.orientation.pix4d",
-    "opk": "photoplan.io.orientation.opk",
+    "opk": "photoplan.io.orientation.text:OPK",
     "exif": "photoplan.io.orientation.exif",
     "odm": "photoplan.io.orientation.odm",
     "colmap": "photoplan.io.orientation.colmap",
@@ -41,7 +41,8 @@ def orientation_format(name: str) -> OrientationFormat:
     """The format of a name."""
     if name not in FORMATS:
         raise UsageError(f"orientation format {name!r}; allowed are {', '.join(FORMATS)}")
-    found: OrientationFormat = import_module(FORMATS[name]).FORMAT
+    module, _, value = FORMATS[name].partition(":")
+    found: OrientationFormat = getattr(import_module(module), value or "FORMAT")
     return found
 
 
