@@ -48,7 +48,7 @@ def test_what_fails_is_not_kept(made: list[Path], tmp_path: Path) -> None:
 def test_code_that_is_imported_counts_and_other_code_does_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     found = closure(["photoplan.products.film"])
     assert {"photoplan.errors", "photoplan.geometry.pose", "photoplan.products.film"} <= found
-    assert "photoplan.products.restore" not in found and "photoplan.cli.ortho" not in found
+    assert "photoplan.products.restore" not in found and "photoplan.cli.verb" not in found
     root = tmp_path / "photoplan"
     (root / "one").mkdir(parents=True)
     (root / "one" / "__init__.py").write_text("")
