@@ -8,8 +8,9 @@ from collocation_twin import collocation, covariance, distances
 from numpy.typing import NDArray
 
 from photoplan.kernels.collocation import EXPONENTIAL, GAUSSIAN, MATERN
-from photoplan.kernels.fit_covariance import block_score, minimise
+from photoplan.kernels.fit_covariance import block_score
 from photoplan.kernels.jit import COMPILED
+from photoplan.terrain.covariance import minimise
 
 NOISE = 2e-4
 

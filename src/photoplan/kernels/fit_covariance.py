@@ -1,4 +1,4 @@
-"""How well a covariance function predicts each point of some blocks from the others, and the best one."""
+"""Scores of covariance functions: how well they predict each point of some blocks from the others."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def block_score(
 
 
 @kernel
-def _objective(
+def score(
     d2: NDArray[Any],
     sides: NDArray[Any],
     b: NDArray[Any],
@@ -82,7 +82,10 @@ def _objective(
     logs: NDArray[Any],
     family: int,
 ) -> float:
-    """Sum over blocks plus the prior: (log − prior[0])² · prior[1] for each parameter, bounds in prior[2:4]."""
+    """Sum `block_score` over blocks, and add the prior.
+
+    The prior of each logarithm is (log − prior[0])² · prior[1]; beyond the bounds prior[2:4] the score is infinite.
+    """
     total = 0.0
     for p in range(3):
         if logs[p] < prior[2, p] or logs[p] > prior[3, p]:
@@ -94,67 +97,3 @@ def _objective(
         if not total < np.inf:
             return np.inf
     return total
-
-
-def minimise(
-    d2: NDArray[Any],
-    sides: NDArray[Any],
-    b: NDArray[Any],
-    noise: NDArray[Any],
-    prior: NDArray[Any],
-    first: NDArray[Any],
-    family: int,
-) -> tuple[NDArray[Any], float]:
-    """Logarithms of the parameters of the best prediction, by the simplex of Nelder and Mead; and the objective.
-
-    Not compiled: its time is that of the objective, and numba would take 10 s for this little of NumPy.
-
-    Parameters
-    ----------
-    d2, sides, b, noise : ndarrays, shapes (k, n, n), (k, n, n), (k, n, 4), (k, n, 3)
-        As in `block_score`, for k blocks.
-    prior : ndarray, shape (4, 3)
-        Mean, weight, lowest and highest value of the logarithms. Equal bounds hold a parameter fixed.
-    first : ndarray, shape (3,)
-        Where to start.
-    """
-    # A simplex of the free parameters only: one with a corner too many in a plane collapses onto a line.
-    free = np.flatnonzero(prior[3] > prior[2])
-    last = len(free)
-    simplex, values = np.empty((last + 1, 3)), np.empty(last + 1)
-    for i in range(last + 1):
-        simplex[i] = first
-        if i > 0:
-            p = free[i - 1]
-            step = min(0.7, prior[3, p] - prior[2, p])
-            simplex[i, p] += step if first[p] + step <= prior[3, p] else -step
-        values[i] = _objective(d2, sides, b, noise, prior, simplex[i], family)
-    for _ in range(120):
-        order = np.argsort(values)
-        simplex, values = simplex[order], values[order]
-        if last == 0 or (values[last] - values[0] < 0.02 and values[last] < np.inf):
-            break
-        middle = simplex[:last].sum(axis=0) / last
-        reflected = middle + (middle - simplex[last])
-        at = _objective(d2, sides, b, noise, prior, reflected, family)
-        if at < values[0]:
-            further = middle + 2.0 * (middle - simplex[last])
-            there = _objective(d2, sides, b, noise, prior, further, family)
-            if there < at:
-                simplex[last], values[last] = further, there
-            else:
-                simplex[last], values[last] = reflected, at
-            continue
-        if at < values[max(last - 1, 0)]:
-            simplex[last], values[last] = reflected, at
-            continue
-        nearer = middle + 0.5 * ((reflected if at < values[last] else simplex[last]) - middle)
-        there = _objective(d2, sides, b, noise, prior, nearer, family)
-        if there < min(at, values[last]):
-            simplex[last], values[last] = nearer, there
-            continue
-        for i in range(1, last + 1):
-            simplex[i] = simplex[0] + 0.5 * (simplex[i] - simplex[0])
-            values[i] = _objective(d2, sides, b, noise, prior, simplex[i], family)
-    best = np.argmin(values)
-    return simplex[best], float(values[best])

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from photoplan.adjustment.least_squares import solve, spread
 from photoplan.codec import storable
-from photoplan.kernels.fit_covariance import block_score, minimise
+from photoplan.kernels.fit_covariance import block_score, score
 from photoplan.kernels.sides import sides_of
 from photoplan.terrain.observations import Observations
 from photoplan.terrain.settings import FAMILIES, BuildSettings
@@ -203,6 +204,39 @@ def estimate_unit(
     scaled = blocks.sides * GAPS[whole.family] ** 2 / 4
     logs, _ = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, first, whole.family)
     return _covariance(whole.family, logs)
+
+
+def minimise(
+    d2: NDArray[np.float64],
+    sides: NDArray[np.float64],
+    b: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    first: NDArray[np.float64],
+    family: int,
+) -> tuple[NDArray[np.float64], float]:
+    """Return the logarithms of variance, length and noise that predict best, and their score.
+
+    Blocks (k, …) and `prior` are those of `photoplan.kernels.fit_covariance.score`; equal bounds hold a parameter.
+    """
+    # A simplex of the free parameters only: one with a corner too many in a plane collapses onto a line.
+    free = np.flatnonzero(prior[3] > prior[2])
+
+    def at(logs: NDArray[np.float64]) -> float:
+        every = first.copy()
+        every[free] = logs
+        return float(score(d2, sides, b, noise, prior, every, family))
+
+    if not len(free):
+        return first, at(first[free])
+    step = np.minimum(0.7, prior[3] - prior[2])
+    step = np.where(first + step <= prior[3], step, -step)[free]
+    simplex = first[free] + np.vstack([np.zeros(len(free)), np.diag(step)])
+    ends = {"initial_simplex": simplex, "xatol": np.inf, "fatol": 0.02, "maxiter": 120, "maxfev": 10_000}
+    found = minimize(at, simplex[0], method="Nelder-Mead", options=ends)
+    logs = first.copy()
+    logs[free] = found.x
+    return logs, float(found.fun)
 
 
 def ladder(covariance: Covariance) -> NDArray[np.float64]:
