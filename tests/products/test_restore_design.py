@@ -7,7 +7,8 @@ from scipy.ndimage import convolve
 from tools.blurred_scenes import any_edges, discrete_spread, taken
 
 from photoplan.errors import InputError, UsageError
-from photoplan.products.restore import RestoreRequest, design_restoration
+from photoplan.products.measured_filter import design_restoration
+from photoplan.requests.quality import RestoreRequest
 
 pytestmark = pytest.mark.usefixtures("searched_once")
 

@@ -16,7 +16,8 @@ from tools.command import Here
 
 from photoplan.errors import UsageError
 from photoplan.io.raster import RasterReader
-from photoplan.products.restore import DesignedPart, FoundFilter, RestoreRequest, requested_filter
+from photoplan.products.measured_filter import DesignedPart
+from photoplan.products.restore import FoundFilter, RestoreRequest, requested_filter
 from photoplan.quality.restoration.design import DesignOptions, design_filter
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.scene import SceneStatistics

@@ -7,33 +7,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, special
 
 
 def chance_normal(ratio: float) -> float:
     """Chance of a value as far from 0 on either side, in standard deviations that are known."""
-    return float(2.0 * special.ndtr(-abs(ratio)))
+    return float(2.0 * scipy.special.ndtr(-abs(ratio)))
 
 
 def chance_t(ratio: float, freedom: float) -> float:
     """The same in standard deviations that were estimated with `freedom` (Student's distribution)."""
-    return float(2.0 * special.stdtr(freedom, -abs(ratio))) if math.isfinite(ratio) else 0.0
+    return float(2.0 * scipy.special.stdtr(freedom, -abs(ratio))) if math.isfinite(ratio) else 0.0
 
 
 def reach_t(share: float, freedom: float) -> float:
     """Estimated standard deviations within which a `share` of the errors lies (Student's distribution); NaN: none."""
-    return float(special.stdtrit(freedom, 0.5 + share / 2.0)) if freedom > 0 else math.nan
+    return float(scipy.special.stdtrit(freedom, 0.5 + share / 2.0)) if freedom > 0 else math.nan
 
 
 def chance_chi_square(square: float, freedom: float) -> float:
     """Chance of a sum of squares of `freedom` normalised errors as large."""
-    return float(special.chdtrc(freedom, square))
+    return float(scipy.special.chdtrc(freedom, square))
 
 
 def chance_f(ratio: float, freedom: float, below: float) -> float:
     """Chance of a ratio of two variances as large, of `freedom` above and `below` below."""
-    return float(special.fdtrc(freedom, below, ratio)) if ratio > 0.0 else 1.0
+    return float(scipy.special.fdtrc(freedom, below, ratio)) if ratio > 0.0 else 1.0
 
 
 def chance_gain(whole: float, rest: float, more: float, freedom: float) -> float:
@@ -106,15 +106,15 @@ class _Likelihood:
         for value, part in zip(values, parts):
             V += value * part
         try:
-            factor = linalg.cho_factor(V, lower=True, overwrite_a=True, check_finite=False)
-        except linalg.LinAlgError:
+            factor = scipy.linalg.cho_factor(V, lower=True, overwrite_a=True, check_finite=False)
+        except scipy.linalg.LinAlgError:
             return None
-        x = linalg.cho_solve(factor, w)
+        x = scipy.linalg.cho_solve(factor, w)
         return cls(factor, x, float(2.0 * np.log(np.diag(factor[0])).sum() + w @ x))
 
     def step(self, parts: Sequence[_Floats], values: _Floats) -> _Floats:
         """Step of the logarithms of the variances."""
-        inverse = linalg.cho_solve(self.factor, np.eye(len(self.x)), overwrite_b=True)
+        inverse = scipy.linalg.cho_solve(self.factor, np.eye(len(self.x)), overwrite_b=True)
         on = np.array([part @ self.x for part in parts])
         slope = np.array([np.vdot(inverse, part) for part in parts]) - on @ self.x
         information = on @ inverse @ on.T * np.outer(values, values)

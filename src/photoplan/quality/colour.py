@@ -8,9 +8,8 @@ from math import hypot
 from typing import Any
 
 import numpy as np
+import scipy  # loads its parts when they are used: a restored image needs none of them
 from numpy.typing import NDArray
-from scipy import ndimage, special
-from scipy.spatial import cKDTree
 
 from photoplan.adjustment.least_squares import Equations, Fit, levenberg, solve, spread
 from photoplan.errors import GeometryError, InputError
@@ -394,8 +393,8 @@ def _even(values: _Array, planes: NDArray[np.int_]) -> _Array:
     if not known.any():
         raise InputError("no pixel of the image has a value; there are no discs to be found")
     width = 1.0 if len(np.unique(planes[planes >= 0])) == 1 and (planes >= 0).all() else 1.2
-    weight = ndimage.gaussian_filter(known.astype(float), width)
-    smooth = ndimage.gaussian_filter(np.where(known, out, 0.0), width)
+    weight = scipy.ndimage.gaussian_filter(known.astype(float), width)
+    smooth = scipy.ndimage.gaussian_filter(np.where(known, out, 0.0), width)
     return np.asarray(smooth / np.maximum(weight, 1e-9))
 
 
@@ -409,11 +408,11 @@ def _spots(even: _Array) -> Iterator[tuple[float, float, float]]:
     ground = _blocks(picture, side)
     rows = np.minimum(np.arange(picture.shape[0]) // side, ground.shape[0] - 1)
     columns = np.minimum(np.arange(picture.shape[1]) // side, ground.shape[1] - 1)
-    level = ndimage.uniform_filter(ground[rows[:, None], columns[None, :]], side)
-    labels, count = ndimage.label(picture < (level + disc) / 2.0)
+    level = scipy.ndimage.uniform_filter(ground[rows[:, None], columns[None, :]], side)
+    labels, count = scipy.ndimage.label(picture < (level + disc) / 2.0)
     if count > _MOST_SPOTS:
         raise InputError(f"{count} spots in the image; at most {_MOST_SPOTS} are a chart of discs: choose a part of it")
-    for index, box in enumerate(ndimage.find_objects(labels), 1):
+    for index, box in enumerate(scipy.ndimage.find_objects(labels), 1):
         area = labels[box] == index
         height, width = area.shape
         radius = float(np.sqrt(area.sum() / np.pi))
@@ -424,7 +423,7 @@ def _spots(even: _Array) -> Iterator[tuple[float, float, float]]:
         if not inside or not _RADII[0] <= radius <= _RADII[1] or long > _MOST_AXES:
             continue
         if 0.8 < full < 1.2:
-            y, x = ndimage.center_of_mass(area)
+            y, x = scipy.ndimage.center_of_mass(area)
             yield x + box[1].start, y + box[0].start, radius
 
 
@@ -487,7 +486,7 @@ class _DiscFit:
         length = np.sqrt(np.maximum(form, 1e-12))
         gradient = np.hypot(u * (1.0 + p) + q * v, v * (1.0 - p) + q * u)
         distance = (length - radius) * length / np.maximum(gradient, 1e-9)
-        return np.asarray(special.ndtr(-distance / np.exp(shape[5])))
+        return np.asarray(scipy.special.ndtr(-distance / np.exp(shape[5])))
 
     def _basis(self, cover: _Array) -> _Array:
         """Columns of what enters linearly: ground, its slopes relative to it, and step, for every plane."""
@@ -566,11 +565,11 @@ def disc_displacements(reference: Sequence[Disc], band: Sequence[Disc]) -> Displ
     there = np.array([[d.x, d.y] for d in band]).reshape(-1, 2)
     farthest = 30.0
     if len(here) > 1:
-        farthest = min(farthest, float(np.median(cKDTree(here).query(here, 2)[0][:, 1])) / 3.0)
+        farthest = min(farthest, float(np.median(scipy.spatial.cKDTree(here).query(here, 2)[0][:, 1])) / 3.0)
     pairs = []
     if len(here) and len(there):
-        apart, nearest = cKDTree(there).query(here)
-        back = cKDTree(here).query(there)[1]
+        apart, nearest = scipy.spatial.cKDTree(there).query(here)
+        back = scipy.spatial.cKDTree(here).query(there)[1]
         pairs = [(i, int(k)) for i, k in enumerate(nearest) if back[k] == i and apart[i] <= farthest]
         pairs = [(i, k) for i, k in pairs if 0.7 < reference[i].radius / band[k].radius < 1.4]
     if len(pairs) < 4:
@@ -646,7 +645,7 @@ def _step(along: _Array, across: _Array, grey: _Array, slope: float | None) -> t
     unknown = 3 if slope is None else 2
 
     def shares(at: _Array) -> _Array:
-        return np.asarray(special.ndtr((across - at[0] - at[2] * along) / np.exp(at[1])))
+        return np.asarray(scipy.special.ndtr((across - at[0] - at[2] * along) / np.exp(at[1])))
 
     def levels(at: _Array) -> Fit:
         return solve(np.stack([np.ones(grey.size), shares(at)], 1), grey)
@@ -732,7 +731,7 @@ def patch_displacements(
 def _matched(here: _Array, there: _Array) -> tuple[float, float, float, float] | None:
     """Displacement along x and y and their standard deviations; None: the windows do not match."""
     inner = (slice(_MARGIN, -_MARGIN), slice(_MARGIN, -_MARGIN))
-    spline = ndimage.spline_filter(there, order=3)
+    spline = scipy.ndimage.spline_filter(there, order=3)
     y, x = np.mgrid[_MARGIN : here.shape[0] - _MARGIN, _MARGIN : here.shape[1] - _MARGIN].astype(float)
     grey = here[inner].ravel()
     if grey.std() < 1e-9 or there[inner].std() < 1e-9:
@@ -743,7 +742,7 @@ def _matched(here: _Array, there: _Array) -> tuple[float, float, float, float] |
     contrast, moved = there[inner].std() / here[inner].std(), np.zeros(2)
     for _ in range(_MATCHING_ROUNDS):
         at = [y + moved[1], x + moved[0]]
-        values = ndimage.map_coordinates(spline, at, order=3, prefilter=False).ravel()
+        values = scipy.ndimage.map_coordinates(spline, at, order=3, prefilter=False).ravel()
         # band(place + displacement) = contrast · reference + brightness.
         matrix = np.stack([-contrast * slopes[0], -contrast * slopes[1], grey, np.ones(grey.size)], 1)
         fit = solve(matrix, values)

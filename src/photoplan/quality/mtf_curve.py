@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from math import log, pi, sqrt
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from photoplan.errors import InputError
 
@@ -19,7 +19,7 @@ def disc_transfer(radius: float, f: _Array) -> _Array:
     """Transfer function of an even disc: 2 J1(2π r f) / (2π r f)."""
     z = 2.0 * pi * radius * f
     small = z < 1e-6
-    return np.where(small, 1.0, 2.0 * special.j1(z) / np.where(small, 1.0, z))
+    return np.where(small, 1.0, 2.0 * scipy.special.j1(z) / np.where(small, 1.0, z))
 
 
 def pupil_transfer(part: _Array) -> _Array:

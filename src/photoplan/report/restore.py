@@ -14,7 +14,8 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.chromatic import model_figures
 from photoplan.products.describe import FileFacts, place_of
-from photoplan.products.restore import DesignedPart, FoundFilter, Job, MeasuredFilter, RestoredImage, RestoreReport
+from photoplan.products.measured_filter import DesignedPart, MeasuredFilter
+from photoplan.products.restore import FoundFilter, Job, RestoredImage, RestoreReport
 from photoplan.project.align import AlignStep
 from photoplan.project.steps import FallOffStep, fall_off_line, load_filter, restoration_of
 from photoplan.quality.colour import ChromaticModel

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from math import ceil, cos, floor, hypot, isnan, pi, radians, sqrt
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, gaussian_filter1d
 
 from photoplan.adjustment.least_squares import MEDIAN_1D, huber, spread
 from photoplan.adjustment.statistics import chance_chi_square
@@ -96,7 +96,7 @@ def noise_of(grey: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) 
     second = a[:, 2:] - 2 * a[:, 1:-1] + a[:, :-2]
     both = np.abs(second[2:] - 2 * second[1:-1] + second[:-2])
     if valid is not None:
-        both[binary_dilation(~valid, np.ones((3, 3)))[1:-1, 1:-1]] = np.nan
+        both[scipy.ndimage.binary_dilation(~valid, np.ones((3, 3)))[1:-1, 1:-1]] = np.nan
     h, w = both.shape[0] // 16 * 16, both.shape[1] // 16 * 16
     blocks = both[:h, :w].reshape(h // 16, 16, w // 16, 16).swapaxes(1, 2).reshape(-1, 256)
     blocks = blocks[np.isfinite(blocks).all(axis=1)]
@@ -140,10 +140,14 @@ def _gradient(
         if not valid.any():
             return filled, filled, 0.0
         filled = np.where(valid, filled, np.float32(np.median(filled[valid][:: max(1, valid.size // _SAMPLE)])))
-    gx = gaussian_filter1d(gaussian_filter1d(filled, SMOOTHING, axis=0), SMOOTHING, axis=1, order=1)
-    gy = gaussian_filter1d(gaussian_filter1d(filled, SMOOTHING, axis=1), SMOOTHING, axis=0, order=1)
+    gx = scipy.ndimage.gaussian_filter1d(
+        scipy.ndimage.gaussian_filter1d(filled, SMOOTHING, axis=0), SMOOTHING, axis=1, order=1
+    )
+    gy = scipy.ndimage.gaussian_filter1d(
+        scipy.ndimage.gaussian_filter1d(filled, SMOOTHING, axis=1), SMOOTHING, axis=0, order=1
+    )
     if valid is not None:
-        near = binary_dilation(~valid, np.ones((3, 3)), iterations=round(3 * SMOOTHING))
+        near = scipy.ndimage.binary_dilation(~valid, np.ones((3, 3)), iterations=round(3 * SMOOTHING))
         gx[near] = 0.0
         gy[near] = 0.0
     noise = noise_of(grey, valid)

@@ -8,9 +8,8 @@ from math import pi, sqrt
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.fft import dctn
-from scipy.linalg import svdvals, toeplitz
 
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import GAUSSIAN_WIDTH, MtfCurve, SpreadFunction, disc_transfer
@@ -87,7 +86,7 @@ def kept_by_compression(pixels: Array) -> Array:
     Goodman 2000) by the share of them that are zero.
     """
     parts = pixels.reshape(pixels.shape[0], pixels.shape[1] // BLOCK, BLOCK, -1, BLOCK).swapaxes(2, 3)
-    coefficients = dctn(parts.reshape(-1, BLOCK, BLOCK), axes=(1, 2), norm="ortho").reshape(-1, BLOCK * BLOCK)
+    coefficients = scipy.fft.dctn(parts.reshape(-1, BLOCK, BLOCK), axes=(1, 2), norm="ortho").reshape(-1, BLOCK * BLOCK)
     steps = np.array([0.0, *(_step(row) for row in coefficients.T[1:])])
     if (steps > 0.0).mean() < _COMPRESSED:
         return np.ones((BLOCK, BLOCK))
@@ -227,7 +226,7 @@ def band_matrix(spread: SpreadFunction, rows: int = BAND_ROWS) -> NDArray[np.flo
     # Image i = sum over objects j of values[half + i - j]: below the diagonal the light that moved onwards.
     down[:count] = spread.values[half : half + count]
     right[:count] = spread.values[half::-1][:count]
-    return np.asarray(toeplitz(down, right))
+    return np.asarray(scipy.linalg.toeplitz(down, right))
 
 
 def condition_of(spread: SpreadFunction) -> Condition:
@@ -235,7 +234,7 @@ def condition_of(spread: SpreadFunction) -> Condition:
     side = spread.side()
     transfer = np.abs(spread.transfer(_FREQUENCIES))
     least = int(np.argmin(transfer))
-    singular = svdvals(band_matrix(spread))
+    singular = scipy.linalg.svdvals(band_matrix(spread))
     return Condition(
         neighbour_ratio=float(side[1] / side[0])
         if side.size > 1 and side[0] > 0.0

@@ -9,8 +9,8 @@ from itertools import product
 from math import log, pi, sqrt
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from photoplan.errors import InputError
 
@@ -159,7 +159,7 @@ def fit_scene(
         starts = [(0.2, 0.0), (0.8, 0.0), *([] if textured else [(0.8, 0.2)])]
         for (share, smoothed), white in product(starts, _WHITE if textured else (-40.0,)):
             start = (-log(float(power.mean())), exponent, low + share * (high - low), smoothed, white)
-            tried.append(minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds))
+            tried.append(scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds))
     factor, exponent, noisy, smoothed, white = min(tried, key=lambda one: float(one.fun)).x
     contrast = sqrt(scale * np.exp(factor) * _unit_contrast(float(exponent)))
     found = sqrt(scale * np.exp(noisy)) if noise[1] > 0.0 else 0.0
