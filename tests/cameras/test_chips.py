@@ -18,7 +18,7 @@ from tools.thinned import some
 from photoplan.cameras.base import project, tremor_told
 from photoplan.cameras.pushbroom import ChippedLine
 from photoplan.errors import InputError
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line import read_line
 
 #: The second chip begins here, stands 0.12 mm (12 lines) ahead, is turned by 1 mrad, and overlaps by so many columns.
 FIRST, AHEAD, TURN = 180, 0.12, 1e-3

@@ -18,8 +18,8 @@ from tools.command import inside
 from photoplan.cameras.base import project
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_step
-from photoplan.io.camera.csm_frame import is_frame, read, read_frame
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.csm import frame_of, is_frame, read_frame
+from photoplan.io.camera.line import read_line
 from photoplan.plan.footprint import footprint
 from photoplan.surfaces.base import LevelSurface
 
@@ -67,7 +67,7 @@ def test_points_of_the_usgs_unit_tests() -> None:
         "instrument_pointing": {"quaternions": [[0.0, -(0.5**0.5), 0.0, 0.5**0.5]], "ephemeris_times": [50]},
         "body_rotation": {"quaternions": [[1, 0, 0, 0]], "ephemeris_times": [50]},
     }
-    frame = read(isd, Path("framer.json")).frame
+    frame = frame_of(isd, Path("framer.json")).frame
     far, side = 0.44979759, 14.99325304
     seen = {(7.5, 7.5): (10, 0, 0), (7.5, 6.5): (9.80194018, 0, 1.98039612), (15, 0): (far, -side, side)}
     seen |= {(0, 15): (far, side, -side), (0, 0): (far, side, side), (15, 15): (far, -side, -side)}
@@ -80,14 +80,14 @@ def test_orientation_is_that_of_the_middle_of_the_exposure() -> None:
     isd = support_data("mercury_transverse")
     t = isd["center_ephemeris_time"]
     position, velocity = (np.array(isd["instrument_position"][k][0]) for k in ("positions", "velocities"))
-    still = read(isd, Path("one.json")).frame.center
+    still = frame_of(isd, Path("one.json")).frame.center
     rows = [(position + s * velocity).tolist() for s in (-1.0, 2.0)]
     isd["instrument_position"] |= {"positions": rows, "velocities": [velocity.tolist()] * 2}
     isd["instrument_position"]["ephemeris_times"] = [t - 1.0, t + 2.0]
-    assert np.abs(read(isd, Path("two.json")).frame.center - still).max() < 1e-5
+    assert np.abs(frame_of(isd, Path("two.json")).frame.center - still).max() < 1e-5
     isd["instrument_position"]["ephemeris_times"] = [t + 1.0, t + 2.0]
     with pytest.raises(InputError, match=r"two.json: instrument_position is stated from .* the image is of"):
-        read(isd, Path("two.json"))
+        frame_of(isd, Path("two.json"))
 
 
 class TestOverItsBody:
@@ -209,7 +209,7 @@ class TestOverItsBody:
 )
 def test_what_is_wrong_in_a_file_is_named(entry: str, value: object, told: str) -> None:
     with pytest.raises(InputError, match=told) as error:
-        read(support_data("mercury_transverse") | {entry: value}, Path("some.json"))
+        frame_of(support_data("mercury_transverse") | {entry: value}, Path("some.json"))
     assert str(error.value).startswith("some.json: ")
 
 
@@ -221,7 +221,7 @@ def test_radial_coefficients_that_are_not_there_are_zero(count: int) -> None:
     expected = [*full[:count], 0.0, 0.0][:3]
     xy = np.stack(np.meshgrid([0.0, 300.0, 900.0], [10.0, 500.0]), axis=-1).reshape(-1, 2)
     rays = [
-        read(
+        frame_of(
             support_data("dione_radial") | {"optical_distortion": {"radial": {"coefficients": c}}}, Path("a.json")
         ).frame.rays(xy)[1]
         for c in (given, expected)
@@ -233,7 +233,7 @@ def test_a_camera_that_looks_away_is_refused() -> None:
     isd = support_data("mercury_transverse")
     isd["instrument_position"]["positions"] = (-np.array(isd["instrument_position"]["positions"])).tolist()
     with pytest.raises(InputError, match="looks away from its body"):
-        read(isd, Path("some.json"))
+        frame_of(isd, Path("some.json"))
 
 
 def test_files_of_lines_and_frames_are_told_apart(tmp_path: Path) -> None:

@@ -14,9 +14,8 @@ from tools.body_axes import over_its_body
 from photoplan.cameras.base import project
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.errors import InputError
-from photoplan.io.camera.isd import Isd
-from photoplan.io.camera.line import csm
-from photoplan.io.camera.line.csm_lens import look
+from photoplan.io.camera.csm import Isd
+from photoplan.io.camera.line import look, read_csm
 
 #: Support data of the USGS's ale (public domain), every fortieth and thirty-second record of their tables.
 DATA = Path(__file__).parents[1] / "data/csm_line"
@@ -38,7 +37,7 @@ def support_data(name: str) -> dict[str, Any]:
 
 
 def camera_of(isd: dict[str, Any]) -> LineCamera:
-    return over_its_body(csm.read(isd, Path("strip.json")))
+    return over_its_body(read_csm(isd, Path("strip.json")))
 
 
 @pytest.mark.parametrize("name", ["kaguya_tc", "kaguya_mi", *EDITED])
@@ -116,7 +115,7 @@ def test_positions_and_rays_are_inverse(isd: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("name", "kind"), [("kaguya_tc", "kaguyalism"), ("edited_radtan", "radtan")])
 def test_focal_length_and_distortion_are_told(name: str, kind: str) -> None:
-    told = csm.read(support_data(name), Path("strip.json")).describe()["focal length"]
+    told = read_csm(support_data(name), Path("strip.json")).describe()["focal length"]
     assert told == f"{support_data(name)['focal_length_model']['focal_length']:.6g} mm, distortion {kind}"
 
 

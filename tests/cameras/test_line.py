@@ -22,9 +22,7 @@ from photoplan.cameras.pushbroom import LineCamera
 from photoplan.cameras.rpc import fit_rpc
 from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.local import EARTH_RADII, BodyGround, Ellipsoid, GeodeticGround
-from photoplan.io.camera.line import csm
-from photoplan.io.camera.line.file import read_line
-from photoplan.io.camera.line.model import StatedLine
+from photoplan.io.camera.line import StatedLine, read_csm, read_line
 from photoplan.plan.footprint import footprint
 from photoplan.surfaces.base import LevelSurface
 
@@ -85,7 +83,7 @@ def test_fault_23_lines_beyond_one_of_the_tables_of_attitudes_are_not_known(name
     table = isd["body_rotation"] | isd["instrument_pointing"] if name == "body_rotation" else dict(isd[name])
     middle = int(np.searchsorted(table["ephemeris_times"], isd["center_ephemeris_time"]))
     isd[name] = table | {k: table[k][middle:] for k in ("ephemeris_times", "quaternions")}
-    oriented = csm.read(isd, Path("strip.json")).track.oriented
+    oriented = read_csm(isd, Path("strip.json")).track.oriented
     assert 15 < oriented[0] < 25 and oriented[1] == 39.5
 
 
@@ -156,7 +154,7 @@ class TestStrip:
 
     def test_pixels_see_what_was_drawn(self) -> None:
         strip = Strip(lines=120)
-        camera = csm.read(strip.isd(), Path("strip.json")).camera(strip.crs, "ellipsoidal")
+        camera = read_csm(strip.isd(), Path("strip.json")).camera(strip.crs, "ellipsoidal")
         XY = strip.seen(300.0)
         found = project(camera, np.concatenate([XY, np.full((*XY.shape[:2], 1), 300.0)], axis=-1))
         y, x = np.mgrid[: strip.lines, : strip.columns]
@@ -183,7 +181,7 @@ class TestStrip:
     def test_a_record_that_ends_with_the_last_line_is_enough_for_the_whole_footprint(self) -> None:
         """The outer edges of the first and last line have no orientation then, and their middles have."""
         strip = Strip(beyond=1e-6)
-        camera = csm.read(strip.isd(), Path("strip.json")).camera(strip.crs, "ellipsoidal")
+        camera = read_csm(strip.isd(), Path("strip.json")).camera(strip.crs, "ellipsoidal")
         corner = np.array([[-0.5, -0.5]])
         assert np.isnan(camera.rays(corner, 300.0)[0]).all()
         seen = footprint(camera, LevelSurface(300.0), None)
@@ -193,7 +191,7 @@ class TestStrip:
 
     def test_an_image_that_leaves_the_grid_of_its_heights_is_projected_where_that_holds(self) -> None:
         strip = Strip()
-        whole = csm.read(strip.isd(), Path("strip.json")).camera(strip.crs, "ellipsoidal")
+        whole = read_csm(strip.isd(), Path("strip.json")).camera(strip.crs, "ellipsoidal")
         camera = LineCamera(whole.track, whole.look, Ending(strip.crs, "ellipsoidal", EARTH_RADII))
         xy = np.stack(np.meshgrid([20.0, 380.0], [20.0, 100.0, 200.0, 400.0, 500.0, 580.0]), axis=-1).reshape(-1, 2)
         ground = whole.rays(xy, 300.0)[0]
@@ -271,5 +269,5 @@ def test_what_is_wrong_in_a_file_is_named(entry: str, value: object, told: str) 
     isd = copy.deepcopy(Strip(lines=20, columns=30).isd())
     isd[entry] = value
     with pytest.raises(InputError, match=told) as error:
-        csm.read(isd, Path("some.json"))
+        read_csm(isd, Path("some.json"))
     assert str(error.value).startswith("some.json: ")

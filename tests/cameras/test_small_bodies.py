@@ -13,8 +13,8 @@ import pytest
 from photoplan.cameras.base import project
 from photoplan.errors import InputError
 from photoplan.geometry.crs import require_projected_metres
-from photoplan.io.camera import csm_frame
-from photoplan.io.camera.line import csm
+from photoplan.io.camera.csm import frame_of
+from photoplan.io.camera.line import read_csm
 from photoplan.plan.footprint import footprint
 from photoplan.surfaces.base import LevelSurface
 
@@ -22,8 +22,8 @@ DATA = Path(__file__).parents[1] / "data"
 #: Radius of Phobos, metres.
 SMALL = 11_080.0
 FILES: dict[str, tuple[Callable[[Any, Path], Any], str, float, str]] = {
-    "frame": (csm_frame.read, "csm_frame/mercury_transverse.json", 2_439_400.0, "+lat_0=48 +lon_0=-112"),
-    "line": (csm.read, "csm_line/kaguya_tc.json", 1_737_400.0, "+lat_0=-82 +lon_0=43"),
+    "frame": (frame_of, "csm_frame/mercury_transverse.json", 2_439_400.0, "+lat_0=48 +lon_0=-112"),
+    "line": (read_csm, "csm_line/kaguya_tc.json", 1_737_400.0, "+lat_0=-82 +lon_0=43"),
 }
 
 

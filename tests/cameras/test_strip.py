@@ -13,7 +13,7 @@ from tools.line_strip import Strip, pattern
 
 from photoplan.cameras.base import project
 from photoplan.errors import InputError
-from photoplan.io.camera.line.file import line_files, read_line
+from photoplan.io.camera.line import line_files, read_line
 from photoplan.io.project.file import load_project
 from photoplan.project.scene import input_files
 

@@ -15,7 +15,7 @@ from tools.shaken_strip import ShakenStrip
 from tools.thinned import some
 
 from photoplan.errors import HeightSystemError, InputError
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line import read_line
 
 LEVEL = '[terrain]\nheight = 300.0\nheight_system = "ellipsoidal"\n'
 

@@ -13,7 +13,7 @@ from photoplan.cameras.base import project
 from photoplan.cameras.correctable import CorrectableLine, TrackPriors
 from photoplan.cameras.line_correction import LineCorrection
 from photoplan.cameras.pushbroom import ChippedLine, LineCamera
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line import read_line
 
 PRIORS = TrackPriors(
     boresight=2e-3, lever_arm=0.1, time_offset=0.01, knots=0.5, position=0.05, attitude=1e-4, smooth_attitude=1e-4

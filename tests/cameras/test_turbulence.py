@@ -11,7 +11,7 @@ from tools.shaken_strip import ShakenStrip
 from photoplan.cameras.base import project
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.geometry.pose import cubic_convolution
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line import read_line
 
 
 def camera_of(strip: ShakenStrip, folder: Path, name: str = "nadir") -> LineCamera:

@@ -30,7 +30,7 @@ KINDS = {"FrameCamera", "WarpedCamera", "corrected_camera", "curved_camera", "Li
 ALLOWED = {
     "cameras/pushbroom.py": "a kind",
     "cameras/correctable.py": "corrections of a kind",
-    "io/camera/line/model.py": "makes a kind of what files state",
+    "io/camera/line.py": "makes a kind of what files state",
     "__init__.py": "public names",
     "cameras/__init__.py": "public names",
     "cameras/frame.py": "a kind",
@@ -38,7 +38,7 @@ ALLOWED = {
     "cameras/corrected.py": "a kind",
     "cameras/build.py": "registry of cameras that compute",
     "cameras/body_frame.py": "a kind in the axes of a body",
-    "io/camera/csm_frame.py": "makes a kind of what files state",
+    "io/camera/csm.py": "makes a kind of what files state",
     "io/camera/frame.py": "a kind",
     "io/camera/film.py": "a kind",
     "io/camera/kinds.py": "registry of cameras that are described",

@@ -9,7 +9,7 @@ from tools.shaken_strip import ShakenStrip
 from photoplan.cameras.base import project
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line import read_line
 from photoplan.kernels.position import positions
 from photoplan.plan.anchors import AnchorRule, Anchors, compile_anchors
 from photoplan.plan.ground import TileGround

@@ -18,7 +18,7 @@ from photoplan.cameras.base import Camera, project
 from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.cameras.pushbroom import measured as measured_of
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line import read_line
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import StatedTerrain
 from photoplan.products.adjust.run import AdjustRequest, adjust_project

@@ -10,7 +10,7 @@ from tools.command import inside
 from tools.shaken_strip import ShakenStrip
 
 from photoplan.cameras.base import project as projected
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line import read_line
 
 
 def test_each_pixel_shows_what_its_line_sees(tmp_path: Path) -> None:

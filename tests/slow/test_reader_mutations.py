@@ -35,9 +35,9 @@ from tools.small_model import write_small
 from photoplan.codec import NotData, decode, encode
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.camera.csm_frame import read_frame
+from photoplan.io.camera.csm import read_frame
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line import read_line
 from photoplan.io.camera.rpc import read_rpc
 from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.objects import read_objects

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.geometry.local import Ellipsoid
-from photoplan.io.camera.line.model import StatedLine
+from photoplan.io.camera.line import StatedLine
 
 
 @dataclass(frozen=True)

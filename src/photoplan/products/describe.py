@@ -15,10 +15,10 @@ from photoplan.events import SILENT, Events
 from photoplan.findings import Result
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
-from photoplan.io.camera.csm_frame import is_frame, read_frame
+from photoplan.io.camera.csm import is_frame, read_frame
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.line.correction import read_line_correction
-from photoplan.io.camera.line.file import describe_line, is_line
+from photoplan.io.camera.line import describe_line, is_line
+from photoplan.io.camera.line_correction import read_line_correction
 from photoplan.io.camera.rpc import is_rpc, read_rpc, rpc_beside, rpc_in
 from photoplan.io.files import looks_like, raster_driver, read_json, read_toml
 from photoplan.io.objects import read_objects

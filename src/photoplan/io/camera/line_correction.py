@@ -11,7 +11,7 @@ from pydantic import Field
 
 from photoplan.cameras.line_correction import LineCorrection, PoseErrors, TrackSpline
 from photoplan.errors import InputError
-from photoplan.io.camera.line.model import MAX_BYTES
+from photoplan.io.camera.line import MAX_BYTES
 from photoplan.io.camera.model import Entry, Number, Positive, Triple
 from photoplan.io.files import read_entries
 

@@ -1,1 +1,0 @@
-"""Line cameras from files."""
