@@ -11,10 +11,8 @@ import pytest
 
 from photoplan.errors import InputError
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.film import FilmEntry
-from photoplan.io.camera.frame import FrameEntry
-from photoplan.io.camera.model import IdealLens, OpenCVFisheyeLens, OpenCVLens
-from photoplan.io.camera.opensfm import resized
+from photoplan.io.camera.model import FilmEntry, FrameEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
+from photoplan.io.orientation.opensfm import resized
 
 
 def write(folder: Path, name: str, content: str | object) -> Path:

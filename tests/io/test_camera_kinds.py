@@ -16,8 +16,7 @@ from photoplan.cameras import corrected, frame
 from photoplan.cameras import curvature as curved
 from photoplan.cameras import curvature as warped
 from photoplan.cameras.lenses import Brown, Fisheye, NoLens, OpenCV
-from photoplan.io.camera.kinds import Camera
-from photoplan.io.camera.model import BrownLens, CameraEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
+from photoplan.io.camera.model import BrownLens, Camera, CameraEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
 
 ROOT = Path(photoplan.__file__).parent
 #: Classes of the registry.
@@ -39,9 +38,7 @@ ALLOWED = {
     "cameras/build.py": "registry of cameras that compute",
     "cameras/body_frame.py": "a kind in the axes of a body",
     "io/camera/csm.py": "makes a kind of what files state",
-    "io/camera/frame.py": "a kind",
-    "io/camera/film.py": "a kind",
-    "io/camera/kinds.py": "registry of cameras that are described",
+    "io/camera/model.py": "kinds, and their registry",
     "io/orientation/inpho.py": "reads a format that knows frames in millimetres alone",
 }
 

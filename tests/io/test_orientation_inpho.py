@@ -7,9 +7,7 @@ import pytest
 from tools.orientation_blocks import CAMERA, CENTERS, GROUND, NAMES, block, our_pixels, pixels_of_matrix
 
 from photoplan.errors import InputError
-from photoplan.io.camera.film import FilmEntry
-from photoplan.io.camera.frame import FrameEntry
-from photoplan.io.camera.model import BrownLens
+from photoplan.io.camera.model import BrownLens, FilmEntry, FrameEntry
 from photoplan.io.orientation.block import without_lenses
 from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation.form import TableFormat

@@ -5,9 +5,9 @@ import pytest
 from tools.orientation_blocks import CAMERA, block, our_pixels
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.camera.film import FilmEntry
+from photoplan.io.camera.model import FilmEntry
 from photoplan.io.orientation import file as orientation_file
-from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, OrientationTable, OrientedImage
 from photoplan.io.orientation.file import (
     FORMATS,
     choose_format,
@@ -18,7 +18,6 @@ from photoplan.io.orientation.file import (
     written_formats,
 )
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import OrientationTable, OrientedImage
 
 MARKS = {str(k): xy for k, xy in enumerate([(-106.0, -106.0), (106.0, -106.0), (106.0, 106.0)])}
 

@@ -11,9 +11,7 @@ from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera as ComputingCamera
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
-from photoplan.io.camera.film import FilmEntry
-from photoplan.io.camera.frame import FrameEntry
-from photoplan.io.camera.model import BrownLens, OpenCVLens, RadialTableLens
+from photoplan.io.camera.model import BrownLens, FilmEntry, FrameEntry, OpenCVLens, RadialTableLens
 from photoplan.io.project.model import Image, fiducial_fit, image_size, interior_of, lens_of
 
 IMAGE = Image(name="a", file="a.tif", camera="c", center=(0, 0, 0), angles=(0, 0, 0))

@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 from tools.thinned import examples
 
 from photoplan.errors import HeightSystemError, InputError, UsageError
-from photoplan.io.camera.film import FilmEntry
-from photoplan.io.camera.frame import FrameEntry
-from photoplan.io.camera.model import BrownLens, OpenCVFisheyeLens, OpenCVLens, RadialTableLens
+from photoplan.io.camera.model import BrownLens, FilmEntry, FrameEntry, OpenCVFisheyeLens, OpenCVLens, RadialTableLens
 from photoplan.io.files import safe_stem
 from photoplan.io.project.file import load_project, parse_project, project_schema, write_project
 from photoplan.io.project.model import Image, Orientation, OrthoDefaults, Project, StatedTerrain

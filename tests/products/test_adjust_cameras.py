@@ -9,7 +9,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from photoplan.cameras.interior import Interior
-from photoplan.io.camera.kinds import Camera
+from photoplan.io.camera.model import Camera
 from photoplan.io.project.model import Image, interior_of, lens_of
 from photoplan.orientation.bundle.model import AdjustedCamera, BlockCamera
 from photoplan.products.adjust.sensors import block_camera, calibrated, camera_entries

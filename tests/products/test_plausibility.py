@@ -14,7 +14,7 @@ from tools.thinned import some
 
 from photoplan.geometry.pose import angles_from_rotation, rotation_from_angles, rotation_opk
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.frame import FrameEntry
+from photoplan.io.camera.model import FrameEntry
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.project.model import Image, Orientation
 from photoplan.io.terrain.reader import TerrainReader

@@ -7,9 +7,8 @@ import numpy as np
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera as PixelCamera
 from photoplan.geometry.pose import Pose
-from photoplan.io.camera.frame import FrameEntry
-from photoplan.io.orientation.block import OrientationBlock
-from photoplan.io.orientation.table import OrientationTable, OrientedImage
+from photoplan.io.camera.model import FrameEntry
+from photoplan.io.orientation.block import OrientationBlock, OrientationTable, OrientedImage
 from photoplan.io.project.model import Image, interior_of, lens_of
 
 CAMERA = FrameEntry(

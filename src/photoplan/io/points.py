@@ -21,10 +21,10 @@ from photoplan.geometry.heights import heights_in
 from photoplan.geometry.pose import rotation_from_angles
 from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.files import ImageNames, check_plain_file, crs_beside, read_text, same_images
+from photoplan.io.orientation.block import angle_in_radians
 from photoplan.io.orientation.exif import map_positions, read_folder
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.tables import NUMBER, Columns, Dialect, Table, number, read_table, write_table
 from photoplan.io.vector_layer import read_layer
 

@@ -22,7 +22,14 @@ from photoplan.geometry.frames import triple
 from photoplan.geometry.local import enu_of_geodetic
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.files import ImageNames
-from photoplan.io.orientation.block import Loss, OrientationBlock, without_lenses
+from photoplan.io.orientation.block import (
+    Loss,
+    OrientationBlock,
+    OrientationTable,
+    OrientedImage,
+    degrees_of,
+    without_lenses,
+)
 from photoplan.io.orientation.exif import SUFFIXES
 from photoplan.io.orientation.file import (
     choose_format,
@@ -32,7 +39,6 @@ from photoplan.io.orientation.file import (
     written_formats,
 )
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, degrees_of
 from photoplan.io.points import named_as, read_ground_points, read_image_points
 from photoplan.io.product import check_output
 from photoplan.io.project.model import Image, interior_of, lens_of

@@ -16,8 +16,8 @@ from photoplan.geometry.bounds import area_note
 from photoplan.geometry.crs import agreement, crs_step
 from photoplan.geometry.grid import Window
 from photoplan.io.image_metadata import read_image_metadata
+from photoplan.io.orientation.block import OrientationTable
 from photoplan.io.orientation.exif import SUFFIXES
-from photoplan.io.orientation.table import OrientationTable
 from photoplan.io.project.model import Image, ImageEntry, Project
 from photoplan.orientation.conventions import ImagePlausibility, JudgedView, look, other_reading
 from photoplan.plan.footprint import footprint, mean_gsd

@@ -24,7 +24,7 @@ from photoplan.io.camera.line import StatedLine, read_line
 from photoplan.io.camera.line_correction import read_line_correction, read_pose_errors
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.camera.rpc import read_rpc
-from photoplan.io.orientation.table import angle_in_radians
+from photoplan.io.orientation.block import angle_in_radians
 from photoplan.io.project.model import (
     FrameImage,
     Image,

@@ -1,26 +1,75 @@
-"""Camera descriptions from files of any known format."""
+"""Camera descriptions from files of any known format.
+
+A camera from a calibration report of the U.S. Geological Survey is a camera in photoplan's TOML
+(``docs/templates/usgs-camera.toml`` is a template); beside its ``[cameras.NAME]`` the file may have a table
+``[report]`` with ``distances_mm``, the printed distances between fiducial marks. Coordinates are typed from paper, and
+a wrong digit would bend every photograph of the camera unseen.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from photoplan.errors import InputError
-from photoplan.io.camera import opencv as camera_opencv
-from photoplan.io.camera import opensfm as camera_opensfm
-from photoplan.io.camera import pix4d as camera_pix4d
-from photoplan.io.camera import yaml as camera_yaml
-from photoplan.io.camera.kinds import Camera
-from photoplan.io.camera.model import CameraEntry
-from photoplan.io.camera.usgs import check_report
-from photoplan.io.files import explain, looks_like, read_head, read_toml
+from photoplan.io.camera.model import Camera, CameraEntry
+from photoplan.io.camera.opencv import is_opencv, read_opencv, read_orthority
+from photoplan.io.files import explain, finite, looks_like, read_head, read_toml
 from photoplan.io.orientation import colmap as orientation_colmap
 from photoplan.io.orientation import metashape as orientation_metashape
-from photoplan.io.orientation import pix4d as orientation_pix4d
+from photoplan.io.orientation import opensfm, pix4d
 from photoplan.io.orientation.form import TableFormat
+
+#: Coordinates and distances are printed to a micrometre each; rounding makes 2 µm, and the least-squares solution that
+#: the coordinates come from one more.
+TOLERANCE_UM = 3.0
+
+
+def distance_differences(
+    fiducials_mm: Mapping[str, tuple[float, float]], distances_mm: Mapping[str, float], where: str
+) -> dict[str, float]:
+    """Distance from the coordinates minus the printed one, micrometres, by pair."""
+    found = {}
+    for pair, printed in distances_mm.items():
+        distance = finite(printed, f"{where}: distance {pair}")
+        first, _, second = pair.partition("-")
+        if first not in fiducials_mm or second not in fiducials_mm or first == second or distance <= 0:
+            raise InputError(
+                f"{where}: distance {pair!r} = {distance} mm; a key names two of the marks "
+                f"({', '.join(fiducials_mm)}) with a hyphen between, and the distance is positive"
+            )
+        computed = math.dist(fiducials_mm[first], fiducials_mm[second])
+        found[pair] = (computed - distance) * 1000.0
+    return found
+
+
+def check_report(contents: Mapping[str, Any], cameras: Mapping[str, CameraEntry], where: str) -> None:
+    """Compare the ``[report]`` of a TOML file, if it has one, with the camera that it is about."""
+    report = contents.get("report")
+    if report is None:
+        return
+    where = f"{where}: report"
+    if not isinstance(report, dict) or not isinstance(report.get("distances_mm"), dict):
+        raise InputError(f"{where}: needed is distances_mm = {{ 1-2 = 311.128, … }} and, of several cameras, camera")
+    name = report.get("camera", next(iter(cameras)) if len(cameras) == 1 else None)
+    camera = cameras.get(name) if isinstance(name, str) else None
+    system = camera.fiducial_system if camera is not None else None
+    if system is None:
+        raise InputError(f"{where}: camera = {name!r}; name one of the film cameras: {', '.join(map(repr, cameras))}")
+    differences = distance_differences(system.places_mm, report["distances_mm"], where)
+    wrong = {pair: d for pair, d in differences.items() if abs(d) > TOLERANCE_UM}
+    if wrong:
+        told = ", ".join(f"{pair} by {d:+.0f} µm" for pair, d in wrong.items())
+        raise InputError(
+            f"{where}: the fiducial marks of camera {name!r} do not have the printed distances: {told} (allowed are "
+            f"±{TOLERANCE_UM:.0f}); compare coordinates and distances with the paper"
+        )
+
 
 _CAMERAS = TypeAdapter(dict[str, Camera])
 
@@ -29,7 +78,7 @@ def _text(path: Path) -> dict[str, CameraEntry]:
     """Cameras of one of the formats whose files end in ``.txt``."""
     head = read_head(path)
     if head.lstrip().lower().startswith("filename imagewidth"):
-        return dict(orientation_pix4d.read(path, TableFormat()).cameras)
+        return dict(pix4d.read(path, TableFormat()).cameras)
     if "CAMERA_ID, MODEL" in head or path.name == "cameras.txt":
         return orientation_colmap.read_cameras(path)
     raise InputError(
@@ -41,7 +90,7 @@ def _text(path: Path) -> dict[str, CameraEntry]:
 def _toml(path: Path) -> dict[str, CameraEntry]:
     """Cameras of the ``[cameras.NAME]`` tables of a project file, alone or in a whole project.
 
-    A table ``[report]`` beside them is compared with them; see `photoplan.io.camera.usgs`.
+    A table ``[report]`` beside them is compared with them.
     """
     contents, text = read_toml(path)
     cameras = contents.get("cameras")
@@ -56,11 +105,11 @@ def _toml(path: Path) -> dict[str, CameraEntry]:
 
 
 def _yaml(path: Path) -> dict[str, CameraEntry]:
-    return camera_opencv.read(path) if camera_opencv.is_opencv(path) else camera_yaml.read(path)
+    return read_opencv(path) if is_opencv(path) else read_orthority(path)
 
 
 def _json(path: Path) -> dict[str, CameraEntry]:
-    return camera_opencv.read(path) if camera_opencv.is_opencv(path) else camera_opensfm.read(path)
+    return read_opencv(path) if is_opencv(path) else opensfm.read_cameras(path)
 
 
 #: Reader of every format, by file suffix.
@@ -70,7 +119,7 @@ CAMERA_FORMATS: dict[str, Callable[[Path], dict[str, CameraEntry]]] = {
     ".yml": _yaml,
     ".json": _json,
     ".xml": orientation_metashape.read_cameras,
-    ".cam": camera_pix4d.read,
+    ".cam": pix4d.read_cameras,
     ".txt": _text,
     ".bin": orientation_colmap.read_cameras,
 }
@@ -100,4 +149,4 @@ def read_cameras(path: str | Path) -> CameraFile:
     cameras = CAMERA_FORMATS[suffix](path)
     if not cameras:
         raise InputError(f"{path}: describes no camera")
-    return CameraFile(path, cameras, suffix == ".json" and not camera_opencv.is_opencv(path))
+    return CameraFile(path, cameras, suffix == ".json" and not is_opencv(path))

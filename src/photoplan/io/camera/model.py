@@ -1,6 +1,7 @@
-"""Descriptions of lenses, and what is common to those of cameras, as checked and frozen values.
+"""Cameras as a project describes them: lenses, frame cameras and film cameras, as checked and frozen values.
 
-Each knows the lens or the interior orientation that computes.
+Each knows the lens or the interior orientation that computes. To add a kind of camera, derive it from `CameraEntry` and
+add it to `Camera`; everything else asks the camera.
 """
 
 from __future__ import annotations
@@ -11,14 +12,24 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Strict,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
-from photoplan.cameras.fiducials import FiducialFit, fit_marks
+from photoplan.cameras.fiducials import MODELS, FiducialFit, fit_marks
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Brown, Fisheye, Lens, NoLens, OpenCV, RadialTable, Reversed
 from photoplan.errors import InputError
-from photoplan.io.files import check_input_name
-from photoplan.io.mark_model import LARGEST, Marks, Number
+from photoplan.io.files import build, check_input_name
+from photoplan.io.mark_model import LARGEST, EachMark, Marks, Number
 
 Positive = Annotated[float, Strict(), Field(gt=0, le=LARGEST, allow_inf_nan=False)]
 NotNegative = Annotated[float, Strict(), Field(ge=0, le=LARGEST, allow_inf_nan=False)]
@@ -249,7 +260,7 @@ class FiducialSystem:
 
 
 class CameraEntry(Entry, ABC):
-    """A camera, of whatever kind: those that there are stand in `photoplan.io.camera.kinds`."""
+    """A camera, of whatever kind: those that there are stand in `photoplan.io.camera.model`."""
 
     type: str
     size: tuple[Pixels, Pixels] | None
@@ -334,3 +345,220 @@ class CameraEntry(Entry, ABC):
         if lens:
             entries["lens"] = self.lens.model_copy(update=lens)
         return self.model_copy(update=entries)
+
+
+class FrameEntry(CameraEntry):
+    """A digital frame camera: by its focal length in pixels, or by camera constant and pixel or sensor size."""
+
+    type: Literal["frame"] = "frame"
+    size: tuple[Pixels, Pixels]
+    """Width and height in pixels."""
+    focal_px: Positive | tuple[Positive, Positive] | None = None
+    """Camera constant in pixels; two numbers where pixels are not square (x, y)."""
+    camera_constant_mm: Positive | None = None
+    pixel_size_um: Positive | tuple[Positive, Positive] | None = None
+    sensor_size_mm: tuple[Positive, Positive] | None = None
+    principal_point_px: Pair | None = None
+    """Column and row of the principal point, (0, 0) the centre of the upper-left pixel; default the image's middle."""
+    principal_point_mm: Pair | None = None
+    """The same as x0 to the right and y0 upwards from the image's middle, millimetres."""
+
+    comments: ClassVar[Mapping[str, str]] = {
+        "type": "digital frame camera",
+        "size": "width and height, pixels",
+        "focal_px": "camera constant in pixels; [x, y] if they differ",
+        "camera_constant_mm": "",
+        "pixel_size_um": "",
+        "sensor_size_mm": "",
+        "principal_point_px": "column, row",
+        "principal_point_mm": "x right, y up, from the middle of the image",
+    }
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.focal_px is None) == (self.camera_constant_mm is None):
+            raise ValueError("give either focal_px or camera_constant_mm")
+        sizes = (self.pixel_size_um is not None) + (self.sensor_size_mm is not None)
+        if self.camera_constant_mm is not None and sizes != 1:
+            raise ValueError("camera_constant_mm needs either pixel_size_um or sensor_size_mm")
+        if self.focal_px is not None and sizes:
+            raise ValueError("focal_px stands alone: leave out pixel_size_um and sensor_size_mm")
+        if self.principal_point_mm is not None and self.focal_px is not None:
+            raise ValueError("principal_point_mm goes with camera_constant_mm; with focal_px give principal_point_px")
+        if self.principal_point_mm is not None and self.principal_point_px is not None:
+            raise ValueError("give either principal_point_px or principal_point_mm")
+        if self.camera_constant_mm is None and self.lens.needs == "mm":
+            raise ValueError("a radial table and a lens in unit mm need camera_constant_mm instead of focal_px")
+        return self
+
+    @property
+    def fiducial_system(self) -> None:
+        """There is none."""
+        return None
+
+    @property
+    def pixels(self) -> InPixels:
+        """The camera in pixels."""
+        w, h = self.size
+        middle = (w - 1) / 2, (h - 1) / 2
+        if self.camera_constant_mm is None:
+            assert self.focal_px is not None
+            focal = self.focal_px if isinstance(self.focal_px, tuple) else (self.focal_px, self.focal_px)
+            return InPixels(self.size, focal, self.principal_point_px or middle)
+        px, py = self._pixel_mm
+        x0, y0 = self.principal_point_mm or (0.0, 0.0)
+        point = self.principal_point_px or (middle[0] + x0 / px, middle[1] - y0 / py)
+        return InPixels(self.size, (self.camera_constant_mm / px, self.camera_constant_mm / py), point)
+
+    @property
+    def states_pixels(self) -> bool:
+        """Whether the principal point is stated in pixels, or nothing is in millimetres."""
+        return self.camera_constant_mm is None or self.principal_point_px is not None
+
+    @property
+    def _pixel_mm(self) -> tuple[float, float]:
+        """Side lengths of a pixel in millimetres."""
+        if self.sensor_size_mm is not None:
+            return self.sensor_size_mm[0] / self.size[0], self.sensor_size_mm[1] / self.size[1]
+        assert self.pixel_size_um is not None
+        pair = self.pixel_size_um if isinstance(self.pixel_size_um, tuple) else (self.pixel_size_um,) * 2
+        return pair[0] / 1000, pair[1] / 1000
+
+    def interior_orientation(self, size: tuple[int, int], fiducials: Fiducials | None) -> Interior:
+        """Interior orientation, the same for all images; `fiducials` are not used."""
+        if not self.states_pixels:
+            assert self.camera_constant_mm is not None
+            return Interior.metric(size, self.camera_constant_mm, self._pixel_mm, self.principal_point_mm or (0.0, 0.0))
+        pixels = self.pixels
+        col, row = pixels.point
+        return Interior.digital(size, pixels.focal, (col - (size[0] - 1) / 2, row - (size[1] - 1) / 2))
+
+    def check_fiducials(self, fiducials: Fiducials, sized: bool, name: str) -> None:
+        """A digital image has no marks."""
+        raise ValueError(f'fiducials are given, but camera {name!r} is digital (type = "frame")')
+
+
+def frame_in_pixels(pixels: InPixels, lens: Mapping[str, Any], where: str) -> CameraEntry:
+    """The description of a camera that is known in pixels, with the entries of its lens; `where` begins messages."""
+    fx, fy = pixels.focal
+    focal = fx if fx == fy else pixels.focal
+    values = {"size": pixels.size, "focal_px": focal, "principal_point_px": pixels.point, "lens": dict(lens)}
+    return build(FrameEntry, values, where)
+
+
+class FilmEntry(CameraEntry):
+    """A film camera whose photographs were scanned; each image states where its fiducial marks are in the scan."""
+
+    type: Literal["film"]
+    camera_constant_mm: Positive
+    fiducials_mm: Fiducials
+    """Calibrated fiducial marks: name = [x, y], x right and y upwards, millimetres."""
+    principal_point_mm: Pair = (0.0, 0.0)
+    """Principal point of the calibration report in the system of the fiducial marks."""
+    interior: Literal["similarity", "affine", "bilinear"] = "affine"
+    mirrored: Annotated[bool, Strict()] = False
+    """Whether the film was scanned through its back, so that left and right are exchanged."""
+    size: tuple[Pixels, Pixels] | None = None
+    """Width and height of the scans in pixels, where all are equal."""
+    marks: Marks | None = None
+    """What the fiducial marks look like: one description for all, or one for each by name."""
+
+    comments: ClassVar[Mapping[str, str]] = {
+        "type": "scanned film; each image states its measured fiducial marks",
+        "camera_constant_mm": "",
+        "principal_point_mm": "in the system of the fiducial marks, x right, y up",
+        "interior": '"similarity", "affine" or "bilinear": from the marks to the scan',
+        "mirrored": "true if the film was scanned through its back",
+        "size": "width and height of the scans, pixels",
+        "fiducials_mm": "calibrated marks: name = [x, y]",
+        "marks": "what the marks look like, mm",
+    }
+
+    @field_validator("fiducials_mm")
+    @classmethod
+    def _marks(cls, marks: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        if len(set(marks.values())) != len(marks):
+            twice = sorted(n for n, at in marks.items() if list(marks.values()).count(at) > 1)
+            raise ValueError(f"fiducial marks {', '.join(twice)} have the same coordinates")
+        return marks
+
+    @model_validator(mode="after")
+    def _enough(self) -> Self:
+        if self.lens.needs == "px":
+            raise ValueError("unit px has no meaning for the lens of a film camera; allowed are tangent and mm")
+        if isinstance(self.marks, EachMark):
+            described, names = set(self.marks.__pydantic_extra__), ", ".join(self.fiducials_mm)
+            unknown, bare = sorted(described - set(self.fiducials_mm)), sorted(set(self.fiducials_mm) - described)
+            if unknown:
+                raise ValueError(f"marks describes {', '.join(unknown)}; fiducials_mm has {names}")
+            if bare:
+                raise ValueError(f"marks does not describe fiducial mark {', '.join(bare)}")
+        needed = MODELS[self.interior]
+        if len(self.fiducials_mm) < needed:
+            raise ValueError(f"{len(self.fiducials_mm)} fiducial marks; {self.interior} needs at least {needed}")
+        return self
+
+    @property
+    def pixels(self) -> None:
+        """Each scan has its own."""
+        return None
+
+    @property
+    def states_pixels(self) -> bool:
+        """Never: the marks are in millimetres."""
+        return False
+
+    @property
+    def odd_in_x(self) -> frozenset[str]:
+        """Name the values that change their sign when x of the image is counted the other way."""
+        return self.lens.odd_in_x | {"x0"}
+
+    def x_reversed(self) -> Self:
+        """Return the camera with x of marks, principal point and lens reversed."""
+        x, y = self.principal_point_mm
+        return self.model_copy(
+            update={
+                "fiducials_mm": {name: (-mark[0] + 0.0, mark[1]) for name, mark in self.fiducials_mm.items()},
+                "principal_point_mm": (-x + 0.0, y),
+                "lens": self.lens.x_reversed(),
+            }
+        )
+
+    @property
+    def fiducial_system(self) -> FiducialSystem:
+        """The fiducial marks."""
+        return FiducialSystem(self.fiducials_mm, self.interior, self.mirrored, self.marks)
+
+    def interior_orientation(self, size: tuple[int, int], fiducials: Fiducials | None) -> Interior:
+        """Interior orientation of a scan from its measured marks; raises as `FiducialSystem.fit`."""
+        plane_to_pixel = self.fiducial_system.fit(fiducials).transformation
+        return Interior(self.camera_constant_mm, self.principal_point_mm, plane_to_pixel, size)
+
+    def check_fiducials(self, fiducials: Fiducials, sized: bool, name: str) -> None:
+        """Marks of a scan are the camera's, and enough."""
+        if not sized:
+            raise ValueError(
+                "size = [width, height] of the scan is stated neither here nor for its camera, and its file "
+                "cannot be read; give the scan, or state the size"
+            )
+        unknown = [n for n in fiducials if n not in self.fiducials_mm]
+        if unknown:
+            raise ValueError(
+                f"fiducial marks {', '.join(unknown)} are not among those of camera {name!r}:"
+                f" {', '.join(self.fiducials_mm)}"
+            )
+        needed = MODELS[self.interior]
+        if len(fiducials) < needed:
+            missing = [n for n in self.fiducials_mm if n not in fiducials]
+            raise ValueError(
+                f"{len(fiducials)} fiducial marks measured, {self.interior} needs {needed}; "
+                f"missing {', '.join(missing)}"
+            )
+
+
+def _kind(value: Any) -> str:
+    found = value.get("type", "frame") if isinstance(value, dict) else getattr(value, "type", "frame")
+    return found if isinstance(found, str) else repr(found)
+
+
+Camera = Annotated[Annotated[FrameEntry, Tag("frame")] | Annotated[FilmEntry, Tag("film")], Discriminator(_kind)]

@@ -25,11 +25,19 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry, UnusableCamera
+from photoplan.io.camera.opencv import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.files import finite, read_text, whole_number
-from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
-from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras, without_unusable
+from photoplan.io.orientation.block import (
+    FLIP,
+    Loss,
+    OrientationBlock,
+    OrientationFormat,
+    OrientationTable,
+    posed,
+    require_cameras,
+    without_unusable,
+)
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import FLIP, OrientationTable, posed
 from photoplan.io.orientation.text import numbers
 
 MAX_BYTES = 2 << 30

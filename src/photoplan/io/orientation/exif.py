@@ -23,9 +23,8 @@ from photoplan.geometry.crs import crs_step
 from photoplan.geometry.local import enu_poses
 from photoplan.geometry.pose import rotation_from_angles
 from photoplan.io.image_metadata import ImageMetadata, read_image_metadata
-from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, OrientationTable, posed
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import OrientationTable, posed
 
 SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff")
 #: From north, east, down to east, north, up.

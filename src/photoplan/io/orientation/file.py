@@ -9,9 +9,8 @@ from pathlib import Path
 from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.files import read_head
-from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, OrientationTable
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import OrientationTable
 from photoplan.io.product import check_output
 from photoplan.io.store import together, write_atomically
 
@@ -28,7 +27,7 @@ FORMATS: dict[str, str] = {
     "pix4d": "photoplan.io.orientation.pix4d",
     "opk": "photoplan.io.orientation.text:OPK",
     "exif": "photoplan.io.orientation.exif",
-    "odm": "photoplan.io.orientation.odm",
+    "odm": "photoplan.io.orientation.opensfm:ODM",
     "colmap": "photoplan.io.orientation.colmap",
     "opencv": "photoplan.io.camera.opencv",
 }

@@ -1,4 +1,4 @@
-r"""Project files of Trimble Inpho, Match-AT and OrthoMaster (``.prj``): images, orientations and digital frame cameras.
+"""Project files of Trimble Inpho, Match-AT and OrthoMaster (``.prj``): images, orientations and digital frame cameras.
 
 Sections ``$CAMERA`` (or ``$CAMERA_DEFINITION``) and ``$PHOTO`` hold entries ``$KEY : value`` and lines of numbers:
 
@@ -20,6 +20,9 @@ flight line. There are programs that take it the other way. So ``$INS`` is heard
 the rotation of these angles, and if neither is, the user declares it. An affine transformation that turns
 the image is carried over to the rotation. ``$RADIAL_COEFFS`` and ``$DECENTRE_COEFFS`` are not read, since it is not
 public whether they correct or distort: a camera that has them is left to a camera file.
+
+In files that are written, each image also gets its ω, φ, κ as ``$INS``, so that the file itself settles the direction
+of its rotation matrices; they are written ground to camera unless the other is asked for.
 """
 
 from __future__ import annotations
@@ -33,13 +36,19 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.pose import rotation_opk
-from photoplan.io.camera.frame import FrameEntry
-from photoplan.io.camera.model import CameraEntry
+from photoplan.io.camera.model import CameraEntry, FrameEntry, InPixels
 from photoplan.io.files import build, read_text
-from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation.block import (
+    Loss,
+    OrientationBlock,
+    OrientationFormat,
+    OrientationTable,
+    OrientedImage,
+    common_losses,
+    posed,
+    require_map,
+)
 from photoplan.io.orientation.form import Direction, TableFormat
-from photoplan.io.orientation.inpho_write import losses, render
-from photoplan.io.orientation.table import OrientationTable, posed
 from photoplan.io.orientation.text import DIRECTIONS, checked_rotation, numbers
 from photoplan.io.tables import number
 
@@ -132,7 +141,7 @@ def _entries(text: str) -> list[_Entry]:
     return found
 
 
-def read(path: Path, form: TableFormat) -> OrientationBlock:
+def _read(path: Path, form: TableFormat) -> OrientationBlock:
     """Block of a file."""
     file = _parse(path)
     photos = [p for p in file.photos if "$EXT_ORI" in p]
@@ -316,6 +325,101 @@ def _own(path: Path, head: str) -> bool:
     return re.search(r"^\s*\$(PROJECT|PHOTO|EXT_ORI)\b", head, re.M) is not None
 
 
-FORMAT = OrientationFormat(
-    name="inpho", title="project of Trimble Inpho", sniff=_own, read=read, render=render, losses=losses, suffix=".prj"
-)
+#: Side of a pixel that is taken for a camera that is described in pixels, millimetres.
+ASSUMED_PIXEL = 0.005
+
+
+def _losses(block: OrientationBlock) -> list[Loss]:
+    """What of a block an Inpho project does not hold."""
+    lost = common_losses(block, cameras=True, film=False, crs=True)
+    direction = DIRECTIONS[block.matrix or OWN]
+    lost.append(
+        Loss("other", f"no word on what the rotation matrix does; it is written {direction}, the angles as $INS")
+    )
+    for name, camera in block.cameras.items():
+        if camera.camera_constant_mm is None:
+            lost.append(
+                Loss("other", f"no camera in pixels: {name!r} is written with pixels of {ASSUMED_PIXEL * 1000:g} µm")
+            )
+    return lost
+
+
+def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
+    """The text of a project.
+
+    Raises
+    ------
+    InputError
+        No camera is known: the format states a camera constant with every image.
+    """
+    require_map(block, path)
+    if not block.cameras:
+        raise InputError(f"{path}: an Inpho project states a camera constant with every image; give `camera` FILE")
+    lines = ["$PROJECT 5.0.0", f"  $PROJECT_NAME : {_word(path.stem)}", "  $ANGULAR_UNITS : deg", "$END"]
+    if block.table.crs is not None:
+        crs = " ".join(block.table.crs.split())
+        lines += ["$COORDINATE_SYSTEM_SET", f"  $COORDINATE_SYSTEM : {crs}", "$END_COORDINATE_SYSTEM"]
+    matrices = block.table.rotations
+    for image, R in zip(block.table.images, matrices):
+        lines += _photo_lines(block, image, R.T if (block.matrix or OWN) == "ground-to-camera" else R)
+    for name, camera in block.cameras.items():
+        if camera.pixels is not None:
+            lines += _camera_lines(name, camera.pixels, _constant(camera))
+    lines.append("$NAVIGATION")
+    for image, angles in zip(block.table.images, block.angles("opk", "deg")):
+        lines.append(f"  $PHOTO_NUM : {_word(image.name)}")
+        lines.append(f"  $GPS : {_row(image.center, 15, 4)}")
+        lines.append(f"  $INS : {_row(angles, 14, 8)}")
+    lines.append("$ENDNAV")
+    return {path: "\n".join(lines) + "\n"}
+
+
+def _word(name: str) -> str:
+    return name.replace(" ", "\\ ")
+
+
+def _row(values: object, width: int, digits: int) -> str:
+    return " ".join(f"{float(v) + 0.0:{width}.{digits}f}" for v in values)  # type: ignore[attr-defined]
+
+
+def _photo_lines(block: OrientationBlock, image: OrientedImage, M: np.ndarray) -> list[str]:
+    camera = block.camera(image)
+    lines = ["$PHOTO", f"  $PHOTO_NUM : {_word(image.name)}"]
+    file = block.files.get(image.name)
+    if file is not None:
+        lines.append(f"  $PHOTO_FILE : {_word(file)}")
+    lines.append(f"  $CAMERA_ID : {_word(block.camera_name(image))}")
+    lines += ["  $ORI_STAT : adjusted", "  $EXT_ORI :"]
+    lines.append("    " + _row((_constant(camera), *image.center), 16, 6))
+    lines += ["    " + _row(row, 18, 14) for row in np.round(M, 14)]
+    lines.append("$END")
+    return lines
+
+
+def _constant(camera: CameraEntry) -> float:
+    if camera.camera_constant_mm is not None or camera.pixels is None:
+        return camera.constant_mm
+    return camera.pixels.focal[0] * ASSUMED_PIXEL
+
+
+def _camera_lines(name: str, camera: InPixels, c: float) -> list[str]:
+    (fx, fy), (col, row), (width, height) = camera.focal, camera.point, camera.size
+    # The image coordinates have their origin in the principal point: then PPA is zero.
+    return [
+        "$CAMERA",
+        f"  $TYPE : {_word(name)}",
+        "  $BRAND : Custom",
+        "  $KIND : CCDFrame",
+        "  $CCD_INTERIOR_ORIENTATION :",
+        f"    {_row((fx / c, 0.0, col), 24, 14)}",
+        f"    {_row((0.0, -fy / c, row), 24, 14)}",
+        f"  $CCD_COLUMNS : {width}",
+        f"  $CCD_ROWS : {height}",
+        "  $PIXEL_REFERENCE : CenterTopLeft",
+        f"  $FOCAL_LENGTH : {c:.9f}",
+        "  $PRINCIPAL_POINT_PPA : 0.000000 0.000000",
+        "$END",
+    ]
+
+
+FORMAT = OrientationFormat("inpho", "project of Trimble Inpho", _own, _read, _render, _losses, suffix=".prj")

@@ -38,11 +38,19 @@ from photoplan.geometry.local import (
 )
 from photoplan.geometry.units import metric_system
 from photoplan.io.camera.model import CameraEntry, UnusableCamera
+from photoplan.io.camera.opencv import AgisoftForm, agisoft_form, frame_camera
 from photoplan.io.files import finite, numbers, read_xml
-from photoplan.io.lens_forms import AgisoftForm, agisoft_form, frame_camera
-from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
+from photoplan.io.orientation.block import (
+    FLIP,
+    Loss,
+    OrientationBlock,
+    OrientationFormat,
+    OrientationTable,
+    height_losses,
+    posed,
+    require_cameras,
+)
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import FLIP, OrientationTable, posed
 from photoplan.io.orientation.text import checked_rotation
 from photoplan.plain import xml_quoted, xml_text
 

@@ -1,8 +1,14 @@
-"""Exterior orientation from OpenSfM's ``reconstruction.json``.
+"""Orientations and cameras of OpenSfM (``reconstruction.json``) and OpenDroneMap (``shots.geojson``, ``cameras.json``).
 
-As its documentation defines it (opensfm.org/docs: geometry, dataset): ``rotation`` is an angle-axis vector that, with
-``translation``, takes world coordinates to camera coordinates, x_camera = R x_world + t, the camera's axes being x
-right, y down, z forwards. World coordinates are a local tangential system (east, north, up) whose origin is
+The models of cameras are those of OpenSfM's documentation (opensfm.org/docs/geometry.html): image coordinates are
+divided by the larger side of the image, origin in its middle, x right and y down; the middle is ((w − 1)/2, (h − 1)/2)
+with the centre of the upper-left pixel at (0, 0). Camera axes are x right, y down, z forwards, so distortion has
+OpenCV's meaning: ``perspective`` has one focal length and k1, k2; ``simple_radial``, ``radial`` and ``brown`` add
+focal_x, focal_y, c_x, c_y, (k3, p1, p2); ``fisheye`` is OpenCV's with k1, k2, ``fisheye_opencv`` with k1–k4.
+
+Poses, as its documentation defines them (opensfm.org/docs: geometry, dataset): ``rotation`` is an angle-axis vector
+that, with ``translation``, takes world coordinates to camera coordinates, x_camera = R x_world + t, the camera's axes
+being x right, y down, z forwards. World coordinates are a local tangential system (east, north, up) whose origin is
 ``reference_lla``, or with OpenDroneMap of today a UTM zone. So the projection centre is −Rᵀ t, and with our axes (y up,
 z backwards) R_ground_camera = Rᵀ diag(1, −1, −1).
 
@@ -12,11 +18,19 @@ offset in whole metres, and keeps the former as ``reconstruction.topocentric.jso
 OpenSfM's ``export_geocoords``). It puts the reference at the offset itself, with height 0 (``opendm/osfm.py``,
 write_reference_lla), so that both files state the same reference, and their origins coincide; they differ by the
 convergence of meridians and the map's scale. ``gps_position`` of the shots stays east, north, up in both.
+
+OpenDroneMap's ``shots.geojson`` (in its folder ``odm_report``): one feature per image. The geometry is the projection
+centre in longitude, latitude and height. ``translation`` is the projection centre in the project's UTM zone, and
+``rotation``, as in OpenSfM, a rotation vector that takes the axes of the map to those of the camera (x right, y down, z
+forwards). ``focal`` is divided by the larger side of the image; the lens is not in this file but in ``cameras.json`` of
+the project, which is read if it lies beside the file or in the folder above. The file does not name the UTM zone. It is
+the one in which the two positions that it states of every image agree.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,22 +42,123 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import is_no_fix
-from photoplan.geometry.crs import agreement, crs_label, crs_step, misfit, topocentric_poses, utm_codes
+from photoplan.geometry.crs import agreement, canonical_crs, crs_label, crs_step, misfit, topocentric_poses, utm_codes
 from photoplan.geometry.local import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
-from photoplan.io.camera.model import CameraEntry, UnusableCamera
-from photoplan.io.camera.opensfm import cameras_of
+from photoplan.io.camera.model import CameraEntry, InPixels, UnusableCamera, frame_in_pixels
+from photoplan.io.camera.opencv import opencv_form, opencv_losses
 from photoplan.io.files import elements, finite, looks_like, members, read_json
-from photoplan.io.lens_forms import opencv_form, opencv_losses
 from photoplan.io.orientation.block import (
+    FLIP,
     Loss,
     OrientationBlock,
     OrientationFormat,
+    OrientationTable,
+    OrientedImage,
+    common_losses,
     height_losses,
+    posed,
     require_cameras,
     without_unusable,
 )
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import FLIP, OrientationTable, posed
+
+_COEFFICIENTS = {
+    "perspective": ("k1", "k2"),
+    "simple_radial": ("k1",),
+    "radial": ("k1", "k2"),
+    "brown": ("k1", "k2", "p1", "p2", "k3"),
+    "fisheye": ("k1", "k2"),
+    "fisheye_opencv": ("k1", "k2", "k3", "k4"),
+}
+
+
+def read_cameras(path: Path) -> dict[str, CameraEntry]:
+    """Cameras of a JSON file by name; sizes are those that the file states."""
+    contents = read_json(path)
+    if isinstance(contents, dict) and contents and all(_is_camera(c) for c in contents.values()):
+        return cameras_of([{"cameras": contents}], path)
+    return cameras_of(contents, path)
+
+
+def cameras_of(
+    reconstructions: Any, path: Path, faults: dict[str, UnusableCamera] | None = None
+) -> dict[str, CameraEntry]:
+    """Cameras of the parsed contents of a ``reconstruction.json``.
+
+    Those of a projection that has no form here are entered into `faults`; None: they are errors.
+    """
+    if not isinstance(reconstructions, list) or not all(
+        isinstance(r, dict) and isinstance(r.get("cameras"), dict) for r in reconstructions
+    ):
+        raise InputError(
+            f"{path}: neither a reconstruction.json of OpenSfM nor a cameras.json of OpenDroneMap{looks_like(path)}"
+        )
+    cameras: dict[str, CameraEntry] = {}
+    for reconstruction in reconstructions:
+        for name, values in reconstruction["cameras"].items():
+            try:
+                camera = _camera(values, f"{path}: camera {name!r}")
+            except UnusableCamera as error:
+                if faults is None:
+                    raise
+                faults[name] = error
+                continue
+            if cameras.setdefault(name, camera) != camera:
+                raise InputError(f"{path}: camera {name!r} differs between the reconstructions; keep one of them")
+    return cameras
+
+
+def _is_camera(values: Any) -> bool:
+    return isinstance(values, dict) and "projection_type" in values
+
+
+def _camera(values: Any, where: str) -> CameraEntry:
+    if not _is_camera(values):
+        raise InputError(f"{where}: projection_type is missing")
+    kind = values["projection_type"]
+    if not isinstance(kind, str) or kind not in _COEFFICIENTS:
+        raise UnusableCamera(
+            f"{where}: projection_type {kind!r} is not supported; must be one of {', '.join(_COEFFICIENTS)}"
+        )
+    size = finite([values.get("width"), values.get("height")], f"{where}: width and height", 2)
+    w, h = int(size[0]), int(size[1])
+    side = max(w, h)
+    focal_x = finite(values.get("focal_x", values.get("focal")), f"{where}: focal")
+    focal_y = finite(values.get("focal_y", focal_x * _value(values, "aspect_ratio", where, 1.0)), f"{where}: focal_y")
+    for key in ("p1", "p2", "k3", "k4", "k5", "k6", "s0", "s1", "s2", "s3"):
+        if key not in _COEFFICIENTS[kind] and _value(values, key, where) != 0:
+            raise InputError(f"{where}: {key} = {values[key]} is not supported for projection_type {kind!r}")
+    lens: dict[str, Any] = {k: _value(values, k, where) for k in _COEFFICIENTS[kind]}
+    point = (
+        (w - 1) / 2 + _value(values, "c_x", where) * side,
+        (h - 1) / 2 + _value(values, "c_y", where) * side,
+    )
+    lens = {"type": "opencv_fisheye" if kind.startswith("fisheye") else "opencv", **lens}
+    return frame_in_pixels(InPixels((w, h), (focal_x * side, focal_y * side), point), lens, where)
+
+
+def _value(values: dict[str, Any], key: str, where: str, default: float = 0.0) -> float:
+    number: float = finite(values.get(key, default), f"{where}: {key}")
+    return number
+
+
+def resized(camera: CameraEntry, size: tuple[int, int], where: str) -> CameraEntry:
+    """The camera for images of another resolution, as normalised coordinates define it."""
+    if size == camera.size or camera.pixels is None:
+        return camera
+    given = camera.pixels
+    factor = max(size) / max(given.size)
+    expected = tuple(s * factor for s in given.size)
+    if max(abs(a - b) for a, b in zip(expected, size)) > max(1.0, factor):
+        raise InputError(
+            f"{where}: image of {size[0]} × {size[1]} px, camera of {given.size[0]} × {given.size[1]} px; "
+            "another aspect ratio means another camera or crop"
+        )
+    (fx, fy), middle = given.focal, [(s - 1) / 2 for s in given.size]
+    point = tuple((s - 1) / 2 + (p - m) * factor for s, p, m in zip(size, given.point, middle))
+    focal = fx * factor if fx == fy else (fx * factor, fy * factor)
+    return camera.model_copy(update={"size": size, "focal_px": focal, "principal_point_px": point})
+
 
 _Floats = NDArray[np.float64]
 
@@ -199,13 +314,13 @@ def _refuse_far(path: Path, worlds: dict[str, _Floats], shots: Shots) -> None:
     )
 
 
-def losses(block: OrientationBlock) -> Iterable[Loss]:
+def _losses(block: OrientationBlock) -> Iterable[Loss]:
     """What of a block the format cannot hold."""
     yield from opencv_losses(block, rational=False)
     yield from height_losses(block.table)
 
 
-def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
+def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """Text of a ``reconstruction.json``.
 
     Raises
@@ -269,7 +384,7 @@ def normalised_camera(name: str, camera: CameraEntry, path: Path) -> dict[str, A
     return {"projection_type": "brown", **common, **radial, "p1": form.p[0], "p2": form.p[1]}
 
 
-def read(path: Path, form: TableFormat) -> OrientationBlock:
+def _read(path: Path, form: TableFormat) -> OrientationBlock:
     """Oriented images of a ``reconstruction.json``, in its local system or UTM zone; `form` is not used.
 
     With the cameras of the file, where it describes them.
@@ -370,8 +485,122 @@ FORMAT = OrientationFormat(
     name="opensfm",
     title="reconstruction.json of OpenSfM",
     sniff=lambda path, head: path.suffix.lower() == ".json" and '"shots"' in head,
-    read=read,
-    render=render,
-    losses=losses,
+    read=_read,
+    render=_render,
+    losses=_losses,
     suffix=".json",
+)
+
+
+#: Longest distance of the two positions of an image, metres; the same numbers differ by rounding only.
+_AGREE = 0.05
+
+
+def _read_odm(path: Path, form: TableFormat) -> OrientationBlock:
+    """Oriented images of a ``shots.geojson``, with the cameras of ``cameras.json``; `form` is not used."""
+    contents = read_json(path)
+    features = contents.get("features") if isinstance(contents, dict) else None
+    if not isinstance(features, list) or not features:
+        raise InputError(f"{path}: not a shots.geojson of OpenDroneMap (a FeatureCollection with features)")
+    shots = [_odm_shot(feature, k, path) for k, feature in enumerate(features)]
+    crs, notes = _utm_zone(np.array([s[2] for s in shots]), np.array([s[1].center for s in shots]), path)
+    cameras, file = _cameras_beside(path, [s[1] for s in shots])
+    if cameras:
+        notes.append(f"{path.name}: cameras from {file}")
+    else:
+        notes.append(f"{path.name}: states focal lengths but no lens; the project's cameras.json describes the cameras")
+    table = OrientationTable(path, tuple(s[1] for s in shots), crs=crs, true_metres=True, notes=tuple(notes))
+    return OrientationBlock(table, cameras, sizes={s[1].name: s[0] for s in shots} if not cameras else {})
+
+
+def _odm_shot(feature: Any, k: int, path: Path) -> tuple[tuple[int, int], OrientedImage, tuple[float, float, float]]:
+    """Image size, pose, and longitude, latitude, height of a feature."""
+    properties = feature.get("properties") if isinstance(feature, dict) else None
+    if not isinstance(properties, dict) or not isinstance(properties.get("filename"), str):
+        raise InputError(f"{path}: feature {k + 1} states no filename")
+    name = properties["filename"]
+    where = f"{path}: shot {name!r}"
+    center = finite(properties.get("translation"), f"{where}: translation", 3)
+    R_camera_ground = Rotation.from_rotvec(finite(properties.get("rotation"), f"{where}: rotation", 3)).as_matrix()
+    width, height = finite([properties.get("width"), properties.get("height")], f"{where}: width and height", 2)
+    geometry = feature.get("geometry")
+    place = geometry.get("coordinates") if isinstance(geometry, dict) else None
+    camera = properties.get("camera")
+    image = posed(name, center, R_camera_ground.T @ FLIP, camera if isinstance(camera, str) else None)
+    return (int(width), int(height)), image, finite(place, f"{where}: coordinates", 3)
+
+
+def _utm_zone(lonlat: NDArray[np.float64], XYZ: NDArray[np.float64], path: Path) -> tuple[str | None, list[str]]:
+    """The UTM zone in which longitude, latitude and the map coordinates agree, with a note."""
+    for code in utm_codes(float(np.median(lonlat[:, 1])), float(np.median(lonlat[:, 0]))):
+        try:
+            there = crs_step("EPSG:4326", code)(lonlat[:, :2])
+        except InputError:
+            continue
+        if np.abs(there - XYZ[:, :2]).max() < _AGREE:
+            return code, [f"{path.name}: positions agree with longitude and latitude in {crs_label(code)}"]
+    return None, [f"{path.name}: no UTM zone makes positions agree with longitude and latitude; declare the CRS"]
+
+
+def _cameras_beside(path: Path, images: list[OrientedImage]) -> tuple[dict[str, CameraEntry], Path | None]:
+    """Cameras of the project's ``cameras.json``, if it describes those of all images."""
+    for folder in (path.parent, path.parent.parent):
+        file = folder / "cameras.json"
+        if file.is_file():
+            cameras = read_cameras(file)
+            named = {i.camera for i in images}
+            known = named <= set(cameras) or (named == {None} and len(cameras) == 1)
+            return (cameras, file) if known else ({}, None)
+    return {}, None
+
+
+def _render_odm(block: OrientationBlock, path: Path) -> dict[Path, str]:
+    table = block.table
+    if table.crs is None:
+        raise InputError(f"{path}: shots.geojson needs longitude and latitude; state the CRS of the orientation")
+    lonlat = crs_step(table.crs, "EPSG:4326")(table.centers[:, :2]).tolist()
+    features = []
+    for image, (lon, lat), R in zip(table.images, lonlat, table.rotations):
+        size = block.size(image)
+        form = opencv_form(block.camera(image)) if block.cameras else None
+        properties: dict[str, Any] = {"filename": image.name}
+        if block.cameras:
+            properties["camera"] = block.camera_name(image)
+        if form is not None:
+            properties["focal"] = form.focal[0] / max(form.size)
+        if size is None:
+            raise InputError(f"{path}: the size of image {image.name!r} is not known; name the file with the cameras")
+        properties |= {"width": size[0], "height": size[1], "translation": list(image.center)}
+        properties["rotation"] = Rotation.from_matrix(FLIP @ R.T).as_rotvec().tolist()
+        point = {"type": "Point", "coordinates": [lon, lat, image.center[2]]}
+        features.append({"type": "Feature", "properties": properties, "geometry": point})
+    return {path: json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"}
+
+
+def _losses_odm(block: OrientationBlock) -> Iterable[Loss]:
+    lost = common_losses(block, cameras=False, crs=True)
+    for loss in lost:
+        if loss.kind == "camera":
+            yield Loss(
+                "camera", "only the focal length of the cameras, no principal point and no lens: keep their file"
+            )
+        else:
+            yield loss
+    crs = block.table.crs
+    if crs is not None and not re.fullmatch(r"EPSG:32[67]\d\d", canonical_crs(crs)):
+        yield Loss("crs", "no CRS but UTM zones of WGS 84; readers will take these positions for others")
+
+
+def _sniff_odm(path: Path, head: str) -> bool:
+    return '"FeatureCollection"' in head and '"translation"' in head and '"rotation"' in head
+
+
+ODM = OrientationFormat(
+    name="odm",
+    title="OpenDroneMap shots.geojson",
+    sniff=_sniff_odm,
+    read=_read_odm,
+    render=_render_odm,
+    losses=_losses_odm,
+    suffix=".geojson",
 )

@@ -43,15 +43,18 @@ from photoplan.geometry.pose import rotation_opk
 from photoplan.geometry.units import metric_system
 from photoplan.io.files import crs_beside, read_text
 from photoplan.io.orientation.block import (
+    FLIP,
     Loss,
     OrientationBlock,
     OrientationFormat,
+    OrientationTable,
+    OrientedImage,
     common_losses,
     name_losses,
+    posed,
     require_map,
 )
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, posed
 from photoplan.io.tables import NUMBER, Columns, Dialect, csv_line, number, read_table
 
 MAX_BYTES = 200_000_000

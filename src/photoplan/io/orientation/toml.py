@@ -14,12 +14,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
-from photoplan.io.camera.kinds import Camera
-from photoplan.io.camera.model import Fiducials, Name, Pixels, Triple
+from photoplan.io.camera.model import Camera, Fiducials, Name, Pixels, Triple
 from photoplan.io.files import explain, read_toml
-from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, require_map
+from photoplan.io.orientation.block import (
+    OrientationBlock,
+    OrientationFormat,
+    OrientationTable,
+    OrientedImage,
+    require_map,
+)
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import OrientationTable, OrientedImage
 from photoplan.io.project.file import camera_lines, toml_value
 from photoplan.io.project.model import Orientation
 

@@ -19,9 +19,9 @@ from photoplan.cameras.lenses import Lens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import area_fault, bounds_fault, odd_angles, odd_place
 from photoplan.geometry.pose import ANGLE_UNITS
-from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.line import line_files
 from photoplan.io.camera.model import (
+    Camera,
     CameraEntry,
     Entry,
     Fiducials,

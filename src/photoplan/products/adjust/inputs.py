@@ -15,9 +15,9 @@ from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.bounds import area_note
 from photoplan.geometry.pose import ANGLE_UNITS, Pose, angles_from_rotation
 from photoplan.io.files import ImageNames, match_key
+from photoplan.io.orientation.block import angle_in_radians
 from photoplan.io.orientation.exif import image_files
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.points import (
     PositionTable,
     is_gcp_list,

@@ -15,8 +15,7 @@ from photoplan.adjustment.least_squares import by_differences, spread
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation, small_rotations, view_from_rotation
-from photoplan.io.orientation.block import OrientationBlock
-from photoplan.io.orientation.table import OrientationTable, OrientedImage
+from photoplan.io.orientation.block import OrientationBlock, OrientationTable, OrientedImage
 from photoplan.io.orientation.toml import render
 from photoplan.io.project.file import toml_value
 from photoplan.io.quicklook import write_png
