@@ -199,6 +199,7 @@ OVERWRITE: Any = opt("Replace files that exist.", False, section="run")
 PROJECT: Any = arg("Project file, or the folder that holds `project.toml`.", project=True)
 IMAGES: Any = opt("Images or patterns; may be repeated [all].", (), listed=True, metavar="NAME,…", section="input")
 PICTURE: Any = opt("Write no picture of the result.", True, flag="no-picture", section="result")
+REPORT_FORMAT: Any = opt("Format of the report.", "html", section="result")
 DRY_RUN: Any = opt("Say what would be done, and stop.", False, section="run")
 _EXECUTORS = "threads, processes, or the address of a Dask scheduler, tcp://host:port."
 EXECUTOR: Any = opt(_EXECUTORS, "threads", metavar="KIND", section="run")

@@ -6,7 +6,7 @@ import importlib
 import types
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
@@ -191,9 +191,7 @@ def command(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
                 draw(result)
         made: list[Path] = []
         for path, file in opened.items():
-            if file is not None and (content := load(verb.draw[drawn[path]])(result)) is not None:
-                each = content if isinstance(content, Mapping) else {path: content}
-                made += [replace(file, path=place).write(one) for place, one in each.items()]
+            made += file.draw(load(verb.draw[drawn[path]]), result) if file is not None else []
         options = type(request).model_fields
         first = [path for key, path in request.drawn.items() if path in made and key not in options]
         files = [*first, *result.written(), *(path for path in made if path not in first)]

@@ -814,7 +814,7 @@ _PICTURE = base64.b64decode(
 _DECODERS = {"dda6fb8a7330": "libjpeg 9 of the IJG", "0626c3e14946": "libjpeg-turbo"}
 T = TypeVar("T")
 #: Fields of requests that decide no value.
-_IDLE = {"memory", "workers", "executor", "overwrite", "dry_run"}
+_IDLE = {"memory", "workers", "executor", "overwrite", "dry_run", "report_format"}
 #: Texts from here on are no messages, but the tiles that a record keeps.
 _LONG = 100_000
 _PACKAGES = ("photoplan", "numpy", "numba", "scipy", "rasterio", "pyproj", "pyogrio", "shapely")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -40,7 +42,7 @@ STYLE = {
 _DPI = 150
 #: Width of a plot over the whole page, inches.
 _WIDE = 7.2
-_PARTS = ("cm", "collections", "colors", "figure", "lines", "patches", "path", "ticker")
+_PARTS = ("artist", "cm", "collections", "colors", "figure", "image", "lines", "patches", "path", "text", "ticker")
 
 
 def has_matplotlib() -> bool:
@@ -93,8 +95,25 @@ def axes_of(width: float, height: float) -> tuple[Any, Any]:
     return fig, fig.subplots()
 
 
+_KEPT: ContextVar[dict[bytes, Any] | None] = ContextVar("kept", default=None)
+
+
+@contextmanager
+def keeping() -> Iterator[dict[bytes, Any]]:
+    """Keep figures as they are, for a PDF: `png` returns what stands for each."""
+    kept: dict[bytes, Any] = {}
+    token = _KEPT.set(kept)
+    try:
+        yield kept
+    finally:
+        _KEPT.reset(token)
+
+
 def png(fig: Any, dpi: int = _DPI, **options: Any) -> bytes:
     """A figure as PNG, without the name of the program that drew it; options are those of matplotlib's ``savefig``."""
+    if (kept := _KEPT.get()) is not None and not options:
+        kept[key := b"figure %d" % len(kept)] = fig
+        return key
     buffer = io.BytesIO()
     fig.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None}, **options)
     return buffer.getvalue()

@@ -6,10 +6,12 @@ import base64
 import html
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
+from typing import Any
 
 from photoplan.errors import UsageError
 from photoplan.io.disk import disk_error, make_parents
@@ -18,7 +20,7 @@ from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.store import write_atomically
 from photoplan.project.scene import input_files
-from photoplan.report.drawing import load_matplotlib
+from photoplan.report.drawing import keeping, load_matplotlib
 
 _STYLE = """
 :root { --ink: #1c2730; --soft: #5c6b77; --rule: #d7dee3; --accent: #0b5c8c; --ground: #f6f8f9; }
@@ -142,14 +144,33 @@ class ReportFile:
     """A report or picture that can be written: seen before any work."""
 
     path: Path
+    report: bool = False
+
+    def draw(self, drawing: Callable[[Any], Any], result: Any) -> list[Path]:
+        """Draw it from a result and write it; a drawing may return several by their places, or None."""
+        printing = self.report and self.path.suffix.lower() == ".pdf"
+        with ExitStack() as stack:
+            plots = stack.enter_context(keeping()) if printing else {}
+            content = drawing(result)
+        if content is None:
+            return []
+        if printing:
+            from photoplan.report.pdf import printed  # noqa: PLC0415 - for PDF alone
+
+            return [self.write(printed(self._stated(content), plots))]
+        each = content if isinstance(content, Mapping) else {self.path: content}
+        return [replace(self, path=place).write(one) for place, one in each.items()]
+
+    def _stated(self, content: str) -> str:
+        """Return a document whose paths are written from its folder; pictures inside are left as they are."""
+        parts = re.split(r"(data:image/[^\"]*)", content)
+        parts[::2] = [stated_text(part, self.path.parent) for part in parts[::2]]
+        return "".join(parts)
 
     def write(self, content: str | bytes) -> Path:
         """Write it whole or not at all; its folder is made. Returns its path."""
         if isinstance(content, str):
-            # Pictures inside are left as they are.
-            parts = re.split(r"(data:image/[^\"]*)", content)
-            parts[::2] = [stated_text(part, self.path.parent) for part in parts[::2]]
-            content = "".join(parts).encode("utf-8", errors="replace")
+            content = self._stated(content).encode("utf-8", errors="replace")
         try:
             make_parents(self.path.parent)
         except OSError as error:
@@ -172,9 +193,9 @@ def open_report(
     if table is not None and table.resolve() == path.resolve():
         raise UsageError(f"{path}: report and table are the same file; give two names")
     opened = open_picture(path, inputs, overwrite=overwrite, project=project, what="a report")
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise UsageError(f"{path}: a report is written as HTML; give a name that ends in .html")
-    return opened
+    if path.suffix.lower() not in (".html", ".htm", ".pdf"):
+        raise UsageError(f"{path}: a report is HTML or PDF; give a name that ends in .html or .pdf")
+    return opened and replace(opened, report=True)
 
 
 def open_picture(

@@ -8,7 +8,19 @@ from typing import Literal
 
 from photoplan.errors import UsageError
 from photoplan.io.orientation.form import Direction, TableFormat
-from photoplan.request import BEYOND_AREA, DRY_RUN, IMAGES, ONE_WORKER, OVERWRITE, PICTURE, PROJECT, Request, arg, opt
+from photoplan.request import (
+    BEYOND_AREA,
+    DRY_RUN,
+    IMAGES,
+    ONE_WORKER,
+    OVERWRITE,
+    PICTURE,
+    PROJECT,
+    REPORT_FORMAT,
+    Request,
+    arg,
+    opt,
+)
 
 
 class ConvertRequest(Request):
@@ -114,7 +126,7 @@ class InteriorRequest(Request):
     )
     scan_resolution: str | None = opt("Resolution, such as 1200dpi or 21um [what the files state].", None,
                                       metavar="DPI|UM", section="input")  # fmt: skip
-    report: Path | None = opt("Write figures and plots as a page.", None, metavar="HTML", writes=True)
+    report: Path | None = opt("Write figures and plots as a page, HTML or PDF.", None, metavar="FILE", writes=True)
     plot: Path | None = opt("Write residual vectors as a picture.", None, metavar="PNG", writes=True)
     write: bool = opt("Make the model that of the cameras in the project file.", False, section="result")
     overwrite: bool = OVERWRITE
@@ -215,7 +227,9 @@ class ResectRequest(Request):
     )
     unknown_camera_constant: bool = opt("The camera constant is not even approximately known; for one image.", False)
     critical: float = opt("Normalised residual from which a point is a gross error.", 4.0, ge=2, le=20)
-    report: Path | None = opt("Write residuals with pictures as a page.", None, metavar="HTML", writes=True)
+    report: Path | None = opt(
+        "Write residuals with pictures as a page, HTML or PDF.", None, metavar="FILE", writes=True
+    )
     dry_run: bool = _KEEP_PROJECT
     overwrite: bool = OVERWRITE
 
@@ -247,6 +261,7 @@ class AdjustRequest(Request):
     iterations: int = opt("Largest number of iterations of each solution.", 40, ge=1)
     output: Path | None = opt("Folder of the report [PROJECT/adjustment].", None, folder=True, metavar="FOLDER",
                               section="result")  # fmt: skip
+    report_format: Literal["html", "pdf"] = REPORT_FORMAT
     dry_run: bool = opt("Adjust and print the figures; write nothing.", False, section="run")
     overwrite: bool = OVERWRITE
 
@@ -263,4 +278,4 @@ class AdjustRequest(Request):
     @property
     def drawn(self) -> Mapping[str, Path]:
         """The page of the report."""
-        return {"report": self.folder / "report.html"}
+        return {"report": self.folder / f"report.{self.report_format}"}

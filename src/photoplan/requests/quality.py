@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from photoplan.errors import UsageError
 from photoplan.request import BOUNDS, DRY_RUN, IMAGES, MEMORY, ONE_WORKER, OVERWRITE, Request, arg, opt, path_or
 
-REPORT: Any = opt("Report with plots to write.", None, metavar="HTML", writes=True)
+REPORT: Any = opt("Report with plots to write, HTML or PDF.", None, metavar="FILE", writes=True)
 
 
 class SensorRequest(Request):

@@ -60,7 +60,8 @@ class SurfaceRequest(SurfaceSettings):
 
     project: Path = PROJECT
     images: tuple[str, ...] = IMAGES
-    report: Path | None = opt("Accuracy by classes, images and levels, with plots.", None, metavar="HTML", writes=True)
+    report: Path | None = opt("Accuracy by classes, images and levels, with plots, HTML or PDF.", None, metavar="FILE",
+                              writes=True)  # fmt: skip
     output: Path | None = opt("Folder of the files [products by the project].", None, folder=True, section="result")
     quicklook: bool = opt("Write no picture of the surface.", True, flag="no-quicklook", section="result")
     force: bool = opt(

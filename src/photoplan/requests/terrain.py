@@ -12,6 +12,7 @@ from photoplan.request import (
     BOUNDS,
     ONE_WORKER,
     OVERWRITE,
+    REPORT_FORMAT,
     WORKERS,
     Request,
     arg,
@@ -77,6 +78,7 @@ class BuildRequest(Request):
     beyond_area: bool = BEYOND_AREA
     report: bool | None = opt("Write a page with plots beside the model [if matplotlib is there].", None,
                               section="result")  # fmt: skip
+    report_format: Literal["html", "pdf"] = REPORT_FORMAT
     dry_run: bool = opt("Read, clean and plan; print it and stop.", False, section="run")
     workers: int = ONE_WORKER
     overwrite: bool = OVERWRITE
@@ -100,7 +102,8 @@ class BuildRequest(Request):
     @property
     def drawn(self) -> dict[str, Path]:
         """The page of the report."""
-        return {} if self.report is False else {"report": self.output.with_name(f"{self.output.stem}.report.html")}
+        name = f"{self.output.stem}.report.{self.report_format}"
+        return {} if self.report is False else {"report": self.output.with_name(name)}
 
 
 class InfoRequest(Request):
