@@ -25,7 +25,7 @@ from photoplan.io.orientation.block import angle_in_radians
 from photoplan.io.orientation.exif import map_positions, read_folder
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.form import TableFormat
-from photoplan.io.tables import NUMBER, Columns, Dialect, Table, number, read_table, write_table
+from photoplan.io.tables import NUMBER, Columns, Dialect, TextTable, number, read_table, write_table
 from photoplan.io.vector_layer import read_layer
 
 _ROLES = {
@@ -221,7 +221,7 @@ def read_image_points(
     )
 
 
-def _sigma(table: Table) -> np.ndarray:
+def _sigma(table: TextTable) -> np.ndarray:
     sigma = np.stack([table.first_known(role, "sigma") for role in ("sigma_x", "sigma_y")], axis=1)
     bad = np.flatnonzero((sigma <= 0).any(axis=1))
     if len(bad):
@@ -231,7 +231,7 @@ def _sigma(table: Table) -> np.ndarray:
 
 
 def _once(
-    table: Table, key: np.ndarray, names: tuple[Sequence[str], Sequence[str]], doubtful: list[str] | None
+    table: TextTable, key: np.ndarray, names: tuple[Sequence[str], Sequence[str]], doubtful: list[str] | None
 ) -> np.ndarray:
     """Measurements of a point in an image that are the only ones, (n,): of several nothing says which is right."""
     _, of, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -536,7 +536,7 @@ def read_observed_positions(
     )
 
 
-def _sigma_observed_positions(table: Table) -> NDArray[np.float64]:
+def _sigma_observed_positions(table: TextTable) -> NDArray[np.float64]:
     out = []
     for roles in (("sigma_x", "sigma_xy", "sigma"), ("sigma_y", "sigma_xy", "sigma"), ("sigma_z", "sigma")):
         out.append(table.first_known(*roles))
@@ -544,13 +544,13 @@ def _sigma_observed_positions(table: Table) -> NDArray[np.float64]:
     return np.stack(out, axis=1)
 
 
-def _positive(table: Table, role: str, values: NDArray[np.float64]) -> None:
+def _positive(table: TextTable, role: str, values: NDArray[np.float64]) -> None:
     bad = np.flatnonzero(values <= 0)
     if len(bad):
         raise InputError(f"{table.where(int(bad[0]))}: {role} = {values[bad[0]]:g}; it must be positive")
 
 
-def _rotations(table: Table, form: TableFormat) -> NDArray[np.float64] | None:
+def _rotations(table: TextTable, form: TableFormat) -> NDArray[np.float64] | None:
     roles = ("omega", "phi", "kappa")
     there = [role for role in roles if role in table.roles]
     if not there:
@@ -567,7 +567,7 @@ def _rotations(table: Table, form: TableFormat) -> NDArray[np.float64] | None:
     return R if form.direction == "camera-to-ground" else np.swapaxes(R, 1, 2)
 
 
-def _times(table: Table) -> NDArray[np.float64]:
+def _times(table: TextTable) -> NDArray[np.float64]:
     if "time" not in table.roles:
         return np.arange(len(table.rows), dtype=float)
     texts = table.texts("time")

@@ -204,7 +204,7 @@ class TableLayout:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Table:
+class TextTable:
     """A table that was split into fields."""
 
     path: Path
@@ -270,7 +270,7 @@ class Table:
         return np.array(values, float)
 
 
-def read_table(path: Path, columns: Columns, dialect: Dialect = Dialect(), max_bytes: int = MAX_BYTES) -> Table:
+def read_table(path: Path, columns: Columns, dialect: Dialect = Dialect(), max_bytes: int = MAX_BYTES) -> TextTable:
     """The fields of a text table."""
     size = path.stat().st_size if path.exists() else 0
     if size > max_bytes:
@@ -287,7 +287,7 @@ def read_table(path: Path, columns: Columns, dialect: Dialect = Dialect(), max_b
     for (line, _), row in zip(body, rows):
         if len(row) != layout.width:
             raise InputError(f"{path}:{line}: {wrong_width(len(row), layout)}")
-    return Table(
+    return TextTable(
         path=path, rows=rows, lines=tuple(line for line, _ in body), layout=layout, decimal_comma=dialect.decimal_comma
     )
 

@@ -189,7 +189,7 @@ SLOPE_COLOURS = ((255, 255, 212), (254, 217, 142), (254, 153, 41), (204, 76, 2),
 
 
 @dataclass(frozen=True)
-class Picture:
+class TerrainPicture:
     """One kind of picture: how a tile is computed, and how it is stored."""
 
     kind: str
@@ -249,7 +249,7 @@ def dtm_tint(request: TintRequest, events: Events = SILENT) -> ShadingFacts:
 
 
 def make_picture(
-    request: PictureRequest, picture: Callable[[OpenTerrain, MapGrid], Picture], events: Events = SILENT
+    request: PictureRequest, picture: Callable[[OpenTerrain, MapGrid], TerrainPicture], events: Events = SILENT
 ) -> ShadingFacts:
     """Write a picture of a terrain model; a run that was killed is continued by the same request.
 
@@ -316,19 +316,21 @@ def _grid(request: PictureRequest, terrain: OpenTerrain) -> MapGrid:
     return MapGrid.covering(bounds, request.resolution or terrain.resolution, terrain.crs)
 
 
-def shade_picture(light: Lighting) -> Callable[[OpenTerrain, MapGrid], Picture]:
+def shade_picture(light: Lighting) -> Callable[[OpenTerrain, MapGrid], TerrainPicture]:
     """A hillshade: grey values 1 to 255, 0 where there is no terrain."""
 
     def tile(terrain: OpenTerrain, grid: MapGrid, window: Window) -> GridTile:
         slopes = surface_slopes(terrain.surface, grid, window)
         return shading.grey(shading.hillshade(slopes, light))[None]
 
-    return lambda terrain, grid: Picture(
+    return lambda terrain, grid: TerrainPicture(
         kind="hillshade", dtype="uint8", bands=1, nodata="auto", settings=light.model_dump(), tile=tile
     )
 
 
-def slope_picture(unit: str = "degrees", classes: tuple[float, ...] = ()) -> Callable[[OpenTerrain, MapGrid], Picture]:
+def slope_picture(
+    unit: str = "degrees", classes: tuple[float, ...] = ()
+) -> Callable[[OpenTerrain, MapGrid], TerrainPicture]:
     """Slope in `degrees` or `percent` as float32; or the numbers of its classes, with colours."""
     if unit not in ("degrees", "percent"):
         raise UsageError(f"slope in {unit!r}; allowed are degrees and percent")
@@ -342,7 +344,7 @@ def slope_picture(unit: str = "degrees", classes: tuple[float, ...] = ()) -> Cal
 
     settings = {"unit": unit, "classes": list(classes)}
     if not classes:
-        return lambda terrain, grid: Picture(
+        return lambda terrain, grid: TerrainPicture(
             kind="slope", dtype="float32", bands=1, nodata="auto", settings=settings, tile=tile
         )
     at = np.linspace(0, len(SLOPE_COLOURS) - 1, len(classes) + 1)
@@ -350,7 +352,7 @@ def slope_picture(unit: str = "degrees", classes: tuple[float, ...] = ()) -> Cal
     table = {0: (0, 0, 0)} | {
         i + 1: (int(r), int(g), int(b)) for i, (r, g, b) in enumerate(np.column_stack(mixed).tolist())
     }
-    return lambda terrain, grid: Picture(
+    return lambda terrain, grid: TerrainPicture(
         kind="slope classes",
         dtype="uint8",
         bands=1,
@@ -362,13 +364,13 @@ def slope_picture(unit: str = "degrees", classes: tuple[float, ...] = ()) -> Cal
     )
 
 
-def aspect_picture() -> Callable[[OpenTerrain, MapGrid], Picture]:
+def aspect_picture() -> Callable[[OpenTerrain, MapGrid], TerrainPicture]:
     """Aspect, degrees clockwise from north, -1 where it is flat."""
 
     def tile(terrain: OpenTerrain, grid: MapGrid, window: Window) -> GridTile:
         return shading.aspect(surface_slopes(terrain.surface, grid, window))[None]
 
-    return lambda terrain, grid: Picture(
+    return lambda terrain, grid: TerrainPicture(
         kind="aspect",
         dtype="float32",
         bands=1,
@@ -385,12 +387,12 @@ def tint_picture(
     steps: int | None = None,
     light: Lighting | None = None,
     strength: float = 0.6,
-) -> Callable[[OpenTerrain, MapGrid], Picture]:
+) -> Callable[[OpenTerrain, MapGrid], TerrainPicture]:
     """Height tints, red, green, blue, with a mask."""
     if not 0 <= strength <= 1:
         raise UsageError(f"strength {strength} of the hillshade; 0 to 1 are allowed")
 
-    def picture(terrain: OpenTerrain, grid: MapGrid) -> Picture:
+    def picture(terrain: OpenTerrain, grid: MapGrid) -> TerrainPicture:
         colours = _ramp(terrain, grid, ramp, span, steps)
 
         def tile(terrain: OpenTerrain, grid: MapGrid, window: Window) -> GridTile:
@@ -408,7 +410,7 @@ def tint_picture(
         }
         if light is not None:
             settings |= light.model_dump() | {"strength": strength}
-        return Picture(kind="tints", dtype="uint8", bands=3, nodata="mask", settings=settings, tile=tile)
+        return TerrainPicture(kind="tints", dtype="uint8", bands=3, nodata="mask", settings=settings, tile=tile)
 
     return picture
 
