@@ -17,7 +17,7 @@ from photoplan.cameras.lenses import Lens
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Placement
 from photoplan.geometry.local import LocalFrame, earth_radius
-from photoplan.geometry.pose import Pose, dot
+from photoplan.geometry.pose import Pose, dot, solve3
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ class WarpedCamera:
         with np.errstate(all="ignore"):
             point = self._meet(v, heights)
             J = self._warp_with_jacobian(point)[1]
-            d = _solve(J, v)
+            d = solve3(J, v)
             d /= np.linalg.norm(d, axis=-1, keepdims=True)
         return point.reshape(shape), d.reshape(shape)
 
@@ -252,7 +252,7 @@ class WarpedCamera:
     def _start(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where the rays would meet the heights over a sphere of the given curvature."""
         nadir = np.column_stack([np.broadcast_to(self.center[:2], (len(v), 2)), heights])
-        d = _solve(self._warp_with_jacobian(nadir)[1], v)
+        d = solve3(self._warp_with_jacobian(nadir)[1], v)
         above = self.center[2] - heights
         bend = self.curvature * (d[:, 0] ** 2 + d[:, 1] ** 2)
         root = np.sqrt(np.maximum(d[:, 2] ** 2 - 2.0 * bend * above, 0.0))
@@ -271,20 +271,11 @@ def inverse_by_newton(warp: Warp, displaced: ArrayLike) -> NDArray[np.float64]:
     with np.errstate(all="ignore"):
         for _ in range(_ITERATIONS):
             miss = warp(p) - wanted.reshape(-1, 3)
-            p -= _solve(warp.jacobian(p), miss)
+            p -= solve3(warp.jacobian(p), miss)
             if not (np.abs(miss) > 1e-9).any():
                 break
         p[~(np.abs(miss) < 1e-6).all(axis=1)] = np.nan
     return p.reshape(wanted.shape)
-
-
-def _solve(J: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x of J x = v for (n, 3, 3) and (n, 3) by Cramer's rule, which leaves NaN where there is no solution."""
-    a, b, c = J[..., 0], J[..., 1], J[..., 2]
-    bc = np.cross(b, c)
-    det = (a * bc).sum(axis=-1)
-    x = np.stack([(v * bc).sum(-1), (v * np.cross(c, a)).sum(-1), (v * np.cross(a, b)).sum(-1)], axis=-1)
-    return x / det[..., None]
 
 
 # ICAO standard atmosphere: temperature falls by 6.5 K/km from 288.15 K to 11 km and stays; density follows from

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.interior import Interior
 from photoplan.errors import InputError
+from photoplan.geometry.pose import determinant, solve2
 
 
 class Lens(Protocol):
@@ -88,11 +89,6 @@ _ITERATIONS = 60
 _Map = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-def determinant(J: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Determinant of matrices (..., 2, 2)."""
-    return J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-
-
 def upright(J: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Where a lens's derivative (..., 2, 2) neither mirrors nor turns round; False for NaN.
 
@@ -100,15 +96,6 @@ def upright(J: NDArray[np.float64]) -> NDArray[np.bool_]:
     least one of determinant and trace is negative.
     """
     return np.asarray((determinant(J) > 0) & (J[..., 0, 0] + J[..., 1, 1] > 0))
-
-
-def solve2(J: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x of J x = b for matrices (..., 2, 2) and vectors (..., 2); inf or NaN where J is singular."""
-    det = determinant(J)
-    x = np.empty_like(b)
-    x[..., 0] = (J[..., 1, 1] * b[..., 0] - J[..., 0, 1] * b[..., 1]) / det
-    x[..., 1] = (J[..., 0, 0] * b[..., 1] - J[..., 1, 0] * b[..., 0]) / det
-    return x
 
 
 def newton_inverse(

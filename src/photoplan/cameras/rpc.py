@@ -14,6 +14,7 @@ from photoplan.cameras.fiducials import Affine2D
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.crs import nearest_turn
 from photoplan.geometry.local import GeodeticGround
+from photoplan.geometry.pose import solve2
 
 #: Polynomials hold for normalised coordinates from −1 to 1; as far as this they are followed: images reach a little
 #: beyond what the coefficients were fitted to. Further out there is no position.
@@ -231,7 +232,7 @@ class RationalFunctions:
             for _ in range(_ITERATIONS):
                 at, J = self._evaluate(ground, 2, bound=np.inf)
                 miss = at - xy
-                ground[:, :2] -= solve(J, miss)
+                ground[:, :2] -= solve2(J, miss)
                 found = np.asarray((np.abs(miss) < _FOUND).all(axis=1))
                 if found.all():
                     break
@@ -284,14 +285,6 @@ def _terms(powers: NDArray[np.float64], exponents: NDArray[np.int64]) -> NDArray
     """Products of powers (4, ..., 3) of the three coordinates, shape (..., 20)."""
     L, P, H = (np.moveaxis(powers[exponents[:, k], ..., k], 0, -1) for k in range(3))
     return L * P * H
-
-
-def solve(J: NDArray[np.float64], miss: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x of J x = miss for (n, 2, 2 or more) and (n, 2) by Cramer's rule; NaN where there is none."""
-    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    u = (J[:, 1, 1] * miss[:, 0] - J[:, 0, 1] * miss[:, 1]) / det
-    v = (J[:, 0, 0] * miss[:, 1] - J[:, 1, 0] * miss[:, 0]) / det
-    return np.stack([u, v], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,7 +408,7 @@ class RpcCamera:
                 miss = at - xy
                 if not (np.abs(miss) > 1e-9).any():
                     break
-                point[:, :2] -= solve(A, miss)
+                point[:, :2] -= solve2(A, miss)
             point[~(np.abs(miss) < _FOUND).all(axis=1)] = np.nan
         return point
 

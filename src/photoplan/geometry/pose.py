@@ -1,4 +1,4 @@
-"""Poses, rotations and angle conventions, and motion over time."""
+"""Poses, rotations and angle conventions, systems of two and three equations, and motion over time."""
 
 from __future__ import annotations
 
@@ -18,6 +18,18 @@ ANGLE_UNITS = {"deg": 360.0, "gon": 400.0, "rad": 2 * np.pi}
 ROTATION_ORDERS = ("opk", "pok", "kpo", "kop", "okp", "pko")
 
 _AXIS = {"o": 0, "p": 1, "k": 2}
+#: From camera axes x right, y down, z forwards to x right, y up, z backwards, and back.
+FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+def angle_in_radians(value: NDArray[np.float64], unit: str) -> NDArray[np.float64]:
+    """Convert angles of a unit (deg, gon, rad) to radians."""
+    return value * (2 * np.pi / ANGLE_UNITS[unit])
+
+
+def angle_in_unit(radians: NDArray[np.float64], unit: str) -> NDArray[np.float64]:
+    """Convert angles in radians to a unit."""
+    return radians * (ANGLE_UNITS[unit] / (2 * np.pi))
 
 
 def _about(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -63,6 +75,13 @@ def angles_from_rotation(R_ground_camera: ArrayLike, order: str = "opk") -> NDAr
     return np.asarray(np.linalg.det(P) * np.array([omega, np.arctan2(R[0, 2], cos_phi), kappa]))
 
 
+def degrees_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ω, φ, κ in degrees of matrices (n, 3, 3); rounded to 1e-12°, below the noise of the conversion."""
+    # Adding zero turns −0.0 into 0.0.
+    angles = np.array([angles_from_rotation(R) for R in rotations], np.float64)
+    return np.asarray(np.round(np.degrees(angles), 12) + 0.0, np.float64)
+
+
 def axes_of_angles(R_ground_camera: ArrayLike, order: str = "opk") -> NDArray[np.float64]:
     """Axes in ground space about which small changes of ω, φ and κ turn a camera, as rows, shape (3, 3).
 
@@ -100,6 +119,28 @@ def view_from_rotation(R: NDArray[np.float64]) -> tuple[float, float, float]:
 def dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Scalar products of vectors (..., k), shape (...): several times as fast as a sum over their short last axis."""
     return np.asarray(np.einsum("...i,...i", a, b))
+
+
+def determinant(J: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the determinants of matrices (..., 2, 2), or of the first two columns of wider ones."""
+    return J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+
+
+def solve2(J: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return x of J x = b for matrices (..., 2, 2) and vectors (..., 2); inf or NaN where J is singular."""
+    det = determinant(J)
+    x = np.empty_like(b)
+    x[..., 0] = (J[..., 1, 1] * b[..., 0] - J[..., 0, 1] * b[..., 1]) / det
+    x[..., 1] = (J[..., 0, 0] * b[..., 1] - J[..., 1, 0] * b[..., 0]) / det
+    return x
+
+
+def solve3(J: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return x of J x = b for matrices (n, 3, 3) and vectors (n, 3); inf or NaN where J is singular."""
+    u, v, w = J[..., 0], J[..., 1], J[..., 2]
+    vw = np.cross(v, w)
+    x = np.stack([(b * vw).sum(-1), (b * np.cross(w, u)).sum(-1), (b * np.cross(u, v)).sum(-1)], axis=-1)
+    return x / (u * vw).sum(axis=-1)[..., None]
 
 
 def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,10 +18,9 @@ from photoplan.errors import InputError, named_by
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.crs import crs_label, crs_step, parse_crs, same_crs
 from photoplan.geometry.heights import heights_in
-from photoplan.geometry.pose import rotation_from_angles
+from photoplan.geometry.pose import angle_in_radians, rotation_from_angles
 from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.files import ImageNames, check_plain_file, crs_beside, read_text, same_images
-from photoplan.io.orientation.block import angle_in_radians
 from photoplan.io.orientation.exif import map_positions, read_folder
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.form import TableFormat

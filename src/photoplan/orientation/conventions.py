@@ -15,7 +15,7 @@ from photoplan.cameras.lenses import Lens
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.bounds import HIGHEST_FLIGHT
-from photoplan.geometry.pose import ANGLE_UNITS, ROTATION_ORDERS, rotation_from_angles
+from photoplan.geometry.pose import ANGLE_UNITS, FLIP, ROTATION_ORDERS, angle_in_radians, rotation_from_angles
 
 DIRECTIONS = ("camera-to-ground", "ground-to-camera")
 CAMERA_AXES = ("up-back", "down-forward")
@@ -88,7 +88,7 @@ class StatedPoses:
             return self.matrices
         assert self.angles is not None
         at = ["opk".index(letter) for letter in order]
-        return np.stack([rotation_from_angles(a[at] * (2 * np.pi / ANGLE_UNITS[unit]), order) for a in self.angles])
+        return rotation_from_angles(angle_in_radians(self.angles[:, at], unit), order)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +182,7 @@ def turn_matrix(camera_axes: str, turned: int) -> NDArray[np.float64]:
     """Matrix (3, 3) that takes camera axes as a file means them to x right, y up, z towards the viewer."""
     c, s = {0: (1.0, 0.0), 90: (0.0, 1.0), 180: (-1.0, 0.0), 270: (0.0, -1.0)}[turned]
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    flip = np.diag([1.0, -1.0, -1.0]) if camera_axes == "down-forward" else np.eye(3)
+    flip = FLIP if camera_axes == "down-forward" else np.eye(3)
     return turn @ flip
 
 

@@ -20,6 +20,7 @@ from photoplan.geometry.bounds import area_fault, area_note
 from photoplan.geometry.crs import canonical_crs, require_projected_metres
 from photoplan.geometry.frames import triple
 from photoplan.geometry.local import enu_of_geodetic
+from photoplan.geometry.pose import degrees_of
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.files import ImageNames
 from photoplan.io.orientation.block import (
@@ -27,7 +28,6 @@ from photoplan.io.orientation.block import (
     OrientationBlock,
     OrientationTable,
     OrientedImage,
-    degrees_of,
     without_lenses,
 )
 from photoplan.io.orientation.exif import SUFFIXES

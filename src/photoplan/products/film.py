@@ -28,7 +28,7 @@ from photoplan.cameras.lenses import Lens
 from photoplan.errors import GeometryError, InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Estimate, Result, noted, raise_failed, with_sigma
-from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation
+from photoplan.geometry.pose import angle_in_unit, angles_from_rotation
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.model import FiducialSystem
 from photoplan.io.files import unique_stems
@@ -815,12 +815,11 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     if frame.local is not None:
         center[2] = frame.outward(center)
     orientation = project.orientation
-    to_unit = ANGLE_UNITS[orientation.angle_unit] / (2 * np.pi)
     R = found.pose.R_ground_camera
     D = angle_derivatives(R, orientation.rotation)
     of_angles = D @ found.covariance[3:6, 3:6] @ D.T
     T = np.eye(len(found.covariance))
-    T[3:6, 3:6] = D * to_unit
+    T[3:6, 3:6] = angle_in_unit(D, orientation.angle_unit)
     camera, entries = (None, {}) if not found.free else _calibration(project, image, found)
     if camera is not None:
         T[6:, 6:] = camera.of_block
@@ -830,7 +829,7 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
         points=given,
         found=found,
         center=center,
-        angles=angles_from_rotation(R, orientation.rotation) * to_unit,
+        angles=angle_in_unit(angles_from_rotation(R, orientation.rotation), orientation.angle_unit),
         covariance=T @ found.covariance @ T.T,
         angle_names=tuple(_GREEK[k] for k in orientation.rotation),
         angle_unit=orientation.angle_unit,

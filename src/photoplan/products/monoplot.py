@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Result, noted
-from photoplan.geometry.pose import axes_of_angles
+from photoplan.geometry.pose import angle_in_radians, axes_of_angles
 from photoplan.io.files import ImageNames
-from photoplan.io.orientation.block import angle_in_radians
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Image, ImageEntry, Project

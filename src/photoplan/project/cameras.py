@@ -18,13 +18,12 @@ from photoplan.cameras.rpc import RationalFunctions, RpcCamera
 from photoplan.errors import InputError
 from photoplan.geometry.heights import height_step
 from photoplan.geometry.local import GeodeticGround
-from photoplan.geometry.pose import Pose, rotation_from_angles
+from photoplan.geometry.pose import Pose, angle_in_radians, rotation_from_angles
 from photoplan.io.camera.csm import StatedFrame, read_frame
 from photoplan.io.camera.line import StatedLine, read_line
 from photoplan.io.camera.line_correction import read_line_correction, read_pose_errors
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.camera.rpc import read_rpc
-from photoplan.io.orientation.block import angle_in_radians
 from photoplan.io.project.model import (
     FrameImage,
     Image,

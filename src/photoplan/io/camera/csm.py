@@ -35,7 +35,7 @@ from photoplan.cameras.lenses import Brown, Cubic, Lens, NoLens, OpenCV, Reverse
 from photoplan.cameras.pushbroom_rays import to_sphere
 from photoplan.errors import InputError
 from photoplan.geometry.local import BodyGround
-from photoplan.geometry.pose import Pose, between, conjugate, cubic, odd_step, quaternions, rotations, times
+from photoplan.geometry.pose import FLIP, Pose, between, conjugate, cubic, odd_step, quaternions, rotations, times
 from photoplan.io.files import read_json
 
 _Floats = NDArray[np.float64]
@@ -257,8 +257,6 @@ LENSES: dict[str, Callable[[Isd, float], tuple[float, Lens]]] = {
 _MAX_BYTES = 20_000_000
 #: Suffixes of support data.
 SUFFIXES = (".json", ".isd")
-#: From the axes of an ISD's camera (x, y, forwards) to those of a camera here (x, y up, backwards).
-_TURNED = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,7 +363,7 @@ def _pose(isd: Isd) -> Pose:
     inertial = positions if len(at) == 1 else cubic(at, positions, speeds, t)
     body = isd.turns("body_rotation", t)
     center = rotations(body)[0] @ inertial[0]
-    return Pose(center, rotations(times(body, conjugate(isd.turns("instrument_pointing", t))))[0] @ _TURNED)
+    return Pose(center, rotations(times(body, conjugate(isd.turns("instrument_pointing", t))))[0] @ FLIP)
 
 
 def _refuse_away(frame: FrameCamera, radius: float) -> None:

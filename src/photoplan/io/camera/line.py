@@ -44,8 +44,9 @@ from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.local import EARTH_RADII, BodyGround
 from photoplan.geometry.pose import (
-    ANGLE_UNITS,
+    FLIP,
     EvenTable,
+    angle_in_radians,
     between,
     conjugate,
     continuous,
@@ -518,8 +519,6 @@ MARK = "photoplan strip 1"
 #: A record that is silent for this many times its usual step has a gap.
 _GAP = 10.0
 _COLUMNS = "time,x,y,z,omega,phi,kappa"
-#: From the camera axes of frame images to those of a line camera, which looks along +z.
-_TURNED = np.diag([1.0, -1.0, -1.0])
 
 
 #: What is further from nought is no time, no place in an aircraft, no angle.
@@ -597,10 +596,10 @@ def _strip_track(strip: StripFile, path: Path) -> LineTrack:
         raise InputError(f"positions of {flight.file} have no place in {flight.crs}; are they in this CRS?")
     # Grid east, grid north and up in the axes of the earth.
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    angles = table[:, 4:] * (2 * np.pi / ANGLE_UNITS[flight.angle_unit])
+    angles = angle_in_radians(table[:, 4:], flight.angle_unit)
     record = axes @ rotation_from_angles(angles[:, ["opk".index(k) for k in flight.rotation]], flight.rotation)
     S = places + record @ np.array(flight.lever_arm)
-    q = continuous(quaternions(record @ rotation_opk(*np.radians(flight.boresight)) @ _TURNED))
+    q = continuous(quaternions(record @ rotation_opk(*np.radians(flight.boresight)) @ FLIP))
     # Attitudes too without kinks at the records: where these are as far apart as lines, a late clock lies between them.
     speed, turning = (np.gradient(each, t, axis=0, edge_order=2 if len(t) > 2 else 1) for each in (S, q))
     clock = np.array([0.0]), np.array([0.0]), np.array([strip.clock.line])

@@ -17,20 +17,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import odd_angles, odd_place
-from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation, rotation_from_angles
+from photoplan.geometry.pose import (
+    angle_in_radians,
+    angle_in_unit,
+    angles_from_rotation,
+    degrees_of,
+    rotation_from_angles,
+)
 from photoplan.geometry.units import agreed_metres, metric_heights, metric_system, unit_label
 from photoplan.io.camera.model import CameraEntry, IdealLens, UnusableCamera
 from photoplan.io.orientation.form import Direction, TableFormat
 
 #: By the letters that spell an order of rotations.
 ANGLE_NAMES = {"o": "omega", "p": "phi", "k": "kappa"}
-#: From camera axes x right, y down, z forwards to x right, y up, z backwards, and back.
-FLIP = np.diag([1.0, -1.0, -1.0])
-
-
-def angle_in_radians(value: NDArray[np.float64], unit: str) -> NDArray[np.float64]:
-    """Angles of a unit (deg, gon, rad) in radians."""
-    return value * (2 * np.pi / ANGLE_UNITS[unit])
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ class OrientationTable:
     def rotations(self) -> NDArray[np.float64]:
         """R_ground_camera of every image, shape (n, 3, 3), in the axes of the table's system."""
         angles = angle_in_radians(np.array([i.angles for i in self.images], float), self.angle_unit)
-        R = np.stack([rotation_from_angles(a, self.rotation) for a in angles])
+        R = rotation_from_angles(angles, self.rotation)
         return R if self.direction == "camera-to-ground" else np.swapaxes(R, 1, 2)
 
     def opk_degrees(self) -> NDArray[np.float64]:
@@ -167,13 +166,6 @@ class OrientationTable:
         if (self.angle_unit, self.rotation, self.direction) == ("deg", "opk", "camera-to-ground"):
             return np.array([i.angles for i in self.images], float)
         return degrees_of(self.rotations)
-
-
-def degrees_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """ω, φ, κ in degrees of matrices (n, 3, 3); rounded to 1e-12°, below the noise of the conversion."""
-    # Adding zero turns −0.0 into 0.0.
-    angles = np.array([angles_from_rotation(R) for R in rotations], np.float64)
-    return np.asarray(np.round(np.degrees(angles), 12) + 0.0, np.float64)
 
 
 def posed(
@@ -276,8 +268,7 @@ class OrientationBlock:
         if (table.angle_unit, table.rotation, table.direction) == (unit, order, "camera-to-ground"):
             # Numbers that are already so stay untouched.
             return np.array([i.angles for i in table.images], np.float64)
-        scale = ANGLE_UNITS[unit] / (2 * np.pi)
-        angles = np.array([angles_from_rotation(R, order) for R in table.rotations], np.float64) * scale
+        angles = angle_in_unit(np.array([angles_from_rotation(R, order) for R in table.rotations], np.float64), unit)
         # Rounded below the noise of the conversion; adding zero turns −0.0 into 0.0.
         return np.asarray(np.round(angles, 12) + 0.0, np.float64)
 

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
+from photoplan.geometry.pose import FLIP
 from photoplan.io.camera.model import CameraEntry, UnusableCamera
 from photoplan.io.camera.opencv import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.files import finite, read_text, whole_number
 from photoplan.io.orientation.block import (
-    FLIP,
     Loss,
     OrientationBlock,
     OrientationFormat,

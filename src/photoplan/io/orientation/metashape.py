@@ -36,12 +36,12 @@ from photoplan.geometry.local import (
     legacy_wkt,
     map_poses,
 )
+from photoplan.geometry.pose import FLIP
 from photoplan.geometry.units import metric_system
 from photoplan.io.camera.model import CameraEntry, UnusableCamera
 from photoplan.io.camera.opencv import AgisoftForm, agisoft_form, frame_camera
 from photoplan.io.files import finite, numbers, read_xml
 from photoplan.io.orientation.block import (
-    FLIP,
     Loss,
     OrientationBlock,
     OrientationFormat,

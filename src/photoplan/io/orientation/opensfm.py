@@ -44,11 +44,11 @@ from photoplan.errors import InputError
 from photoplan.geometry.bounds import is_no_fix
 from photoplan.geometry.crs import agreement, canonical_crs, crs_label, crs_step, misfit, topocentric_poses, utm_codes
 from photoplan.geometry.local import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
+from photoplan.geometry.pose import FLIP
 from photoplan.io.camera.model import CameraEntry, InPixels, UnusableCamera, frame_in_pixels
 from photoplan.io.camera.opencv import opencv_form, opencv_losses
 from photoplan.io.files import elements, finite, looks_like, members, read_json
 from photoplan.io.orientation.block import (
-    FLIP,
     Loss,
     OrientationBlock,
     OrientationFormat,

@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.local import is_local_crs, legacy_wkt
+from photoplan.geometry.pose import FLIP
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.camera.opencv import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.files import finite, read_text, whole_number
 from photoplan.io.orientation.block import (
-    FLIP,
     Loss,
     OrientationBlock,
     OrientationFormat,

@@ -39,11 +39,10 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.local import enu_poses, is_local_crs, is_wgs84_geographic, legacy_wkt
-from photoplan.geometry.pose import rotation_opk
+from photoplan.geometry.pose import FLIP, rotation_opk
 from photoplan.geometry.units import metric_system
 from photoplan.io.files import crs_beside, read_text
 from photoplan.io.orientation.block import (
-    FLIP,
     Loss,
     OrientationBlock,
     OrientationFormat,

@@ -17,7 +17,7 @@ from photoplan.findings import Result, noted, with_sigma
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.frames import Triple, triple
 from photoplan.geometry.heights import height_label
-from photoplan.geometry.pose import ANGLE_UNITS
+from photoplan.geometry.pose import angle_in_unit
 from photoplan.io.files import fingerprint
 from photoplan.io.project.model import image_size
 from photoplan.io.store import versions
@@ -748,8 +748,8 @@ def _boresight(result: MapResult) -> tuple[Triple, Triple] | None:
     project, adjusted = result.prepared.inputs.project, result.adjusted
     if not project.adjustment.boresight or result.prepared.inputs.attitudes is None:
         return None
-    factor = ANGLE_UNITS[project.orientation.angle_unit] / (2 * np.pi)
-    return triple(adjusted.boresight * factor), triple(adjusted.boresight_sigma * factor)
+    unit = project.orientation.angle_unit
+    return triple(angle_in_unit(adjusted.boresight, unit)), triple(angle_in_unit(adjusted.boresight_sigma, unit))
 
 
 def _gross(result: MapResult) -> tuple[NamedMeasurement, ...]:

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.bounds import area_note
-from photoplan.geometry.pose import ANGLE_UNITS, Pose, angles_from_rotation
+from photoplan.geometry.pose import Pose, angle_in_radians, angle_in_unit, angles_from_rotation
 from photoplan.io.files import ImageNames, match_key
-from photoplan.io.orientation.block import angle_in_radians
 from photoplan.io.orientation.exif import image_files
 from photoplan.io.orientation.form import TableFormat
 from photoplan.io.points import (
@@ -662,19 +661,18 @@ def map_result(prepared: Prepared, adjusted: Adjusted) -> MapResult:
     poses = tuple(frame.map_pose(pose) for pose in adjusted.poses)
     centers = np.array([pose.center for pose in poses]).reshape(-1, 3)
     unit, order = project.orientation.angle_unit, project.orientation.rotation
-    to_unit = ANGLE_UNITS[unit] / (2 * np.pi)
-    angles = np.array([angles_from_rotation(pose.R_ground_camera, order) for pose in poses]).reshape(-1, 3) * to_unit
+    angles = np.array([angles_from_rotation(pose.R_ground_camera, order) for pose in poses]).reshape(-1, 3)
     T = np.zeros((len(poses), 6, 6))
     T[:, :3, :3] = np.linalg.inv(frame.jacobian(centers))
     for k, pose in enumerate(poses):
-        T[k, 3:, 3:] = angle_derivatives(pose.R_ground_camera, order) * to_unit
+        T[k, 3:, 3:] = angle_in_unit(angle_derivatives(pose.R_ground_camera, order), unit)
     XYZ = frame.map_points(adjusted.XYZ)
     cameras = _cameras(project, prepared.block, adjusted)
     return MapResult(
         prepared=prepared,
         adjusted=adjusted,
         poses=poses,
-        angles=angles,
+        angles=angle_in_unit(angles, unit),
         covariances=tuple(_joint(prepared, adjusted, cameras, k, T[k]) for k in range(len(poses))),
         XYZ=XYZ,
         covariance=frame.map_covariance(adjusted.point_covariance, XYZ),

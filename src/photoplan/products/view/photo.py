@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from photoplan.adjustment.least_squares import by_differences, spread
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.geometry.pose import ANGLE_UNITS, angles_from_rotation, small_rotations, view_from_rotation
+from photoplan.geometry.pose import (
+    angle_in_unit,
+    angles_from_rotation,
+    small_rotations,
+    view_from_rotation,
+)
 from photoplan.io.orientation.block import OrientationBlock, OrientationTable, OrientedImage
 from photoplan.io.orientation.toml import render
 from photoplan.io.project.file import toml_value
@@ -370,7 +375,7 @@ def _of_image(camera: ViewCamera, ground: ViewGround, turn: _Floats) -> _Floats:
     project = ground.named
     R = stated_pose(project, project.image(str(camera.request.image))).R_ground_camera
     angles = angles_from_rotation(R @ small_rotations(turn[None, :3])[0], project.orientation.rotation)
-    return np.asarray(angles * (ANGLE_UNITS[project.orientation.angle_unit] / (2 * np.pi)))
+    return angle_in_unit(angles, project.orientation.angle_unit)
 
 
 def _camera_text(request: CameraRequest, after: _Floats) -> str:
