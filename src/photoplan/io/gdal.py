@@ -163,3 +163,14 @@ def close_handles() -> None:
 
 # Left to the interpreter's end, rasterio closes them when its own modules are gone: "Error in sys.excepthook" (3.12).
 atexit.register(close_handles)
+
+
+TARGET = "PHOTOPLAN_TARGET"
+"""The tag in which the file of a surface names what its heights lie over."""
+
+
+def target_of(path: Path, driver: str) -> str | None:
+    """Return what the heights of a raster lie over; None if that is a map, or the file does not say."""
+    with open_raster(path, driver) as dataset:
+        target: str = dataset.tags().get(TARGET, "map")
+    return None if target == "map" else target

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice, pairwise
@@ -78,17 +79,8 @@ COLUMNS = Columns(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class PointBlock:
-    """Columns of a block of lines."""
-
-    xyz: NDArray[np.float64]
-    records: NDArray[np.int64]
-    code: list[str] | None
-    line: list[str] | None
-    name: list[str] | None
-    sigma: NDArray[np.float64] | None
-    right: NDArray[np.float64] | None
+_Block = dict[str, Any]
+"""Columns of a block of lines: ``records`` (numbers), ``xyz``, and by role arrays of numbers or lists of texts."""
 
 
 def points_layout(path: Path, lines: Sequence[str], dialect: Dialect) -> TableLayout | None:
@@ -126,8 +118,8 @@ def _are_numbers_of_points(rows: Sequence[Sequence[str]]) -> bool:
 
 def parse_block(
     path: Path, layout: TableLayout, first: int, lines: list[str], look_up: LookUp, decimal_comma: bool
-) -> PointBlock | None:
-    """Columns of the lines of a block that hold data; None if there are none."""
+) -> _Block | None:
+    """Return the columns of the lines of a block that hold data; None if there are none."""
     keep = [at for at, text in enumerate(lines) if text and not text.isspace() and text.lstrip()[0] != "#"]
     if keep and first + keep[0] == layout.header:
         keep = keep[1:]
@@ -136,12 +128,12 @@ def parse_block(
     if len(keep) < len(lines):
         lines = [lines[at] for at in keep]
     records = np.array(keep, np.int64) + first
-    block = _fast(layout, lines, records, decimal_comma)
-    return block if block is not None else _slow(path, layout, lines, records, look_up, decimal_comma)
+    found = _fast(layout, lines, decimal_comma) or _slow(path, layout, lines, records, look_up, decimal_comma)
+    return {"records": records, **found}
 
 
-def _fast(layout: TableLayout, lines: list[str], records: NDArray[np.int64], decimal_comma: bool) -> PointBlock | None:
-    """Columns by NumPy's reader; None where anything is unusual."""
+def _fast(layout: TableLayout, lines: list[str], decimal_comma: bool) -> _Block | None:
+    """Read columns by NumPy's reader; None if anything is unusual."""
     texts = [r for r in layout.roles if r not in NUMBERS]
     if decimal_comma:
         lines = [text.replace(",", ".") for text in lines]
@@ -162,37 +154,25 @@ def _fast(layout: TableLayout, lines: list[str], records: NDArray[np.int64], dec
     if len(table) != len(lines) or (plain and table.shape[1] != layout.width):
         return None
 
-    def column(role: str) -> Any:
-        at = layout.roles.get(role)
-        return None if at is None else table[:, at] if plain else table[f"c{at}"]
-
-    xyz = np.stack([column(r) for r in NEEDED], axis=1)
-    sigma, right = column("sigma"), column("z_right")
-    if not np.isfinite(xyz).all() or any(c is not None and not (c >= 0).all() for c in (sigma,)):
+    columns = {role: table[:, at] if plain else table[f"c{at}"] for role, at in layout.roles.items()}
+    found: _Block = {"xyz": np.stack([columns[role] for role in NEEDED], axis=1)}
+    found |= {role: np.array(columns[role]) for role in ("sigma", "z_right") if role in columns}
+    if not all(np.isfinite(found[role]).all() for role in ("xyz", "z_right") if role in found):
         return None
-    if right is not None and not np.isfinite(right).all():
+    if "sigma" in found and not (found["sigma"] >= 0).all():
         return None
-    found: dict[str, list[str] | None] = dict.fromkeys(("code", "line", "name"))
     for role in texts:
-        values = column(role).tolist()
+        values = columns[role].tolist()
         if max(map(len, values)) >= TEXT or any("'" in v or (decimal_comma and "." in v) for v in values):
             return None  # the text may be cut off or in quotes, or its point may have been a comma
         found[role] = [v.strip() for v in values]
-    return PointBlock(
-        xyz=xyz,
-        records=records,
-        code=found["code"],
-        line=found["line"],
-        name=found["name"],
-        sigma=None if sigma is None else np.array(sigma),
-        right=None if right is None else np.array(right),
-    )
+    return found
 
 
 def _slow(
     path: Path, layout: TableLayout, lines: list[str], records: NDArray[np.int64], look_up: LookUp, decimal_comma: bool
-) -> PointBlock:
-    """The same line by line: it names the line and the column that cannot be read."""
+) -> _Block:
+    """Read columns line by line, and name the line and the column that cannot be read."""
     rows: dict[str, list[Any]] = {role: [] for role in layout.roles}
     for record, text in zip(records.tolist(), lines):
         where = f"{path}:{record}"
@@ -206,40 +186,22 @@ def _slow(
                 continue
             value = decimal(fields[at], decimal_comma)
             if value is None:
-                may_miss = role in ("sigma", "z_right") or (role == "z" and _without_height(look_up(code, record)))
+                flat = role == "z" and look_up(code, record).kind in ("border", "hole", "ignore")
+                may_miss = flat or role in ("sigma", "z_right")
                 if not (may_miss and fields[at].casefold().lstrip("+-") in _NONE):
                     number(fields[at], f"{where}: {role}", decimal_comma)
                 value = math.nan
             if role == "sigma" and value < 0:
                 raise InputError(f"{where}: sigma = {fields[at]!r}; a standard deviation is zero or more")
             rows[role].append(value)
-    found = {r: np.array(rows[r], np.float64) for r in NUMBERS if r in rows}
-    xyz = np.stack([found[r] for r in NEEDED], axis=1)
-    texts = (rows.get("code"), rows.get("line"), rows.get("name"))
-    return PointBlock(xyz, records, *texts, found.get("sigma"), found.get("z_right"))
-
-
-def _without_height(cls: CodeClass) -> bool:
-    return cls.kind in ("border", "hole", "ignore")
-
-
-@dataclass
-class _Columns:
-    """Columns of the file as they grow, block by block."""
-
-    xyz: list[NDArray[np.float64]] = field(default_factory=list)
-    records: list[NDArray[np.int64]] = field(default_factory=list)
-    codes: list[NDArray[np.int32]] = field(default_factory=list)
-    lines: list[NDArray[np.int32]] = field(default_factory=list)
-    sigma: list[NDArray[np.float64]] = field(default_factory=list)
-    right: list[NDArray[np.float64]] = field(default_factory=list)
-    names: list[NDArray[Any]] = field(default_factory=list)
+    found: _Block = {"xyz": np.stack([np.array(rows.pop(role), np.float64) for role in NEEDED], axis=1)}
+    return found | {role: np.array(column) if role in NUMBERS else column for role, column in rows.items()}
 
 
 def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     """Points and lines of a text file."""
     layout: TableLayout | None = None
-    codes, ids, out = CodeIndex(), CodeIndex(), _Columns()
+    index, out = {"code": CodeIndex(), "line": CodeIndex()}, defaultdict[str, list[Any]](list)
     notes: list[str] = []
     classes: list[CodeClass] = []
 
@@ -250,15 +212,22 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
         if layout is None:
             layout = points_layout(path, lines, options.dialect)
             notes = [] if layout is None else _unused(path, layout, lines, options)
-        block = None
-        if layout is not None:
-            block = parse_block(path, layout, first, lines, look_up, options.dialect.decimal_comma)
-        if block is not None:
-            _append(out, block, codes, ids)
-            _learn(classes, codes, block, look_up)
-    if layout is None or not out.xyz:
+        comma = options.dialect.decimal_comma
+        block = None if layout is None else parse_block(path, layout, first, lines, look_up, comma)
+        if block is None:
+            continue
+        for role, values in block.items():
+            known = index[role].numbers(values, len(values)) if role in index else np.asarray(values)
+            out[role].append(known)
+        # Classes of the codes that this block brought; unknown ones are named with their line.
+        for code in index["code"].texts[len(classes) :]:
+            own = block.get("code", ())
+            classes.append(look_up(code, int(block["records"][own.index(code)]) if code in own else 0))
+    if layout is None or not out:
         raise InputError(f"{path}: holds no line with data" + ("" if layout is None else ", only a header"))
-    return _terrain(path, layout, out, codes, ids, classes, notes)
+    # The parts are not needed beside the whole.
+    whole = {role: np.concatenate(out.pop(role)) for role in list(out)}
+    return _terrain(path, layout, whole, (index["code"].texts, index["line"].texts), classes, notes)
 
 
 def _unused(path: Path, layout: TableLayout, lines: list[str], options: ReadOptions) -> list[str]:
@@ -278,51 +247,21 @@ def _unused(path: Path, layout: TableLayout, lines: list[str], options: ReadOpti
     return [f"{path.name}: columns not used: {', '.join(unused.values())}"] if unused else []
 
 
-def _append(out: _Columns, block: PointBlock, codes: CodeIndex, ids: CodeIndex) -> None:
-    out.xyz.append(block.xyz)
-    out.records.append(block.records)
-    count = len(block.xyz)
-    if block.code is not None:
-        out.codes.append(codes.numbers(block.code, count))
-    if block.line is not None:
-        out.lines.append(ids.numbers(block.line, count))
-    if block.sigma is not None:
-        out.sigma.append(block.sigma)
-    if block.right is not None:
-        out.right.append(block.right)
-    if block.name is not None:
-        out.names.append(np.array(block.name))
-
-
-def _learn(
-    classes: list[CodeClass], codes: CodeIndex, block: PointBlock, look_up: Callable[[str, int], CodeClass]
-) -> None:
-    """Classes of the codes that this block brought; unknown ones are named with their line."""
-    for code in codes.texts[len(classes) :]:
-        at = int(block.records[block.code.index(code)]) if block.code is not None and code in block.code else 0
-        classes.append(look_up(code, at))
-
-
 def _terrain(
     path: Path,
     layout: TableLayout,
-    out: _Columns,
-    codes: CodeIndex,
-    ids: CodeIndex,
+    whole: _Block,
+    names: tuple[list[str], list[str]],
     classes: list[CodeClass],
     notes: list[str],
 ) -> MeasuredTerrain:
-    def whole(parts: list[Any]) -> Any:
-        joined = np.concatenate(parts) if parts else None
-        parts.clear()  # the parts are not needed beside the whole
-        return joined
-
-    xyz, records, names = whole(out.xyz), whole(out.records), whole(out.names)
-    sigma, right = whole(out.sigma), whole(out.right)
-    number, line = whole(out.codes), whole(out.lines)
-    columns = PointColumns(xyz=xyz, records=records, codes=number, sigma=sigma, names=names)
+    xyz, records = whole["xyz"], whole["records"]
+    number: Any = whole.get("code")
+    line: Any = whole.get("line")
+    sigma, right, named = whole.get("sigma"), whole.get("z_right"), whole.get("name")
+    columns = PointColumns(xyz=xyz, records=records, codes=number, sigma=sigma, names=named)
     if number is None and line is None:
-        on_line = np.zeros(len(xyz), bool)
+        on_line: Any = np.zeros(len(xyz), bool)
     else:
         by_class = np.array([is_line(c) for c in classes] or [False])
         on_line = by_class[number] if number is not None else line > 0
@@ -333,19 +272,19 @@ def _terrain(
     lines: list[MeasuredLine] = []
     alone = np.empty(0, np.int64)
     if on_line.any():
-        lines, alone = _make_lines(path, columns, on_line, line, right, (codes.texts, ids.texts), classes)
+        lines, alone = _make_lines(path, columns, on_line, line, right, names, classes)
         if len(alone):
             some = ", ".join(str(r) for r in records[alone[:5]])
             notes.append(
                 f"{path.name}: {len(alone)} lines have one record (line {some} of the file); read as mass points"
             )
-    texts, kinds = codes.texts, list(classes)
+    texts, kinds = names[0], list(classes)
     if len(alone):
         texts, kinds = [*texts, ""], [*kinds, CodeClass("mass")]
         number = np.zeros(len(xyz), np.int32) if number is None else number
         number[alone] = len(texts) - 1
         on_line[alone] = False
-    columns = PointColumns(xyz=xyz, records=records, codes=number, sigma=sigma, names=names)
+    columns = PointColumns(xyz=xyz, records=records, codes=number, sigma=sigma, names=named)
     if on_line.any():
         columns = columns.take(~on_line)
     groups = make_groups(path, columns, texts, kinds) if len(columns.xyz) else []
@@ -361,7 +300,7 @@ def _terrain(
         heights,
         files=(path,),
         notes=tuple(notes),
-        codes=frozenset(codes.texts),
+        codes=frozenset(names[0]),
         fields=(f"{path.name}: {', '.join(layout.names if layout.header else layout.roles)}",),
     )
 

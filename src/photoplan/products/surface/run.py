@@ -16,12 +16,12 @@ from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Result, noted
 from photoplan.io.disk import make_folder
+from photoplan.io.gdal import TARGET
 from photoplan.io.point_cloud import write_cloud
 from photoplan.io.product import ProductFile, check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.raster_info import ImageForm
 from photoplan.io.store import input_entry, scratch, together, write_run_record
-from photoplan.io.surface_file import TARGET
 from photoplan.plain import pick
 from photoplan.products.run import Run, refuse_inputs
 from photoplan.products.surface.plan import HARDLY, TILE, SurfaceJob, SurfacePlan, median, plan_surface
