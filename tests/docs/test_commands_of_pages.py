@@ -492,6 +492,7 @@ STAGES: dict[str, Callable[..., None]] = {
     "tutorial": lambda folder: None,
     "mosaic": mosaics,
     "balance": named_block,
+    "quality-report": named_block,
     "build-report": survey,
     "large": in_place,
     "monoplot": with_points,

@@ -308,6 +308,18 @@ VERBS: dict[str, str | Verb] = {
         "requests.quality:SimulateRequest",
         "products.simulate:simulate",
     ),
+    "report": Verb(
+        "Join what the runs of a project found into one report.",
+        """Write one quality report of PROJECT from the run records that its commands have left.
+
+        Records (*.run.json) in the folder of the project and in the folders in it are read. Sections follow the chain:
+        images, orientation, tie points and control, adjustment, terrain, products, colours and seams, accuracy. What is
+        missing is named, and results whose inputs have changed since are marked as old.
+        """,
+        "requests.project:ReportRequest",
+        "products.report:report_project",
+        {"report": "report.project:project_page"},
+    ),
     "info": Verb(
         "Show what a raster, project, plan or run record holds.",
         """Show what FILE holds: any file that a command takes or makes, or a folder of images.""",

@@ -174,4 +174,4 @@ def findings_section(found: Findings) -> str:
 def findings_table(found: Table, most: int | None = None) -> str:
     """Return a table; cells that begin as numbers stand at the right."""
     head, *rows = found.texts()
-    return table(head, [[Cell(cell, cell[:1] in "0123456789+-−–±") for cell in row] for row in rows[:most]])
+    return table(head, [[Cell(cell, cell[:1] in tuple("0123456789+-−–±")) for cell in row] for row in rows[:most]])

@@ -215,10 +215,12 @@ class _Paper:
             return
         filled = [row + [("", False)] * (count - len(row)) for row in rows]
         gap, size = 9.0, 8.0
+        numbers = [any(row[k][1] for row in filled) for k in range(count)]
         natural = [0.0] * count
         for size in (8.0, 7.0, 6.2, 5.4):
             natural = [max(_width(row[k][0], size, row is filled[0]) for row in filled) + gap for k in range(count)]
-            if sum(natural) <= _WIDE:
+            # Words may go on in the next line, numbers should not.
+            if sum(wide if number else min(wide, 0.5 * _WIDE) for wide, number in zip(natural, numbers)) <= _WIDE:
                 break
         widths = _fitted(natural, _WIDE)
         head, *body = [

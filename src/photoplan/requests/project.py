@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -102,6 +103,21 @@ class BudgetRequest(Request):
         numbers = [self.camera_constant, self.height, *self.format, self.pixel, self.tolerance]
         if not all(n is None or n > 0 for n in numbers):
             raise UsageError(f"numbers {numbers} of the flight; positive ones are needed")
+
+
+class ReportRequest(Request):
+    """Options of the quality report of a project."""
+
+    project: Path = PROJECT
+    output: Path | None = opt("Report to write, HTML or PDF by its ending [report.html beside the project file].", None,
+                              metavar="FILE", writes=True)  # fmt: skip
+    checked: bool = opt("Leave out the check and the error budget, which open the images.", True, flag="no-check")
+    overwrite: bool = OVERWRITE
+
+    @property
+    def drawn(self) -> Mapping[str, Path]:
+        """The report."""
+        return {"report": self.output or self.project.resolve().parent / "report.html"}
 
 
 class DescribeRequest(Request):
