@@ -28,6 +28,7 @@ of its rotation matrices; they are written ground to camera unless the other is 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,6 @@ from photoplan.io.orientation.block import (
     OrientationBlock,
     OrientationFormat,
     OrientationTable,
-    OrientedImage,
     common_losses,
     posed,
     require_map,
@@ -64,12 +64,14 @@ SQUARE = 1e-6
 _ANGLE_UNITS = {"deg": np.pi / 180, "degree": np.pi / 180, "gon": np.pi / 200, "grad": np.pi / 200, "rad": 1.0}
 
 
+@dataclass
 class _Entry:
     """``$KEY : value`` and the lines below it that begin no other entry."""
 
-    def __init__(self, key: str, value: str, line: int) -> None:
-        self.key, self.value, self.line = key, value, line
-        self.rows: list[str] = []
+    key: str
+    value: str
+    line: int
+    rows: list[str] = field(default_factory=list)
 
 
 class _Section(dict[str, _Entry]):
@@ -91,14 +93,14 @@ class _Section(dict[str, _Entry]):
         return next((self[k].value.replace("\\ ", " ").strip() for k in keys if k in self and self[k].value), None)
 
 
+@dataclass
 class _InphoFile:
     """The parts of a file that are read."""
 
-    def __init__(self) -> None:
-        self.cameras: list[_Section] = []
-        self.photos: list[_Section] = []
-        self.navigation: list[_Section] = []
-        self.other = _Section(0)
+    cameras: list[_Section] = field(default_factory=list)
+    photos: list[_Section] = field(default_factory=list)
+    navigation: list[_Section] = field(default_factory=list)
+    other: _Section = field(default_factory=lambda: _Section(0))
 
 
 def _parse(path: Path) -> _InphoFile:
@@ -262,16 +264,12 @@ def _camera(section: _Section, path: Path) -> tuple[str, CameraEntry | None, NDA
         turn[:2, :2] = Q
     if (section.text("$PIXEL_REFERENCE") or "CenterTopLeft").lower() != "centertopleft":
         return name, None, turn, f"$PIXEL_REFERENCE is {section.text('$PIXEL_REFERENCE')}, not CenterTopLeft"
-    if any(value for key in ("$RADIAL_COEFFS", "$DECENTRE_COEFFS") for value in _coefficients(section, key, path)):
+    stated = [section[key] for key in ("$RADIAL_COEFFS", "$DECENTRE_COEFFS") if key in section]
+    words = [(f"{path}:{e.line}: {e.key}", word) for e in stated for row in (e.value, *e.rows) for word in row.split()]
+    coefficients = [number(word, where) for where, word in words]
+    if any(coefficients):
         return name, None, turn, "it is not public whether its $RADIAL_COEFFS correct or distort"
     return name, _frame(section, name, A, t, pixel, path), turn, None
-
-
-def _coefficients(section: _Section, key: str, path: Path) -> list[float]:
-    if key not in section:
-        return []
-    entry = section[key]
-    return [number(w, f"{path}:{entry.line}: {key}") for row in (entry.value, *entry.rows) for w in row.split()]
 
 
 def _affine(section: _Section, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -321,10 +319,6 @@ def _crs(file: _InphoFile, path: Path, notes: list[str]) -> tuple[str | None, st
     return split_compound(text)
 
 
-def _own(path: Path, head: str) -> bool:
-    return re.search(r"^\s*\$(PROJECT|PHOTO|EXT_ORI)\b", head, re.M) is not None
-
-
 #: Side of a pixel that is taken for a camera that is described in pixels, millimetres.
 ASSUMED_PIXEL = 0.005
 
@@ -345,13 +339,7 @@ def _losses(block: OrientationBlock) -> list[Loss]:
 
 
 def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
-    """The text of a project.
-
-    Raises
-    ------
-    InputError
-        No camera is known: the format states a camera constant with every image.
-    """
+    """Return the text of a project; the format states a camera constant with every image."""
     require_map(block, path)
     if not block.cameras:
         raise InputError(f"{path}: an Inpho project states a camera constant with every image; give `camera` FILE")
@@ -359,9 +347,14 @@ def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     if block.table.crs is not None:
         crs = " ".join(block.table.crs.split())
         lines += ["$COORDINATE_SYSTEM_SET", f"  $COORDINATE_SYSTEM : {crs}", "$END_COORDINATE_SYSTEM"]
-    matrices = block.table.rotations
-    for image, R in zip(block.table.images, matrices):
-        lines += _photo_lines(block, image, R.T if (block.matrix or OWN) == "ground-to-camera" else R)
+    for image, R in zip(block.table.images, block.table.rotations):
+        M = np.round(R.T if (block.matrix or OWN) == "ground-to-camera" else R, 14)
+        file = block.files.get(image.name)
+        lines += ["$PHOTO", f"  $PHOTO_NUM : {_word(image.name)}"]
+        lines += [] if file is None else [f"  $PHOTO_FILE : {_word(file)}"]
+        lines += [f"  $CAMERA_ID : {_word(block.camera_name(image))}", "  $ORI_STAT : adjusted", "  $EXT_ORI :"]
+        lines.append("    " + _row((_constant(block.camera(image)), *image.center), 16, 6))
+        lines += [*("    " + _row(row, 18, 14) for row in M), "$END"]
     for name, camera in block.cameras.items():
         if camera.pixels is not None:
             lines += _camera_lines(name, camera.pixels, _constant(camera))
@@ -380,20 +373,6 @@ def _word(name: str) -> str:
 
 def _row(values: object, width: int, digits: int) -> str:
     return " ".join(f"{float(v) + 0.0:{width}.{digits}f}" for v in values)  # type: ignore[attr-defined]
-
-
-def _photo_lines(block: OrientationBlock, image: OrientedImage, M: np.ndarray) -> list[str]:
-    camera = block.camera(image)
-    lines = ["$PHOTO", f"  $PHOTO_NUM : {_word(image.name)}"]
-    file = block.files.get(image.name)
-    if file is not None:
-        lines.append(f"  $PHOTO_FILE : {_word(file)}")
-    lines.append(f"  $CAMERA_ID : {_word(block.camera_name(image))}")
-    lines += ["  $ORI_STAT : adjusted", "  $EXT_ORI :"]
-    lines.append("    " + _row((_constant(camera), *image.center), 16, 6))
-    lines += ["    " + _row(row, 18, 14) for row in np.round(M, 14)]
-    lines.append("$END")
-    return lines
 
 
 def _constant(camera: CameraEntry) -> float:
@@ -422,4 +401,8 @@ def _camera_lines(name: str, camera: InPixels, c: float) -> list[str]:
     ]
 
 
-FORMAT = OrientationFormat("inpho", "project of Trimble Inpho", _own, _read, _render, _losses, suffix=".prj")
+def _sniff(path: Path, head: str) -> bool:
+    return re.search(r"^\s*\$(PROJECT|PHOTO|EXT_ORI)\b", head, re.M) is not None
+
+
+FORMAT = OrientationFormat("inpho", "project of Trimble Inpho", _sniff, _read, _render, _losses, suffix=".prj")
