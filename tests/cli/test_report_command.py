@@ -50,8 +50,8 @@ def adjusted(folder: Path, **more: Any) -> Path:
     product = {"sigma0": 1.02, "redundancy": 800, "rejected": 2}
     made = record(folder / "adjustment" / "report.run.json", "adjust", product, file="report.json")
     groups = [{"name": "image points", "count": 900, "redundancy": 790.0, "rms": 0.31, "unit": "px"}]
-    values = {"sigma0": 1.02, "redundancy": 800, "gross_errors": [{}, {}], "groups": groups, "notes": [],
-              "check_accuracy": {"RMSE_H": 0.021, "RMSE_V": 0.034}, **more}  # fmt: skip
+    values = {"sigma0": 1.02, "redundancy": 800, "gross_errors": [{}, {}], "groups": groups,
+              "notes": ["errors are alike"], "check_accuracy": {"RMSE_H": 0.021, "RMSE_V": 0.034}, **more}  # fmt: skip
     (folder / "adjustment" / "report.json").write_text(json.dumps(values))
     return made
 
@@ -76,6 +76,7 @@ def test_all_that_was_found_stands_in_the_order_of_the_chain(photoplan: Here, pr
     html = (project / "report.html").read_text()
     assert [*re.findall("<h2>(.*?)</h2>", html)] == ["Warnings, gaps and notes", *titles[1:], "Source files"]
     assert "ties.csv: one pair is weak" in html
+    assert "adjustment/report.json: errors are alike" in html
     assert "one_ortho.run.json" in html
     assert "photoplan balance" in html
     assert str(project) not in html
@@ -213,3 +214,13 @@ def test_a_folder_without_records_gets_a_report(photoplan: Here, small: Block, t
     assert "run `photoplan tie`" in said.out
     assert "Images and cameras" in said.out
     assert photoplan("report", tmp_path / "none").code == 3
+
+
+def test_every_product_of_a_large_project_is_listed(photoplan: Here, project: Path) -> None:
+    for k in range(40):
+        record(project / "products" / f"p{k}_ortho.run.json", "orthophoto", {"image": "one", "valid_share": 0.5})
+    assert photoplan("report", project, "--no-check").code == 0
+    html = (project / "report.html").read_text()
+    products = html[html.index("<h2>Products</h2>") : html.index("<h2>Source files</h2>")]
+    assert [k for k in range(40) if f"products/p{k}_ortho.csv" not in products] == []
+    assert "The first" not in html

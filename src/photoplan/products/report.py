@@ -25,10 +25,10 @@ from photoplan.products.check import ProjectCheck, check_project
 from photoplan.project.scene import input_files
 from photoplan.requests.project import BudgetRequest, ReportRequest
 
-#: Largest run record and report of an adjustment, and the most records that are read.
-_MAX_BYTES, _MOST_RECORDS = 64_000_000, 5000
+#: Largest run record and report of an adjustment, all records together, bytes; the most records that are read.
+_MAX_BYTES, _ALL_BYTES, _MOST_RECORDS = 64_000_000, 1_000_000_000, 5000
 #: Letters of a foreign text, notes and figures of a record, rows of a table that a report takes.
-_LETTERS, _NOTES, _FIGURES, _ROWS = 400, 20, 40, 500
+_LETTERS, _NOTES, _FIGURES, MOST_ROWS = 400, 20, 40, 500
 #: Results that a warning names.
 _NAMED = 4
 
@@ -246,7 +246,11 @@ def report_project(request: ReportRequest, events: Events = SILENT) -> ProjectRe
     sections.append(_accuracy(request, by_section["Adjustment"], missing))
     if by_section[_OTHERS]:
         sections.append(_listed(_OTHERS, by_section[_OTHERS]))
-    notes = [f"{each.name}: {note}" for each in records for note in _notes(each.product)]
+    notes = [
+        f"{each.name}: {note}"
+        for each in records
+        for note in _notes(_report_of(each, []) if each.kind == "adjust" else each.product)
+    ]
     return ProjectReport(
         project=request.project,
         title=folder.name,
@@ -267,12 +271,15 @@ def _section_of(kind: str) -> str:
 def _records(folder: Path) -> tuple[list[RunRecord], list[str]]:
     """Return the records of a project in the order of their times, and what is wrong with others."""
     paths = [*folder.glob("*.run.json"), *(p for f in _folders(folder) for p in f.glob("*.run.json"))]
-    found, warnings = [], []
+    found, warnings, size = [], [], 0
     for path in sorted(paths)[:_MOST_RECORDS]:
         name = _text(relative_path(path, folder))
         try:
+            size += path.lstat().st_size
+            if size > _ALL_BYTES:
+                raise InputError(f"all records together hold more than {_ALL_BYTES} bytes")
             found.append(_read(path, folder))
-        except InputError as error:
+        except (InputError, OSError) as error:
             warnings.append(f"{name}: is left out: {_text(str(error).removeprefix(f'{path}: '))}")
     if len(paths) > _MOST_RECORDS:
         warnings.append(f"{len(paths)} run records; the first {_MOST_RECORDS} are read")
@@ -464,7 +471,7 @@ def _listed(title: str, records: Sequence[RunRecord]) -> Findings:
         return Findings(title=title)
     several = len(records) > 1
     figures = [f for each in records for f in _figures(each, each.product, each.name if several else "")]
-    return Findings(tuple(figures[:_ROWS]), tables={_key(title): _overview(records)}, title=title)
+    return Findings(tuple(figures[:MOST_ROWS]), tables={_key(title): _overview(records)}, title=title)
 
 
 def _key(title: str) -> str:
@@ -472,8 +479,18 @@ def _key(title: str) -> str:
 
 
 def _overview(records: Sequence[RunRecord]) -> Table:
-    rows = tuple((each.name, each.kind, each.when, _state(each)) for each in records[:_ROWS])
-    return Table(("result", "kind", "finished", "state"), rows, "Results and their run records.", printed=True)
+    rows = tuple((each.name, each.kind, each.when, _state(each)) for each in records[:MOST_ROWS])
+    return Table(
+        ("result", "kind", "finished", "state"),
+        rows,
+        _first("Results and their run records", len(records)),
+        printed=True,
+    )
+
+
+def _first(caption: str, count: int) -> str:
+    """Return the caption of a table that has so many rows, but for those beyond the most."""
+    return f"{caption}." if count <= MOST_ROWS else f"{caption}: the first {MOST_ROWS} of {count}."
 
 
 def _state(record: RunRecord) -> str:
@@ -509,10 +526,14 @@ def _images(project: Project, check: bool, warnings: list[str], missing: dict[st
         warnings += [_text(f"check: {each}") for each in (*found.implausible, *found.unusable.values())]
         rows = tuple(
             (each.image, each.tilt_deg, each.gsd, 100 * each.on_terrain, each.relief_px, each.fault or "")
-            for each in found.images[:_ROWS]
+            for each in found.images[:MOST_ROWS]
         )
     head = ("image", "tilt °", "GSD m", "on terrain %", "1 m of height px", "fault")
-    tables = {"images": Table(head, rows, "Images as the check of the project finds them.")} if rows else {}
+    tables = (
+        {"images": Table(head, rows, _first("Images as the check of the project finds them", len(names)))}
+        if rows
+        else {}
+    )
     return Findings(tuple(figures), tables=tables, notes=tuple(notes), title="Images and cameras")
 
 
@@ -539,7 +560,7 @@ def _adjustment(records: Sequence[RunRecord], warnings: list[str]) -> Findings:
             _text(each.get("unit", "")),
             _number(each.get("found_to_stated")),
         )
-        for each in groups[:_ROWS]
+        for each in groups[:MOST_ROWS]
     )
     tables = {"adjustments": _overview(records)}
     if rows:
@@ -570,7 +591,7 @@ def _products(records: Sequence[RunRecord]) -> Findings:
     if not records:
         return Findings(title="Products")
     rows: list[tuple[str | float, ...]] = []
-    for each in records[:_ROWS]:
+    for each in records[:MOST_ROWS]:
         p = each.product
         share = 100 * _number(p.get("valid_share"))
         resolution = _number(each.settings.get("resolution"))
@@ -586,7 +607,11 @@ def _products(records: Sequence[RunRecord]) -> Findings:
         *known(Estimate("worst_anchor_residual_px", worst, label="largest approximation error", unit="px")),
         *known(*(Estimate("outside_m2", v, label="area in no image", unit="m²", at=name) for name, v in gaps)),
     ]
-    return Findings(tuple(figures), tables={"products": Table(head, tuple(shown), "Products.")}, title="Products")
+    return Findings(
+        tuple(figures),
+        tables={"products": Table(head, tuple(shown), _first("Products", len(records)))},
+        title="Products",
+    )
 
 
 def _accuracy(request: ReportRequest, adjustments: Sequence[RunRecord], missing: dict[str, str]) -> Findings:

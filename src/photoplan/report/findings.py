@@ -152,8 +152,8 @@ def _limits(known: NDArray[np.float64]) -> tuple[float, float]:
 _ROWS = 25
 
 
-def findings_section(found: Findings) -> str:
-    """Return a section with all that was found."""
+def findings_section(found: Findings, most: int = _ROWS) -> str:
+    """Return a section with all that was found, and so many lines of each table."""
     heads = ("figure", "of", "value", "standard deviation", "unit", "stated elsewhere", "remark")
     rows = [
         (f.label, spaced(f.plane, f.at), *f.texts, f.unit,
@@ -165,9 +165,9 @@ def findings_section(found: Findings) -> str:
     parts += [f"<p>{text(note)}</p>" for note in found.notes]
     parts += [figure(draw_plot(plot), plot.title, plot.caption) for plot in found.plots]
     for name, each in found.tables.items():
-        cut = f". The first {_ROWS} of {len(each.rows)} lines; all are in the CSV tables."
-        more = cut if len(each.rows) > _ROWS else ""
-        parts += [f"<p>{text((each.caption or name) + more)}</p>", findings_table(each, _ROWS)] if each.rows else []
+        cut = f". The first {most} of {len(each.rows)} lines; all are in the CSV tables."
+        more = cut if len(each.rows) > most else ""
+        parts += [f"<p>{text((each.caption or name) + more)}</p>", findings_table(each, most)] if each.rows else []
     return section(found.title, parts)
 
 

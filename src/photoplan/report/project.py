@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from photoplan.products.report import ProjectReport
+from photoplan.products.report import MOST_ROWS, ProjectReport
 from photoplan.report.findings import findings_section
 from photoplan.report.page import headline, page, section, table, text
 
@@ -12,9 +12,13 @@ def project_page(made: ProjectReport) -> str:
     old = sum(bool(each.old) for each in made.records)
     head = headline(
         [
-            (str(len(made.records)), "run records", f"{old} of them old" if old else "all of the project as it is"),
-            (str(len(made.warnings)), "warnings", ""),
-            (str(len(made.missing)), "gaps", ", ".join(made.missing)),
+            (
+                str(len(made.records)),
+                "run record" if len(made.records) == 1 else "run records",
+                f"{old} of them old" if old else "all of the project as it is",
+            ),
+            (str(len(made.warnings)), "warning" if len(made.warnings) == 1 else "warnings", ""),
+            (str(len(made.missing)), "gap" if len(made.missing) == 1 else "gaps", ", ".join(made.missing)),
         ]
     )
     rows = [
@@ -30,7 +34,7 @@ def project_page(made: ProjectReport) -> str:
         [
             head,
             section("Warnings, gaps and notes", parts),
-            *(findings_section(each) for each in made.sections),
+            *(findings_section(each, MOST_ROWS) for each in made.sections),
             section("Source files", [table(("result", "run record", "finished"), sources)]) if sources else "",
         ],
     )
