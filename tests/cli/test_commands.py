@@ -15,7 +15,7 @@ import rasterio
 from tools.command import COMMAND, OPTIONS, Here, Undisturbed, inside, process
 from tools.small_block import CRS, NAMES, SIZE, Block, texture, write_image
 
-from photoplan.cli.main import VERBS
+from photoplan.cli.table import VERBS
 from photoplan.io.project.file import load_project
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import ground_of

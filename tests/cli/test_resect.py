@@ -17,7 +17,7 @@ from photoplan.cameras.base import project as project_points
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Brown
-from photoplan.cli.main import VERBS
+from photoplan.cli.table import VERBS
 from photoplan.errors import GeometryError, InputError, TilesFailed, UsageError
 from photoplan.geometry.pose import Pose, rotation_from_angles
 from photoplan.io.project.file import load_project

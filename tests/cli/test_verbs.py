@@ -157,7 +157,7 @@ def test_values_read_themselves_from_text_and_only_given_options_are_set(tmp_pat
     ("words", "meant"),
     [
         ("mosiac", "`photoplan mosaic`"),
-        ("volume", "`photoplan dtm volume`"),
+        ("volume", "`photoplan terrain volume`"),
         ("dtm shad", "`photoplan dtm shade`"),
         ("qqq", "see `photoplan --help`"),
     ],

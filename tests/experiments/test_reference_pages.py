@@ -9,10 +9,9 @@ import click
 import pytest
 from tools.command import verbs
 
-from photoplan.cli.dtm import VERBS as DTM_VERBS
-from photoplan.cli.main import VERBS
-from photoplan.cli.view import VERBS as VIEW_VERBS
-from photoplan.cli.view import spelled_out
+from photoplan.cli.lazy import spelled_out
+from photoplan.cli.table import GROUPS as TABLE
+from photoplan.cli.table import VERBS
 from photoplan.io.project.file import project_schema
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,8 +20,9 @@ PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md"]
 #: Options of other programs on the pages.
 OTHERS = {"--help"}
 #: Verbs as they are typed, and the page that explains them; `dtm` and `view` are groups of verbs without options.
+DTM_VERBS, VIEW_VERBS = TABLE["terrain"].verbs, TABLE["view"].verbs
 GROUPS = {"dtm": DTM_VERBS, "view": VIEW_VERBS}
-PLACES = {verb: "command-line" for verb in VERBS if verb not in GROUPS}
+PLACES = {verb: "command-line" for verb in VERBS if verb not in {**GROUPS, **TABLE} or verb == "ortho"}
 PLACES |= {f"dtm {verb}": "dtm" for verb in DTM_VERBS} | {f"view {verb}": "views" for verb in VIEW_VERBS}
 PLACES |= dict.fromkeys(("convert", "fiducials", "interior", "tie", "control", "resect", "adjust"), "orientation")
 PLACES |= {verb: verb for verb in ("mtf", "restore", "characterise", "sensor", "simulate")}
@@ -59,7 +59,7 @@ def examples():
                     continue
                 words = shlex.split(re.split(r"\s+#", call[1])[0])
                 if words[0] == "view":
-                    words = ["view", *spelled_out(words[1:])]
+                    words = ["view", *spelled_out(words[1:], VIEW_VERBS, TABLE["view"].words)]
                 verb = " ".join(words[:2]) if words[0] in GROUPS else words[0]
                 yield pytest.param(verb, words[len(verb.split()) :], id=f"{page.stem}: {call[1][:40]}")
 

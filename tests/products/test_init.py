@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 from pyproj import Proj
 from rasterio.transform import from_origin
 
-from photoplan.cli.main import VERBS
+from photoplan.cli.table import VERBS
 from photoplan.errors import HeightSystemError, InputError, PhotoplanError, UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.pose import rotation_opk

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photoplan.cli.main import VERBS
+from photoplan.cli.table import VERBS
 from photoplan.io.project.file import load_project
 
 command = VERBS["resect"].command("resect")

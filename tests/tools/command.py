@@ -21,8 +21,10 @@ from typing import Any
 import click
 import pytest
 
-from photoplan.cli.main import photoplan, run
+from photoplan.cli.main import run
+from photoplan.cli.table import GROUPS, VERBS
 from photoplan.cli.telling import Telling
+from photoplan.cli.verb import Verb
 
 COMMAND = (sys.executable, "-m", "photoplan")
 OPTIONS = ("--resolution", "1", "--tile", "128")
@@ -219,16 +221,10 @@ class Here:
 
 def verbs() -> dict[str, click.Command]:
     """Every verb by its words, as in ``"dtm build"``."""
-    found: dict[str, click.Command] = {}
-    for name, command in _subcommands(photoplan).items():
-        below = _subcommands(command) if isinstance(command, click.Group) else {}
-        found |= {f"{name} {word}": verb for word, verb in below.items()} or {name: command}
-    return found
-
-
-def _subcommands(group: click.Group) -> dict[str, click.Command]:
-    context = click.Context(group)
-    return {name: command for name in group.list_commands(context) if (command := group.get_command(context, name))}
+    found = {name: row.command(name) for name, row in VERBS.items() if isinstance(row, Verb)}
+    for name, group in (("dtm", GROUPS["terrain"]), ("view", GROUPS["view"])):
+        found |= {f"{name} {word}": row.command(word) for word, row in group.verbs.items()}
+    return {**found, "ortho": GROUPS["ortho"].verbs["images"].command("ortho")}
 
 
 def options_of(command: click.Command) -> set[str]:

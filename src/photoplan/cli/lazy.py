@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from typing import Any
 
 import click
 
 from photoplan.cli.output import spelled
+from photoplan.cli.table import GROUPS, HEADINGS, Group
 from photoplan.cli.verb import Verb
 from photoplan.errors import PhotoplanError
 
-#: Commands that hold commands.
-GROUPS = ("dtm", "view")
+_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
 class LazyGroup(click.Group):
     """Lists verbs without importing them."""
 
-    def __init__(self, *arguments: Any, verbs: Mapping[str, str | Verb], **options: Any) -> None:
-        super().__init__(*arguments, **options)
+    def __init__(self, *arguments: Any, verbs: Mapping[str, Verb | Group], **options: Any) -> None:
+        super().__init__(*arguments, context_settings=_SETTINGS, **options)
         self.verbs = verbs
+        self.words: Mapping[str, tuple[str, ...]] = {}
+        """What words in place of a verb stand for, see `Group.words`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse arguments; a word that is no verb may stand for one."""
+        return super().parse_args(ctx, spelled_out(args, self.verbs, self.words))
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a verb; its errors name parameters as the verb's options."""
@@ -46,31 +51,60 @@ class LazyGroup(click.Group):
     def _meant(self, word: str, ctx: click.Context) -> str:
         """Return which commands a misspelt word may mean; those of groups, too."""
         places = {name: name for name in self.verbs}
-        for name in self.verbs if ctx.parent is None else ():
-            group = self.get_command(ctx, name) if name in GROUPS else None
-            places |= {f"{verb} ({name})": f"{name} {verb}" for verb in getattr(group, "verbs", ())}
+        if ctx.parent is None:
+            inner = {name: group for name, group in GROUPS.items() if not group.alone}
+            places |= {f"{verb} ({name})": f"{name} {verb}" for name, group in inner.items() for verb in group.verbs}
         close = get_close_matches(word, [place.split()[0] for place in places], n=3, cutoff=0.6)
         meant = [f"`{ctx.command_path} {full}`" for place, full in places.items() if place.split()[0] in close]
         return f"; did you mean {' or '.join(meant[:3])}?" if meant else f"; see `{ctx.command_path} --help`"
+
+    @property
+    def own(self) -> click.Command | None:
+        """Command that the name of the group alone stands for."""
+        return self.get_command(click.Context(self), self.words[""][0]) if "" in self.words else None
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the verbs, in the order of a job."""
         return list(self.verbs)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return the command of a verb, made now; that of a group is imported."""
+        """Return the command of a verb or a group, made now."""
         verb = self.verbs.get(cmd_name)
-        if isinstance(verb, str):
-            command: click.Command = importlib.import_module(f"photoplan.cli.{cmd_name}").command
-            return command
-        return None if verb is None else verb.command(cmd_name)
+        if isinstance(verb, Group):
+            group = LazyGroup(cmd_name, verbs=verb.verbs, help=verb.help or verb.short)
+            group.words = verb.words
+            return group
+        if verb is None:
+            return None
+        if self.words.get("") != (cmd_name,):
+            return verb.command(cmd_name)
+        # What the name of the group alone stands for has that name.
+        command = verb.command(self.name or cmd_name)
+        others = ", ".join(f"`{self.name} {name}`" for name in self.verbs if name != cmd_name)
+        command.epilog = f"More: {others}."
+        return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write one line for each verb."""
-        with formatter.section("Verbs"):
-            formatter.write_dl(
-                [(name, verb if isinstance(verb, str) else verb.short) for name, verb in self.verbs.items()]
-            )
+        """Write one line for each verb; those of the whole program below headings."""
+        headings = HEADINGS if ctx.parent is None else {"Commands": tuple(self.verbs)}
+        for heading, names in headings.items():
+            with formatter.section(heading):
+                formatter.write_dl([(name, self.verbs[name].short) for name in names])
+        if ctx.parent is None:
+            rest = set(self.verbs).difference(*headings.values())
+            with formatter.section("Groups (their commands may also be called without the name of the group)"):
+                formatter.write_dl([(name, verb.short) for name, verb in self.verbs.items() if name in rest])
+
+
+def spelled_out(args: list[str], verbs: Iterable[str], words: Mapping[str, tuple[str, ...]]) -> list[str]:
+    """Return arguments of a group with the verb that a word stands for, or that may be left out."""
+    if not args and "-h" in words:
+        return [*words[""]]
+    if not args or args[0] in verbs:
+        return args
+    if args[0] in words:
+        return [*words[args[0]], *args[1:]]
+    return args if "" not in words or args[0] in _SETTINGS["help_option_names"] else [*words[""], *args]
 
 
 #: What may stand between numbers of one option: blanks, commas, semicolons.

@@ -38,7 +38,8 @@ def _named(text: str, group: click.Command | None) -> list[click.Command]:
     if not isinstance(group, click.Group):
         return []
     names = dict.fromkeys(re.findall(r"`photoplan ([a-z]+)", text))
-    return [command for name in names if (command := group.get_command(click.Context(group), name))]
+    found = [command for name in names if (command := group.get_command(click.Context(group), name))]
+    return [getattr(command, "own", None) or command for command in found]
 
 
 def printable(text: str) -> str:

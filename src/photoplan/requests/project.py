@@ -126,3 +126,9 @@ class DescribeRequest(Request):
     file: Path = arg("File of any kind that a command reads or writes, or folder of images.")
     picture: Path | None = opt("Draw a restoration filter as PNG.", None, flag="plot", metavar="PICTURE", writes=True)
     overwrite: bool = OVERWRITE
+
+
+class SchemaRequest(Request):
+    """Options of the description of commands."""
+
+    verb: tuple[str, ...] = opt("Words of the command.", (), argument=True)
