@@ -20,6 +20,7 @@ from scipy.optimize import nnls
 from photoplan.cameras.base import project, tremor_of
 from photoplan.kernels.facets_evidence import agreement, unhidden
 from photoplan.matching.facets.block import FacetBlock
+from photoplan.matching.facets.judged import edge_variances
 from photoplan.matching.facets.means import means_around
 from photoplan.matching.facets.observe import pixels_between
 
@@ -142,6 +143,7 @@ def evidence(
     sizes = (1, *_AROUND)
     lowest: dict[int, _Doubles] = {}
     sums, before, barrier = dict(lowest), dict(lowest), dict(lowest)
+    edges = edge_variances(block)[inner] > 0
     for k in (*range(counts[0] + 1), *range(-1, -counts[1] - 1, -1)):
         far = abs(k) * _STEP > _NEARBY
         L = _lacking(*(here if k == 0 else tried(k, every & (~strong | some) if far else every)), variances)
@@ -159,6 +161,8 @@ def evidence(
                 alike = flat > 0.5 if size > _AROUND[0] else every
                 total = L + _ADDED * (size**2 - 1) * means_around(np.where(alike, np.minimum(L, 4.0), 0.0), size)
             if k == 0:
+                # Another height takes a break of the surface, if the images agree around: as rare as breaks are.
+                rare = (1.0 - _open(total)) * np.log((edges.sum() + 1) / (edges.size + 1))
                 lowest[size], before[size] = total, total
                 sums[size] = np.stack([np.ones(facets.shape), *np.zeros((2, *facets.shape))])
                 continue
@@ -171,7 +175,7 @@ def evidence(
             if distant:
                 other = np.maximum(other, _open(before[size]))
             barrier[size] = np.maximum(barrier[size], total)
-            total = np.where(allowed, total, np.inf)
+            total = np.where(allowed, total - rare, np.inf)
             least = np.minimum(lowest[size], total)
             kept, p = np.exp(least - lowest[size]), np.exp(least - total)
             for n, weight in enumerate((1.0, np.maximum(other, flat) * offset**2, other)):
@@ -184,7 +188,7 @@ def evidence(
         fit = np.fmin(misfit, np.sqrt(here[0] / variances(here[1])))
     against = np.nan_to_num(fit) ** 2 > _AGAINST
     for size in sizes:
-        none = _NONE * sum(counts) * np.exp(np.minimum(lowest[size], 50.0))
+        none = _NONE * sum(counts) * np.exp(np.minimum(lowest[size], 50.0) + rare)
         whole = sums[size][0] + none
         right = 1.0 - (sums[size][2] + none) / whole
         # What a post decides against its height the posts around do not overrule.
