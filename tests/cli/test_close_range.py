@@ -62,7 +62,7 @@ camera = "cam"
 def test_resection_from_5_m_prints_two_figures_of_its_standard_deviations(tmp_path: Path) -> None:
     said = inside("resect", facade(tmp_path, (88.0, 20.0, 2.0)), "--dry-run")
     assert said.code == 0, said.err
-    sigmas = re.findall(r"[XYZ]0 \S+ ±(\S+) m", said.out)
+    sigmas = re.findall(r"[XYZ]0 \S+ ± (\S+) m", said.out)
     assert len(sigmas) == 3
     assert all(float(s) < 1e-3 and len(s.lstrip("0.")) == 2 for s in sigmas), sigmas
 
