@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from photoplan.cli.output import spelled
-from photoplan.cli.table import GROUPS, HEADINGS, Group
+from photoplan.cli.table import GROUPS, HEADINGS, VerbGroup
 from photoplan.cli.verb import Verb
 from photoplan.errors import PhotoplanError
 
@@ -20,11 +20,11 @@ _SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content
 class LazyGroup(click.Group):
     """Lists verbs without importing them."""
 
-    def __init__(self, *arguments: Any, verbs: Mapping[str, Verb | Group], **options: Any) -> None:
+    def __init__(self, *arguments: Any, verbs: Mapping[str, Verb | VerbGroup], **options: Any) -> None:
         super().__init__(*arguments, context_settings=_SETTINGS, **options)
         self.verbs = verbs
         self.words: Mapping[str, tuple[str, ...]] = {}
-        """What words in place of a verb stand for, see `Group.words`."""
+        """What words in place of a verb stand for, see `VerbGroup.words`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse arguments; a word that is no verb may stand for one."""
@@ -70,7 +70,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the command of a verb or a group, made now."""
         verb = self.verbs.get(cmd_name)
-        if isinstance(verb, Group):
+        if isinstance(verb, VerbGroup):
             group = LazyGroup(cmd_name, verbs=verb.verbs, help=verb.help or verb.short)
             group.words = verb.words
             return group

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Group:
+class VerbGroup:
     """Commands that belong together."""
 
     short: str
@@ -555,15 +555,15 @@ _ALONE: dict[str, Verb] = {
 }
 
 #: Groups by their names, in the order of a job; `surface` and `demo` stand alone.
-GROUPS: dict[str, Group] = {
-    "project": Group("Begin, check and describe projects.", _PROJECT),
-    "orient": Group("Orient images: marks, tie points, control, adjustment.", _ORIENT),
-    "ortho": Group(
+GROUPS: dict[str, VerbGroup] = {
+    "project": VerbGroup("Begin, check and describe projects.", _PROJECT),
+    "orient": VerbGroup("Orient images: marks, tie points, control, adjustment.", _ORIENT),
+    "ortho": VerbGroup(
         "Make orthophotos and mosaics, and what belongs to them.",
         _ORTHO,
         words={"": ("images",), "-h": ("images", "-h"), "--help": ("images", "-h")},
     ),
-    "terrain": Group(
+    "terrain": VerbGroup(
         "Terrain models: build, sample, contours, volumes …",
         _TERRAIN,
         """Terrain models with breaklines.
@@ -572,7 +572,7 @@ GROUPS: dict[str, Group] = {
     """,
         alone=False,
     ),
-    "view": Group(
+    "view": VerbGroup(
         "Perspective views, with the ground of every pixel.",
         _VIEW,
         """Perspective views of a project or a terrain model: photoplan view FILE --from X Y --look-at X Y -o PICTURE.
@@ -584,11 +584,11 @@ GROUPS: dict[str, Group] = {
         alone=False,
         words={"": ("picture",), "panorama": ("picture", "--panorama", "cylinder")},
     ),
-    "measure": Group("Measure in images.", _MEASURE),
-    "quality": Group("Sharpness, noise and faults of images; filters.", _QUALITY),
+    "measure": VerbGroup("Measure in images.", _MEASURE),
+    "quality": VerbGroup("Sharpness, noise and faults of images; filters.", _QUALITY),
 }
 #: Commands and groups by the first word after `photoplan`.
-VERBS: dict[str, Verb | Group] = {
+VERBS: dict[str, Verb | VerbGroup] = {
     **{name: verb for group in GROUPS.values() if group.alone for name, verb in group.verbs.items()},
     **_ALONE,
     **GROUPS,
@@ -629,10 +629,10 @@ def schema(request: SchemaRequest, events: Events) -> Schema:
     if not request.verb:
         groups = {name: {verb: row.short for verb, row in group.verbs.items()} for name, group in GROUPS.items()}
         return Schema({**groups, "": {name: row.short for name, row in _ALONE.items()}})
-    row: Verb | Group | None = VERBS.get(request.verb[0])
+    row: Verb | VerbGroup | None = VERBS.get(request.verb[0])
     for word in request.verb[1:]:
-        row = row.verbs.get(word) if isinstance(row, Group) else None
-    if isinstance(row, Group) and "" in row.words:
+        row = row.verbs.get(word) if isinstance(row, VerbGroup) else None
+    if isinstance(row, VerbGroup) and "" in row.words:
         row = row.verbs[row.words[""][0]]
     if not isinstance(row, Verb):
         raise UsageError(f"`verb` {' '.join(request.verb)} is no command; `photoplan schema` lists them")
