@@ -273,7 +273,7 @@ def test_what_cannot_be_is_refused_by_name(scene: Scene, made: Path) -> None:
         (["--memory", "300MB"], 2, "needed for one tile"),
         (["--points", "a.xyz"], 2, ".las, .laz, .ply"),
         (["--points", "a.ply", "--points", "./a.ply", "--overwrite"], 2, "one file twice"),
-        (["--report", "a.pdf"], 2, "ends in .html"),
+        (["--report", "a.docx"], 2, "ends in .html"),
     ):
         said = surface(scene, *words)
         assert said.code == code and text in said.err, said.err
