@@ -22,7 +22,7 @@ from tools.shaken_strip import ShakenStrip
 
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.camera.line.file import read_line
+from photoplan.io.camera.line import read_line
 from photoplan.kernels.pack import pack
 from photoplan.kernels.rectify import rectify_tile
 from photoplan.plan.anchors import AnchorRule, compile_anchors

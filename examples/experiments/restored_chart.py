@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.products.measured_filter import design_restoration
 from photoplan.products.mtf.edges import LUMINANCE, LightImage, measure_edges
 from photoplan.products.mtf.result import MeasuredEdge
-from photoplan.products.restore import RestoreRequest, design_restoration, restore_images
+from photoplan.products.restore import RestoreRequest, restore_images
 from photoplan.project.steps import linearisation_of
 from photoplan.quality.edges.response import EdgeMeasurement, measure_edge
 from photoplan.requests.quality import MtfRequest
