@@ -29,10 +29,10 @@ _LIMITS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at 
 def opt(help: str, default: Any = ..., **how: Any) -> Any:
     """Declare a field that is an option of the command line; without a default it is required.
 
-    Beside limits: `section`, `metavar`, `flag` (its name), `off` (it turns off what the field states), `other` (name of
-    the opposite flag), `writes`, `listed` (values with commas, perhaps with the words of a message), `choices` (words,
-    or a mapping from words to values), `folder`, `project`, `size`, `infinite` and `nan` (numbers that are not refused
-    here); and `draws` for a dry run that draws what is asked all the same.
+    Beside limits: `section`, `metavar`, `flag` (its name), `off` (help of a flag that turns off what the field states),
+    `other` (name of the opposite flag), `writes`, `listed` (values with commas, perhaps with the words of a message),
+    `choices` (words, or a mapping from words to values), `folder`, `project`, `size`, `infinite` and `nan` (numbers
+    that are not refused here); and `draws` for a dry run that draws what is asked all the same.
     """
     limits = {name: how.pop(name) for name in _LIMITS if name in how}
     if how.pop("infinite", False) or how.get("nan"):
@@ -78,7 +78,9 @@ class Request(BaseModel):
         try:
             super().__init__(**named)
         except ValidationError as error:
-            raise UsageError("; ".join(_message(each, type(self)) for each in error.errors())) from None
+            # A field of several types has an error for each of them; the last one lists its words.
+            errors = {each["loc"][:1]: each for each in error.errors()}
+            raise UsageError("; ".join(_message(each, type(self)) for each in errors.values())) from None
         seen: dict[Path, str] = {}
         for name, paths in self.files_written().items():
             for path in paths:
@@ -114,16 +116,16 @@ class Request(BaseModel):
         return {}
 
     @classmethod
-    def may_be_stated(cls) -> list[str]:
+    def may_be_stated(cls) -> dict[str, FieldInfo]:
         """Return the options that a project file may state: those that choose a method, and write and run nothing."""
-        names: list[str] = []
+        found: dict[str, FieldInfo] = {}
         for name, field in cls.model_fields.items():
             how = how_of(field)
             if isinstance(field.annotation, type) and issubclass(field.annotation, Request):
-                names += field.annotation.may_be_stated()
+                found |= field.annotation.may_be_stated()
             elif not (set(how) & {"argument", "writes", "folder"} or how.get("section", "method") != "method"):
-                names.append(name)
-        return names
+                found[name] = field
+        return found
 
     def files_read(self) -> list[Path]:
         """Return the files that it reads, in the order of the fields."""
@@ -154,7 +156,10 @@ def _parsed(value: Any, hint: Any) -> Any:
         if isinstance(value, str) and hasattr(kind, "parse"):
             return kind.parse(value)
         if isinstance(value, dict) and isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, Request)):
-            return kind(**value)
+            try:
+                return kind(**value)
+            except TypeError as error:  # names that a data class has not, values that are no numbers
+                raise UsageError(f"{kind.__name__} {value}: {error}") from None
     return value
 
 
@@ -198,7 +203,8 @@ def crs_option(of: str = "terrain files that state none") -> Any:
 OVERWRITE: Any = opt("Replace files that exist.", False, section="run")
 PROJECT: Any = arg("Project file, or the folder that holds `project.toml`.", project=True)
 IMAGES: Any = opt("Images or patterns; may be repeated [all].", (), listed=True, metavar="NAME,…", section="input")
-PICTURE: Any = opt("Write no picture of the result.", True, flag="no-picture", section="result")
+PICTURE: Any = opt("Write a picture of the result.", True, flag="no-picture", section="result",
+                   off="Write no picture of the result.")  # fmt: skip
 REPORT_FORMAT: Any = opt("Format of the report.", "html", section="result")
 DRY_RUN: Any = opt("Say what would be done, and stop.", False, section="run")
 _EXECUTORS = "threads, processes, or the address of a Dask scheduler, tcp://host:port."

@@ -224,3 +224,26 @@ def test_every_product_of_a_large_project_is_listed(photoplan: Here, project: Pa
     products = html[html.index("<h2>Products</h2>") : html.index("<h2>Source files</h2>")]
     assert [k for k in range(40) if f"products/p{k}_ortho.csv" not in products] == []
     assert "The first" not in html
+
+
+def test_a_project_whose_images_wait_for_an_orientation_has_a_report(photoplan: Here, tmp_path: Path) -> None:
+    images = "".join(f'[[images]]\nname = "{n}"\nfile = "{n}.tif"\ncamera = "c"\n' for n in "ab")
+    camera = '[cameras.c]\ntype = "frame"\nsize = [100, 100]\nfocal_px = 100.0\n'
+    (tmp_path / "project.toml").write_text(f'format = 1\ncrs = "EPSG:32633"\n{camera}{images}')
+    record(tmp_path / "ties.run.json", "tie points", {"points": 77})
+    said = photoplan("report", tmp_path, "--json")
+    assert said.code == 0, said.err
+    assert json.loads(said.out)["missing"]["orientation"] == "2 images of 2 have none"
+    assert figures(said, "Tie points and control")["points"]["value"] == 77
+
+
+def test_messages_on_broken_records_do_not_name_the_folder_of_the_project(photoplan: Here, project: Path) -> None:
+    adjusted(project)
+    (project / "adjustment" / "report.json").write_text("{")
+    (project / "cut.run.json").write_text('{"file": ')
+    odd = {"file": 5, "kind": 5, **SAID}
+    (project / "odd.run.json").write_text(json.dumps(odd))
+    said = photoplan("report", project)
+    assert said.code == 0 and str(project) not in said.err
+    assert "odd.run.json: is left out: file: 5 given; allowed is a valid string kind: 5 given" in said.err
+    assert "cut.run.json: is left out: cut.run.json:1: not valid JSON" in said.err

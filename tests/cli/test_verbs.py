@@ -31,7 +31,7 @@ class Outer(Request):
     bounds: tuple[float, float, float, float] | None = opt("Part.", None, section="input")
     scene: bool | None = opt("Side of the scene.", None, choices={"auto": None, "z<0": True})
     classes: tuple[float, ...] = opt("Limits.", (), listed=True, metavar="A,B")
-    header: bool = opt("The first line is a point.", True, flag="no-header")
+    header: bool = opt("The first line is a head.", True, flag="no-header", off="The first line is a point.")
     inner: Inner = Inner()
     overwrite: bool = OVERWRITE
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -629,11 +629,17 @@ def schema(request: SchemaRequest, events: Events) -> Schema:
     if not request.verb:
         groups = {name: {verb: row.short for verb, row in group.verbs.items()} for name, group in GROUPS.items()}
         return Schema({**groups, "": {name: row.short for name, row in _ALONE.items()}})
-    row: Verb | VerbGroup | None = VERBS.get(request.verb[0])
-    for word in request.verb[1:]:
+    row = command_at(request.verb)
+    if row is None:
+        raise UsageError(f"`verb` {' '.join(request.verb)} is no command; `photoplan schema` lists them")
+    return Schema({**load(row.request).model_json_schema(), "title": " ".join(request.verb)})
+
+
+def command_at(words: Sequence[str]) -> Verb | None:
+    """Return the command that words such as ``ortho mosaic`` or ``ortho`` name; None if there is none."""
+    row: Verb | VerbGroup | None = VERBS.get(words[0])
+    for word in words[1:]:
         row = row.verbs.get(word) if isinstance(row, VerbGroup) else None
     if isinstance(row, VerbGroup) and "" in row.words:
         row = row.verbs[row.words[""][0]]
-    if not isinstance(row, Verb):
-        raise UsageError(f"`verb` {' '.join(request.verb)} is no command; `photoplan schema` lists them")
-    return Schema({**load(row.request).model_json_schema(), "title": " ".join(request.verb)})
+    return row if isinstance(row, Verb) else None

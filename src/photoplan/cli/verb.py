@@ -82,42 +82,51 @@ class VerbCommand(click.Command):
         place, stated = self._stated(ctx)
         for option in self.params:
             name = option.name or ""
-            if ctx.get_parameter_source(name) is ParameterSource.DEFAULT and given.get(name) == option.default:
-                given.pop(name, None)
-                if name in stated:
-                    given[name] = self._checked(ctx, option, f"{place} {name}", stated[name])
-            else:
+            if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT:
                 stated.pop(name, None)
+            elif given.get(name) == option.default:
+                given.pop(name, None)
         assert self.callback is not None
         try:
-            request = _request(self.kind, given)
+            request = _request(self.kind, given | stated)
         except UsageError as error:
-            if any(f"`{name}`" in str(error) for name in stated):
-                raise InputError(f"{place} {error}") from None
+            if stated and str(error) != _refusal(self.kind, given):
+                # The file states fields, not options of the command line.
+                raise InputError(f"{place} {str(error).replace('`', '')}") from None
             raise
         return ctx.invoke(self.callback, request=request, as_json=as_json, quiet=quiet)
 
     def _stated(self, ctx: click.Context) -> tuple[str, dict[str, Any]]:
-        """Return where the project states options of the command, ``[defaults.VERB]``, and these."""
-        from photoplan.request import how_of
+        """Return where the project states options of the command, ``[defaults.VERB]``, and these.
 
-        fields, known = self.kind.model_fields, self.kind.may_be_stated()
-        project = next((ctx.params[name] for name in fields if how_of(fields[name]).get("project")), None)
-        if project is None or not known:
+        Raises
+        ------
+        InputError
+            The project states options that no command takes from it, of this command or another one.
+        """
+        from photoplan.cli.table import command_at
+
+        project = ctx.params.get(_project_of(self.kind))
+        if project is None:
             return "", {}
+        from photoplan.io.files import resolve_input
         from photoplan.io.project.file import stated_defaults
 
-        place, values = stated_defaults(project, self.name or "")
-        for name in values:
-            if name not in known:
-                raise InputError(f"{place} {name}: no option that a project may state; these are {', '.join(known)}")
-        return place, dict(values)
-
-    def _checked(self, ctx: click.Context, option: click.Parameter, place: str, value: Any) -> Any:
-        try:
-            return option.process_value(ctx, value)
-        except click.BadParameter as error:
-            raise InputError(f"{place}: {error.message}") from None
+        folder, tables = stated_defaults(project)
+        for verb, values in tables.items():
+            row = command_at((verb,))
+            kind = load(row.request) if row is not None else None
+            known = kind.may_be_stated() if kind is not None and _project_of(kind) else {}
+            for name, value in values.items():
+                if name not in known:
+                    these = f"these are {', '.join(known)}" if known else f"{verb} has none"
+                    place = f"{project}: [defaults.{verb}] {name}"
+                    raise InputError(f"{place}: no option that a project may state; {these}")
+                hint = known[name].annotation
+                words = [word for each in get_args(hint) if get_origin(each) is Literal for word in get_args(each)]
+                if Path in (hint, *get_args(hint)) and isinstance(value, str) and value not in words:
+                    values[name] = resolve_input(folder, value)
+        return f"{project}: [defaults.{self.name}]", tables.get(self.name or "", {})
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, those of a section together."""
@@ -240,6 +249,22 @@ def _opened(path: Path, key: str, request: Any) -> ReportFile | None:
     return opening(path, request.files_read(), overwrite=overwrite, project=getattr(request, "project", None))
 
 
+def _project_of(kind: type[Request]) -> str:
+    """Return the option that states the project; empty if there is none."""
+    from photoplan.request import how_of
+
+    return next((name for name, entry in kind.model_fields.items() if how_of(entry).get("project")), "")
+
+
+def _refusal(kind: type[Request], given: Mapping[str, Any]) -> str:
+    """Return the message by which a request refuses what is given; empty if it does not."""
+    try:
+        _request(kind, dict(given))
+    except UsageError as error:
+        return str(error)
+    return ""
+
+
 def _request(kind: type[Request], given: dict[str, Any]) -> Request:
     """Return the request, with the requests that it holds; options that were not given keep their defaults."""
     values: dict[str, Any] = {}
@@ -314,8 +339,8 @@ def _parameter(name: str, entry: Any, how: Mapping[str, Any]) -> click.Parameter
     flag = "--" + str(how.get("flag", name.replace("_", "-")))
     default = None if entry.is_required() else entry.get_default(call_default_factory=True)
     if hint is bool and not choices:
-        if how.get("off") or flag[2:].startswith("no-"):
-            return click.Option([name, flag], is_flag=True, flag_value=False, default=True, help=entry.description)
+        if "off" in how:
+            return click.Option([name, flag], is_flag=True, flag_value=False, default=True, help=how["off"])
         other = how.get("other") or (f"no-{flag[2:]}" if default or optional else "")
         names = [name, flag + (f"/--{other}" if other else "")]
         return click.Option(names, is_flag=True, default=None if optional else default, help=entry.description)

@@ -280,7 +280,7 @@ def _records(folder: Path) -> tuple[list[RunRecord], list[str]]:
                 raise InputError(f"all records together hold more than {_ALL_BYTES} bytes")
             found.append(_read(path, folder))
         except (InputError, OSError) as error:
-            warnings.append(f"{name}: is left out: {_text(str(error).removeprefix(f'{path}: '))}")
+            warnings.append(f"{name}: is left out: {_fault(error, path)}")
     if len(paths) > _MOST_RECORDS:
         warnings.append(f"{len(paths)} run records; the first {_MOST_RECORDS} are read")
     return sorted(found, key=lambda each: (each.finished or datetime.min.replace(tzinfo=UTC), each.name)), warnings
@@ -500,7 +500,7 @@ def _state(record: RunRecord) -> str:
 def _images(project: Project, check: bool, warnings: list[str], missing: dict[str, str]) -> Findings:
     """Return the images and cameras of a project, and what its check finds."""
     names = [image.name for image in project.images]
-    oriented, left_out = project.oriented(names) if project.images else ([], [])
+    oriented = [name for name in names if project.any_image(name).unoriented is None]
     figures = [
         Estimate("images", len(names), label="images"),
         Estimate("oriented", len(oriented), label="images with orientation"),
@@ -508,8 +508,8 @@ def _images(project: Project, check: bool, warnings: list[str], missing: dict[st
     ]
     rows: tuple[tuple[str | float, ...], ...] = ()
     notes = [f"CRS: {crs_label(project.crs)}"]
-    if left_out:
-        missing["orientation"] = f"{_counted(len(left_out), 'image')} of {len(names)} have none"
+    if len(oriented) < len(names):
+        missing["orientation"] = f"{_counted(len(names) - len(oriented), 'image')} of {len(names)} have none"
     try:
         found: ProjectCheck | None = check_project(project) if check and oriented else None
     except PhotoplanError as error:
@@ -582,8 +582,13 @@ def _report_of(record: RunRecord, warnings: list[str]) -> Mapping[str, Any]:
     try:
         return {**record.product, **_json_of(path)}
     except InputError as error:
-        warnings.append(f"{Path(record.name).parent.as_posix()}/report.json: is left out: {_text(error)}")
+        warnings.append(f"{Path(record.name).parent.as_posix()}/report.json: is left out: {_fault(error, path)}")
         return record.product
+
+
+def _fault(error: Exception, path: Path) -> str:
+    """Return a message on a file without its folder, which is not for those who get the report."""
+    return _text(str(error).replace(f"{path}: ", "").replace(str(path), path.name))
 
 
 def _products(records: Sequence[RunRecord]) -> Findings:

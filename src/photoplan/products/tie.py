@@ -202,12 +202,12 @@ def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[CentralCam
     return cameras, levels.tolist()
 
 
-def chosen_pairs(images: Sequence[TieImage], how: str) -> tuple[list[tuple[int, int]] | None, str]:
+def chosen_pairs(images: Sequence[TieImage], how: Path | str) -> tuple[list[tuple[int, int]] | None, str]:
     """Return the pairs to compare, or None if features must decide, and how they were chosen."""
     if how == "all":
         return all_pairs(len(images)), "all pairs"
-    if how != "auto":
-        return _listed(images, Path(how)), f"pairs of {how}"
+    if isinstance(how, Path):
+        return _listed(images, how), f"pairs of {how}"
     if all(image.placed for image in images):
         border = [image.on_ground(_border(image.grey.size)) for image in images]
         outlines = [b[np.isfinite(b).all(axis=1), :2] for b in border]
@@ -764,8 +764,8 @@ def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
     output = request.product
     points = [project.resolve(file) for file in project.observations.image_points]  # an older run's among them
     inputs = [request.project, *(file for file in input_files(project) if file not in points)]
-    if request.pairs not in ("auto", "all"):
-        inputs.append(Path(request.pairs))
+    if isinstance(request.pairs, Path):
+        inputs.append(request.pairs)
     if not request.dry_run:
         for file in (output, request.pairs_table):
             check_output(file, inputs, overwrite=request.overwrite)

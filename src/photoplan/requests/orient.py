@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from photoplan.errors import UsageError
 from photoplan.io.orientation.form import Direction, TableFormat
@@ -20,6 +20,7 @@ from photoplan.request import (
     Request,
     arg,
     opt,
+    path_or,
 )
 
 
@@ -169,16 +170,21 @@ class TieRequest(Request):
 
     project: Path = PROJECT
     images: tuple[str, ...] = IMAGES
-    pairs: str = opt("Pairs of images that are compared: auto, all, or a file with two names in each line.", "auto",
-                     metavar="auto|all|FILE")  # fmt: skip
+    pairs: Annotated[Path | Literal["auto", "all"], path_or("auto", "all")] = opt(
+        "Pairs of images that are compared: auto, all, or a file with two names in each line.",
+        "auto",
+        metavar="auto|all|FILE",
+    )
     scale: float | None = opt("Scale of the images in which features are searched, e.g. 0.5 [by their size].", None)
     features: int = opt("Features per image.", 4000)
     levels: int = opt(
         "Kinds of features that are tried while images stay unconnected: as stated, coarser, then more.", 4, ge=1, le=4
     )
     per_image: int = opt("Tie points that an image is to have.", 500)
-    refine: bool = opt("Take features as they are, without least-squares matching.", True, flag="no-refine")
-    use_orientation: bool = opt("Work as if no image had a position.", True, flag="ignore-orientation", off=True)
+    refine: bool = opt("Refine the places of features by least-squares matching.", True, flag="no-refine",
+                       off="Take features as they are, without least-squares matching.")  # fmt: skip
+    use_orientation: bool = opt("Use the positions and orientations that images have.", True, flag="ignore-orientation",
+                                off="Work as if no image had a position.")  # fmt: skip
     output: Path | None = opt("Tie points to write [tie_points.csv by the project].", None, metavar="CSV", writes=True)
     picture: bool = PICTURE
     dry_run: bool = DRY_RUN
@@ -252,12 +258,16 @@ class AdjustRequest(Request):
         "Datum of the block: control and observed positions, or the orientations in PROJECT [as stated].", None
     )
     images: tuple[str, ...] = IMAGES
-    robust: bool = opt("Search no gross errors.", True, flag="no-robust")
+    robust: bool = opt("Search gross errors.", True, flag="no-robust", off="Search no gross errors.")
     critical: float = opt("Normalised residual of a gross error.", 4.0)
     variance_components: bool = opt(
-        "Weight groups as stated, not as their residuals show.", True, flag="no-variance-components"
+        "Weight groups of observations as their residuals show.",
+        True,
+        flag="no-variance-components",
+        off="Weight groups as stated, not as their residuals show.",
     )
-    correlation: bool = opt("Take errors of neighbouring image points as independent.", True, flag="no-correlation")
+    correlation: bool = opt("Take errors of neighbouring image points as correlated.", True, flag="no-correlation",
+                            off="Take errors of neighbouring image points as independent.")  # fmt: skip
     iterations: int = opt("Largest number of iterations of each solution.", 40, ge=1)
     output: Path | None = opt("Folder of the report [PROJECT/adjustment].", None, folder=True, metavar="FOLDER",
                               section="result")  # fmt: skip

@@ -201,7 +201,8 @@ class ProductRequest(PixelOptions):
         "Continue although an orientation has a FAULT, or the resolution is finer than a quarter of the GSD.", False,
         section="run"
     )  # fmt: skip
-    quicklook: bool = opt("Write no picture of the products.", True, flag="no-quicklook", section="result")
+    quicklook: bool = opt("Write a picture of the products.", True, flag="no-quicklook", section="result",
+                          off="Write no picture of the products.")  # fmt: skip
     dry_run: bool = opt("Compile the plan, print it, and stop.", False, section="run")
     workers: int = ONE_WORKER
     executor: str = EXECUTOR
@@ -275,7 +276,8 @@ class RunRequest(Request):
 
     plan: Path = arg("Plan, a GeoPackage.")
     output: Path | None = opt("Folder of the products [as planned].", None, folder=True, section="result")
-    quicklook: bool = opt("Write no picture of the products.", True, flag="no-quicklook", section="result")
+    quicklook: bool = opt("Write a picture of the products.", True, flag="no-quicklook", section="result",
+                          off="Write no picture of the products.")  # fmt: skip
     workers: int = ONE_WORKER
     executor: str = EXECUTOR
     memory: int | None = MEMORY

@@ -85,7 +85,7 @@ class BudgetRequest(Request):
     angle_unit: Literal["deg", "gon", "rad"] = opt("Unit of angles without a project [gon].", "gon", section="input")
     kernel: str = opt("Resampling kernel [bicubic].", "bicubic")
     tolerance: float = opt("Largest residual of the anchors, pixels [0.02].", 0.02, metavar="PX")
-    tables: bool = opt("Print the tables and examples of Ecker 1991 instead.", False)
+    tables: bool = opt("Print the tables and examples of Ecker 1991 instead.", False, section="result")
     picture: Path | None = opt("Write a picture of contributions, and a map of the total.", None, metavar="PNG",
                                writes=True)  # fmt: skip
     overwrite: bool = OVERWRITE
@@ -111,7 +111,8 @@ class ReportRequest(Request):
     project: Path = PROJECT
     output: Path | None = opt("Report to write, HTML or PDF by its ending [report.html beside the project file].", None,
                               metavar="FILE", writes=True)  # fmt: skip
-    checked: bool = opt("Leave out the check and the error budget, which open the images.", True, flag="no-check")
+    checked: bool = opt("Include the check and the error budget, which open the images.", True, flag="no-check",
+                        off="Leave out the check and the error budget, which open the images.")  # fmt: skip
     overwrite: bool = OVERWRITE
 
     @property

@@ -113,7 +113,7 @@ class RestoreRequest(Request):
                                    metavar="TOML", writes=True)  # fmt: skip
     compress: str = opt("Compression: deflate, zstd, lzw, jpeg or none.", "deflate", section="result")
     report: Path | None = REPORT
-    quicklook: bool = opt("Write no pictures.", True, flag="no-quicklook", section="result")
+    quicklook: bool = opt("Write pictures.", True, flag="no-quicklook", section="result", off="Write no pictures.")
     dry_run: bool = DRY_RUN
     workers: int = ONE_WORKER
     memory: int | None = MEMORY

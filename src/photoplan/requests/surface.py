@@ -63,7 +63,8 @@ class SurfaceRequest(SurfaceSettings):
     report: Path | None = opt("Accuracy by classes, images and levels, with plots, HTML or PDF.", None, metavar="FILE",
                               writes=True)  # fmt: skip
     output: Path | None = opt("Folder of the files [products by the project].", None, folder=True, section="result")
-    quicklook: bool = opt("Write no picture of the surface.", True, flag="no-quicklook", section="result")
+    quicklook: bool = opt("Write a picture of the surface.", True, flag="no-quicklook", section="result",
+                          off="Write no picture of the surface.")  # fmt: skip
     force: bool = opt(
         "Continue although orientations have a FAULT, or the images contradict the surface.", False, section="run"
     )

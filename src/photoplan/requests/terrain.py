@@ -127,8 +127,8 @@ class SampleRequest(Request):
         section="input",
     )
     decimal_comma: bool = opt("Numbers of the table are written 1,5.", False, section="input")
-    header: bool = opt("The first line is a point; columns are numbers, X and Y are 1 and 2.", True, flag="no-header",
-                       section="input")  # fmt: skip
+    header: bool = opt("The first line names the columns.", True, flag="no-header", section="input",
+                       off="The first line is a point; columns are numbers, X and Y are 1 and 2.")  # fmt: skip
     names: tuple[str, str] = opt("Names of the new columns.", ("height", "sigma"), metavar="HEIGHT SIGMA",
                                  section="result")  # fmt: skip
     digits: int = opt("Decimals of the heights.", 4, ge=0, le=9, section="result")

@@ -252,15 +252,16 @@ def load_project(path: str | Path) -> Project:
     return parse_project(_with_sizes(data, folder), folder, str(path), text)
 
 
-def stated_defaults(path: str | Path, verb: str) -> tuple[str, dict[str, Any]]:
-    """Return where a project file states options of a command, and these; of a file with faults none."""
+def stated_defaults(path: Path) -> tuple[Path, dict[str, dict[str, Any]]]:
+    """Return the folder of a project file, and the options that it states by command; of a file with faults none."""
+    if (path / "project.toml").is_file():
+        path = path / "project.toml"
     try:
-        data, _ = read_toml(Path(path))
+        tables = read_toml(path)[0].get("defaults")
     except InputError:
-        return "", {}
-    tables = data.get("defaults")
-    values = tables.get(verb) if isinstance(tables, dict) else None
-    return f"{path}: [defaults.{verb}]", values if isinstance(values, dict) else {}
+        tables = None
+    found = tables if isinstance(tables, dict) else {}
+    return path.resolve().parent, {verb: dict(each) for verb, each in found.items() if isinstance(each, dict)}
 
 
 def _with_sizes(data: dict[str, Any], folder: Path) -> dict[str, Any]:
