@@ -146,99 +146,131 @@ def load(place: str) -> Any:
 
 
 def command(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
-    """Run the operation of a verb, draw what is drawn, and print the result."""
-    from photoplan.cli.telling import Telling
-    from photoplan.findings import Result
+    """Run the operation of a verb, draw its pictures and reports, and print the result."""
     from photoplan.io.store import recording, together
-    from photoplan.request import how_of
 
-    dry_run = getattr(request, "dry_run", False)
-    talk, shown = talking(quiet), set[object]()
-
-    def once(line: str) -> None:
-        if line not in shown:
-            events.talk(line)
-        shown.add(line)
-
-    def draw(part: object) -> None:
-        for line in load(verb.each)(part, request, lambda wanted: can_draw(wanted, once)) if verb.each else ():
-            once(line)
-
-    def announced(part: object) -> None:
-        """Print files and messages of a part of the result that is complete; a group gets its names at the end."""
-        if isinstance(part, Result):
-            for path in () if grouped else part.written():
-                if not as_json and path not in shown:
-                    show(path)
-                shown.add(path)
-            for line in part.messages():
-                once(line)
-            draw(part)
-
-    drawn = {
-        path: key
-        for name, paths in request.files_written().items()
-        for path in paths
-        for key in (name, name + path.suffix.lower(), f"{name}/")
-        if key in verb.draw
-    } | {
-        path: key
-        for key, path in request.drawn.items()
-        if dry_run or getattr(request, key, True) is not None or can_draw(True, talk, key)
-    }
-    picture = next((name for name in verb.draw if getattr(request, name, None) is True), None)
-    if picture and not dry_run and can_draw(True, talk):
-        drawn[request.product.with_suffix(".png")] = picture
-    drawing = not dry_run or how_of(type(request).model_fields["dry_run"]).get("draws")
-    opened = {path: _opened(path, key, request) for path, key in drawn.items()} if drawing else {}
-    recorded = recording(verb.record, request, request.files_read()) if verb.record and not dry_run else nullcontext()
+    drawn = _drawn(verb, request, talking(quiet))
+    opened = {path: _opened(path, key, request) for path, key in drawn.items()}
+    recorded = verb.record and not getattr(request, "dry_run", False)
     grouped = bool(opened) and not verb.one_by_one
-    with recorded as record, together() if grouped else nullcontext():
-        with Telling(quiet, announced) as events:
+    with (
+        recording(verb.record, request, request.files_read()) if recorded else nullcontext() as record,
+        together() if grouped else nullcontext(),
+    ):
+        run = _Run(verb, request, quiet, files_at_once=not (grouped or as_json))
+        with run.events as events:
             result = load(verb.make)(request, events)
             if all(part is not result for part in events.results):
-                draw(result)
+                run.draw(result)
         made: list[Path] = []
         for path, file in opened.items():
             made += file.draw(load(verb.draw[drawn[path]]), result) if file is not None else []
-        options = type(request).model_fields
-        first = [path for key, path in request.drawn.items() if path in made and key not in options]
+        first = [path for key, path in request.drawn.items() if path in made and key not in type(request).model_fields]
         files = [*first, *result.written(), *(path for path in made if path not in first)]
         if record is not None:
             record(files, result)
     if verb.figures_first:
         order = [path for paths in request.files_written().values() for path in paths]
         files.sort(key=lambda path: order.index(path) if path in order else len(order))
-    if as_json and verb.files:
-        show_json(result, **{verb.files: files})
-    elif as_json:
-        more: dict[str, Any] = {
-            name: path if path in made else None
-            for name, entry in options.items()
-            if name in verb.draw and entry.annotation is not bool
-            for path in [request.drawn.get(name, getattr(request, name))]
-        }
-        if set(request.drawn) - set(options):
-            more["files"] = files
-        if picture:
-            more["picture"] = next((path for path in made if path not in more.values()), None)
-        show_json(result, **more)
+    if as_json:
+        show_json(result, **({verb.files: files} if verb.files else _drawn_keys(verb, request, made, files)))
     else:
         # A project that was changed is recorded, and no product.
-        read = request.files_read()
-        rest = [file for file in files if file not in read and file not in shown]
+        rest = [file for file in files if file not in request.files_read() and file not in run.shown]
         for line in (*result.summary(), *rest) if verb.figures_first else (*rest, *result.summary()):
             show(line)
     for remark in result.remarks():
         say(remark)
     for message in result.messages():
-        if message not in shown and (not as_json or message.startswith(("note:", "warning:"))):
-            talk(message)
+        if not as_json or message.startswith(("note:", "warning:")):
+            run.once(message)
     result.raise_failures()
 
 
+class _Run:
+    """Printer of files and messages of a run: of each part of the result as soon as it is complete, and once each."""
+
+    def __init__(self, verb: Verb, request: Any, quiet: bool, files_at_once: bool) -> None:
+        from photoplan.cli.telling import Telling
+
+        self._verb, self._request, self._files_at_once = verb, request, files_at_once
+        self.events = Telling(quiet, self._announced)
+        self.shown: set[object] = set()
+        """Files and messages that were printed."""
+
+    def once(self, message: str) -> None:
+        """Print a message, unless it was printed before."""
+        if message not in self.shown:
+            self.events.talk(message)
+        self.shown.add(message)
+
+    def draw(self, part: object) -> None:
+        """Draw a part of the result, if the verb draws parts, and print the messages of the drawing."""
+        if self._verb.each:
+            for line in load(self._verb.each)(part, self._request, lambda wanted: can_draw(wanted, self.once)):
+                self.once(line)
+
+    def _announced(self, part: object) -> None:
+        from photoplan.findings import Result
+
+        if isinstance(part, Result):
+            for path in part.written() if self._files_at_once else ():
+                if path not in self.shown:
+                    show(path)
+                self.shown.add(path)
+            for line in part.messages():
+                self.once(line)
+            self.draw(part)
+
+
+def _drawn(verb: Verb, request: Any, talk: Callable[[str], None]) -> dict[Path, str]:
+    """Return the pictures and reports to be drawn, each with its key in `Verb.draw`.
+
+    They are files that options name, files whose places follow from other options (`Request.drawn`), and the picture
+    beside the product. The last two are left out with a message if matplotlib is missing.
+    """
+    from photoplan.request import how_of
+
+    dry_run = getattr(request, "dry_run", False)
+    if dry_run and not how_of(type(request).model_fields["dry_run"]).get("draws"):
+        return {}
+    found: dict[Path, str] = {}
+    for name, paths in request.files_written().items():
+        for path in paths:
+            for key in (name, name + path.suffix.lower(), f"{name}/"):
+                if key in verb.draw:
+                    found[path] = key
+    for key, path in request.drawn.items():
+        if dry_run or getattr(request, key, True) is not None or can_draw(True, talk, key):
+            found[path] = key
+    picture = _picture_beside(verb, request)
+    if picture and not dry_run and can_draw(True, talk):
+        found[request.product.with_suffix(".png")] = picture
+    return found
+
+
+def _picture_beside(verb: Verb, request: Any) -> str | None:
+    """Return the option that asks for a picture beside the product, without naming it."""
+    return next((name for name in verb.draw if getattr(request, name, None) is True), None)
+
+
+def _drawn_keys(verb: Verb, request: Any, made: list[Path], files: list[Path]) -> dict[str, Any]:
+    """Return the keys of the JSON that name what was drawn, None for a drawing that was not made."""
+    options = type(request).model_fields
+    keys: dict[str, Any] = {}
+    for name in options:
+        if name in verb.draw and options[name].annotation is not bool:
+            path = request.drawn.get(name, getattr(request, name))
+            keys[name] = path if path in made else None
+    if set(request.drawn) - set(options):
+        keys["files"] = files
+    if _picture_beside(verb, request):
+        keys["picture"] = next((path for path in made if path not in keys.values()), None)
+    return keys
+
+
 def _opened(path: Path, key: str, request: Any) -> ReportFile | None:
-    """Return a picture, a report or a folder of pictures to be, checked before any work."""
+    """Return a picture, a report or a folder of pictures that can be written; its place is checked before any work."""
     from photoplan.report.drawing import load_matplotlib
     from photoplan.report.page import ReportFile, open_picture, open_report
 
