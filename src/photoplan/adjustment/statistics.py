@@ -57,7 +57,7 @@ class Components:
     """Variances of the parts of a covariance matrix, where they are most likely."""
 
     variances: _Floats
-    """Of each part, (k,), what it is multiplied with."""
+    """Factor of each part of the matrix, (k,)."""
     deviance: float
     """−2 times the logarithm of the likelihood, without its constant: differences between models of the same data
     count."""

@@ -250,7 +250,7 @@ class WarpedCamera:
         return p
 
     def _start(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where the rays would meet the heights over a sphere of the given curvature."""
+        """Return where the rays would meet the heights over a sphere of the given curvature."""
         nadir = np.column_stack([np.broadcast_to(self.center[:2], (len(v), 2)), heights])
         d = solve3(self._warp_with_jacobian(nadir)[1], v)
         above = self.center[2] - heights
@@ -313,7 +313,7 @@ def _slopes(z: float) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class Refraction:
-    """Where a point of the ground seems to be, seen from a camera through the standard atmosphere.
+    """Apparent place of a ground point, seen from a camera through the standard atmosphere.
 
     In horizontal layers of air (Snell) a ray that arrives at height H under the angle α from the nadir left the ground
     at h under the chord α − K tan α, with K = ∫ (n − n_H) dz / (H − h) from h to H. For the standard atmosphere
@@ -349,7 +349,7 @@ class Refraction:
         return J
 
     def inverse(self, displaced: ArrayLike) -> NDArray[np.float64]:
-        """Where displaced points (..., 3) are; NaN where there is no such point."""
+        """Return the true places of displaced points (..., 3); NaN if there is no such point."""
         return inverse_by_newton(self, displaced)
 
     def _rise(self, h: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -90,7 +90,7 @@ _Map = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def upright(J: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Where a lens's derivative (..., 2, 2) neither mirrors nor turns round; False for NaN.
+    """Return whether a lens's derivative (..., 2, 2) neither mirrors nor turns round; False for NaN.
 
     On the axis it is close to the unit matrix; on its way to a fold the determinant vanishes, and beyond the fold at
     least one of determinant and trace is negative.
@@ -370,7 +370,8 @@ class FieldLimited:
         return total / (12.0 * h)
 
     def _start(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where Newton's search begins for real points (n, 2): the straight continuation seen from the axis."""
+        """Return initial values of Newton's search for real points (n, 2): the straight continuation seen from the
+        axis."""
         rd = np.hypot(t[:, 0], t[:, 1])
         edge = self.radius * t / rd[:, None]
         image = self.lens.distort(edge)
@@ -421,7 +422,7 @@ def _farthest(lens: Lens, real: NDArray[np.float64]) -> float:
 
 
 def _is_endless(lens: Lens) -> bool:
-    """Whether the lens maps all tangents into a bounded circle without folding (fisheye)."""
+    """Return whether the lens maps all tangents into a bounded circle without folding (fisheye)."""
     far = np.array([[1e6, 0.0], [0.0, 1e6], [-1e7, 0.0]])
     with np.errstate(all="ignore"):
         image = lens.distort(far)

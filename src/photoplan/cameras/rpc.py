@@ -46,7 +46,7 @@ _SCALED, _ALIKE, _SAME, _BEGINS, _LITTLE = 0.01, 0.04, 0.05, 0.02, 1.1
 
 @dataclass(frozen=True)
 class SizeFit:
-    """How an image lies in the range of sample and line that rational polynomials state."""
+    """Place of an image in the range of sample and line that rational polynomials state."""
 
     kind: Literal["whole", "scaled", "part", "corner", "beyond", "outside", "unknown"]
     """``scaled``: it has the shape of the range and begins with it, but has another size. ``corner``: it begins with
@@ -71,7 +71,7 @@ class RationalFunctions:
     """Sample and line offset, pixels; (0, 0) is the centre of the upper-left pixel."""
     image_scale: tuple[float, float]
     ground_offset: tuple[float, float, float]
-    """Of longitude and latitude (degrees, WGS 84) and ellipsoidal height (metres)."""
+    """Offsets of longitude and latitude (degrees, WGS 84) and ellipsoidal height (metres)."""
     ground_scale: tuple[float, float, float]
     coefficients: NDArray[np.float64]
     """Numerator and denominator of the sample, then of the line, shape (4, 20)."""
@@ -156,7 +156,7 @@ class RationalFunctions:
         return float(np.nan_to_num(away[known], nan=np.inf).max(initial=0.0))
 
     def fit(self, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> SizeFit:
-        """How an image of a size lies in the range of sample and line that the offsets and scales state."""
+        """Return how an image of a size lies in the range of sample and line that the offsets and scales state."""
         centre = np.array(
             [self.coefficients[0, 0] / self.coefficients[1, 0], self.coefficients[2, 0] / self.coefficients[3, 0]]
         )
@@ -183,7 +183,7 @@ class RationalFunctions:
 
     @cached_property
     def _shares(self) -> NDArray[np.bool_]:
-        """Whether numerator and denominator, of sample and line (2,), vanish together inside the box.
+        """Return whether numerator and denominator, of sample and line (2,), vanish together inside the box.
 
         Polynomials that were fitted without restraint can share a factor: it changes its sign, and positions go
         straight on behind, as they never do behind a pole.
@@ -306,7 +306,7 @@ class RpcCamera:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how the polynomials fit the image, a sentence each."""
+        """Return remarks on how the polynomials fit the image, a sentence each."""
         shift = (0.0, 0.0) if self.correction is None else (self.correction.a3, self.correction.a6)
         fit = self.functions.fit(self.size, shift)
         size = f"{self.size[0]} × {self.size[1]} pixels, and its polynomials hold for {fit.whole[0]} × {fit.whole[1]}"
@@ -430,7 +430,7 @@ class FittedRpc:
 
     functions: RationalFunctions
     rms: tuple[float, float]
-    """Of column and row, pixels."""
+    """Root mean squares of column and row, pixels."""
     worst: float
     """Largest distance, pixels."""
 

@@ -24,7 +24,7 @@ class LazyGroup(click.Group):
         super().__init__(*arguments, context_settings=_SETTINGS, **options)
         self.verbs = verbs
         self.words: Mapping[str, tuple[str, ...]] = {}
-        """What words in place of a verb stand for, see `VerbGroup.words`."""
+        """Commands that words in place of a verb stand for, see `VerbGroup.words`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse arguments; a word that is no verb may stand for one."""

@@ -1,4 +1,4 @@
-"""What verbs print: results on stdout, talk on stderr, and parameters under the names that the command line gives them.
+"""Results on stdout, messages on stderr, and parameters under the names that the command line gives them.
 
 The library names a parameter in backticks: ``give `overwrite` to replace it``. Here, and nowhere else, that becomes the
 option of the verb that runs: ``give --overwrite to replace it``. `` `report=False` `` becomes ``--no-report``.
@@ -65,7 +65,8 @@ def say(text: object) -> None:
 
 
 def is_doubt(text: str) -> bool:
-    """Whether a message says that a result is doubtful or that something was left out: `quiet` does not hide it."""
+    """Return whether a message says that a result is doubtful or that something was left out: `quiet` does not hide
+    it."""
     return _DOUBT.match(text) is not None
 
 
@@ -80,7 +81,7 @@ def talking(quiet: bool) -> Callable[[str], None]:
 
 
 def can_draw(wanted: bool, talk: Callable[[str], None], what: str = "picture") -> bool:
-    """Whether what is wanted can be drawn; `talk` says how, where matplotlib is missing."""
+    """Return whether what is wanted can be drawn; `talk` says how, where matplotlib is missing."""
     from photoplan.report.drawing import has_matplotlib
 
     if wanted and not has_matplotlib():

@@ -25,8 +25,8 @@ class VerbGroup:
     alone: bool = True
     """Its commands are called without the name of the group, too."""
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """What a word in place of a command stands for; the empty one is every other word, such as a file, and none at all
-    where the group explains itself (``-h``) by that command."""
+    """Commands that words in their place stand for. The empty word is every other word, such as a file, and no word at
+    all if the group explains itself (``-h``) by that command."""
 
 
 _PROJECT: dict[str, Verb] = {

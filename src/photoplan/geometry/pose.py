@@ -333,7 +333,7 @@ def between(times: _Floats, quaternions: _Floats, t: _Floats) -> _Floats:
 
 
 def odd_step(times: _Floats, places: _Floats) -> str | None:
-    """Where a track (n,), (n, 3) jumps as nothing does that flies: far more than its usual speed; None: nowhere.
+    """Return the place where a track (n,), (n, 3) jumps by far more than its usual speed allows; None if there is none.
 
     A number in another unit, a wrong sign or a lost digit in a single record is finite, and no other test sees it.
     """

@@ -1,4 +1,4 @@
-"""How GDAL is run: its settings, its warnings, and one open handle per thread."""
+"""GDAL's settings and warnings, and one open handle per thread."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from photoplan.errors import InputError
 CACHE_BYTES = 32 << 20
 """GDAL's block cache of the whole process; its default of a twentieth of the memory is not bounded enough."""
 GDAL_ERRORS = (RasterioError, CPLE_BaseError)
-"""What may come out of a call of rasterio: its own errors, and GDAL's where it does not translate them."""
+"""Errors that a call of rasterio may raise: its own, and GDAL's if it does not translate them."""
 FIXED_DATE = "2000-01-01T00:00:00.000Z"
 """The date of change in GeoPackages: with the time of writing two runs would not make equal files."""
 _HANDLES_PER_THREAD = 4
@@ -90,7 +90,7 @@ def damage_in(found: list[str]) -> str | None:
 
 
 def all_causes(error: BaseException) -> list[str]:
-    """What GDAL said about an error, the first cause first; one line each."""
+    """Return GDAL's messages about an error, the first cause first; one line each."""
     chain: list[BaseException] = [error]
     while chain[-1].__cause__ is not None:
         chain.append(chain[-1].__cause__)
@@ -98,7 +98,7 @@ def all_causes(error: BaseException) -> list[str]:
 
 
 def first_cause(error: BaseException) -> str:
-    """What GDAL said first about an error, in one line."""
+    """Return GDAL's first message about an error, in one line."""
     return all_causes(error)[0]
 
 

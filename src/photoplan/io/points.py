@@ -293,7 +293,7 @@ _UTM = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", re.I)
 
 @dataclass(frozen=True, eq=False)
 class GcpList:
-    """What such a file holds."""
+    """Content of a list of ground control points."""
 
     crs: str
     """Horizontal CRS of the ground points."""
@@ -403,7 +403,7 @@ def _names(rows: list[_Line]) -> list[str]:
 
 
 def is_gcp_list(path: Path) -> bool:
-    """Whether a text file begins with a CRS, as these files do and tables do not."""
+    """Return whether a text file begins with a CRS, as these files do and tables do not."""
     if path.suffix.lower() != ".txt":
         return False
     try:
@@ -453,7 +453,7 @@ class PositionTable:
     time: NDArray[np.float64]
     """Seconds; the running number of the line where the file states none."""
     notes: tuple[str, ...] = ()
-    """What was left out."""
+    """Remarks on rows that were left out."""
 
     def positions(self, sigma: tuple[float, float] | None = None) -> ObservedPositions:
         """The positions; those without a standard deviation get `sigma` (horizontal coordinates, height; metres)."""

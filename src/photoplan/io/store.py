@@ -1,4 +1,4 @@
-"""What survives a crash: staged outputs and their names, tile logs, kept results, run records."""
+"""Files that survive a crash: staged outputs and their names, tile logs, kept results, run records."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a payload stands in the file, and what its record says of it."""
+    """Place of a payload in the file, and the values of its record."""
 
     position: int
     """First byte of the payload; its figures stand before it."""
@@ -82,12 +82,12 @@ class _Place:
 
 
 def log_of(path: Path) -> Path:
-    """Where the finished tiles of a file that is being made are kept."""
+    """Return the log of the finished tiles of a file that is being made."""
     return path.with_name(f".{path.name}.tiles")
 
 
 def checksum_of(payload: bytes | memoryview, figures: Mapping[str, Any] | None) -> int:
-    """What a log keeps of a tile to know it again."""
+    """Return the checksum by which a log knows a tile again."""
     return zlib.crc32(payload, zlib.crc32(_text(figures)))
 
 
@@ -144,7 +144,7 @@ class TileLog:
         return place.position, place.length
 
     def checksum(self, index: int) -> int:
-        """Of a tile's payload and figures, see `checksum_of`."""
+        """Return the checksum of a tile's payload and figures, see `checksum_of`."""
         return self._places[index].checksum
 
     def notes(self, index: int) -> tuple[int, int]:
@@ -357,7 +357,7 @@ class RunMarker:
     def __init__(self, folder: Path, key: str) -> None:
         self._path = folder / f".photoplan-{sha256(key.encode()).hexdigest()[:16]}.run"
         self.interrupted = os.path.lexists(self._path)
-        """Whether an earlier run has died."""
+        """True if an earlier run has died."""
 
     def begin(self) -> None:
         """Say that the run is under way."""
@@ -378,14 +378,14 @@ class _Group:
     waiting: dict[Path, _Identity | None] = field(default_factory=dict)
     """By the name to come: what has this name now."""
     pending: dict[Path, Path] = field(default_factory=dict)
-    """Where they are till then."""
+    """Places of files that have no name yet."""
     unfinished: set[Path] = field(default_factory=set)
-    """Those whose names an earlier run gave before it died."""
+    """Files that got their names from an earlier run before it died."""
     then: list[Callable[[], object]] = field(default_factory=list)
     held: ExitStack = field(default_factory=ExitStack)
     """Locks of products, and working folders."""
     locks: set[Path] = field(default_factory=set)
-    """Those that it holds: a second attempt of the same run holds them already."""
+    """Locks that it holds: a second attempt of the same run holds them already."""
     folders: dict[Path, Path] = field(default_factory=dict)
 
     def take(self, part: Path, path: Path) -> None:
@@ -518,13 +518,13 @@ def when_named(action: Callable[[], object]) -> None:
 
 
 def standing(path: Path) -> Path:
-    """Where a finished file is now: it may wait for its name."""
+    """Return the present place of a finished file, which may wait for its name."""
     group = _GROUP.get()
     return path if group is None else group.pending.get(path, path)
 
 
 def is_unfinished(path: Path) -> bool:
-    """Whether a file is of a product whose run died before all its files had their names."""
+    """Return whether a file is of a product whose run died before all its files had their names."""
     files, identity = _noted(path)
     return bool(files) and identity is not None and identity == _identity(path) and _note(files[0]).exists()
 
@@ -554,7 +554,7 @@ def _note(path: Path) -> Path:
 
 
 def _identity(path: Path) -> _Identity | None:
-    """What a file keeps when it gets another name; None: there is none."""
+    """Return the properties that a file keeps when it gets another name; None if there is no file."""
     try:
         state = path.lstat()
     except OSError:
@@ -582,11 +582,11 @@ class Unfinished:
     path: Path
     log_path: Path
     what: str
-    """What the log holds, for messages: tiles."""
+    """Content of the log, for messages: tiles."""
     check: Callable[[], None]
     """Refuses a file that must not be replaced."""
     faults: tuple[type[BaseException], ...]
-    """What a library raises that cannot write."""
+    """Errors that a library raises if it cannot write."""
     _log: TileLog | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -666,7 +666,7 @@ class ResultLog:
 
     @staticmethod
     def place(product: Path) -> Path:
-        """Where that log is."""
+        """Return the place of that log."""
         return product.with_name(f".{product.name}.steps")
 
     def __enter__(self) -> ResultLog:
@@ -694,7 +694,7 @@ class ResultLog:
         return frozenset(index for index in self._open.finished if index < _FIRST_ARRAY)
 
     def index(self, name: object) -> int:
-        """Where the result of a name is kept: the name's digest, 63 bits."""
+        """Return the key of a kept result: the digest of its name, 63 bits."""
         return int.from_bytes(hashlib.blake2b(repr(name).encode(), digest_size=8).digest(), "big") >> 1
 
     def append(self, index: int, result: Any) -> None:
@@ -747,7 +747,7 @@ class KeptTiles:
     product. None: it is none of the product's tiles."""
 
     def told(self, log: TileLog) -> str:
-        """What a record keeps of the tiles in a log, as text."""
+        """Return what a record keeps of the tiles in a log, as text."""
         found = []
         for index in sorted(log.finished):
             key = self.key(index)
@@ -774,7 +774,7 @@ class KeptTiles:
             return
 
     def _recorded(self, name: str) -> Iterator[tuple[int, str, int, int, int, dict[str, Any]]]:
-        """What `told` said of a file; nothing if there is no such record."""
+        """Yield what `told` stated of a file; nothing if there is no such record."""
         try:
             text = json.loads(read_own(self.record))["tiles"][name]
             found = json.loads(zlib.decompressobj().decompress(base64.b64decode(text), _MOST))
@@ -821,7 +821,8 @@ _PACKAGES = ("photoplan", "numpy", "numba", "scipy", "rasterio", "pyproj", "pyog
 
 
 def recorded_result(product: Path, key: str, result: Callable[[dict[str, Any], Any], T | None]) -> T | None:
-    """What `result` makes of the entries product and settings of a product's record; None if it has no such key."""
+    """Return what `result` makes of the entries product and settings of a product's record; None if it has no such
+    key."""
     try:
         record = json.loads(read_own(record_path(product)))
         return result(record["product"], record["settings"]) if record["key"] == key else None
@@ -830,7 +831,7 @@ def recorded_result(product: Path, key: str, result: Callable[[dict[str, Any], A
 
 
 def record_path(product: Path) -> Path:
-    """Where the record of a product stands: `NAME.run.json` beside it."""
+    """Return the place of the record of a product: `NAME.run.json` next to it."""
     return product.with_name(f"{product.stem}.run.json")
 
 
@@ -849,7 +850,7 @@ def _read_record(path: Path) -> dict[str, Any] | None:
 
 
 def input_entry(path: Path | str, digest: str | None = None) -> dict[str, Any]:
-    """How a record names an input; its digest is sampled if it is not known."""
+    """Return the entry of an input in a record; its digest is sampled if it is not known."""
     return {"path": Path(path), "sampled_sha256": digest or fingerprint(path).digest, "size": Path(path).stat().st_size}
 
 
@@ -943,7 +944,8 @@ def _entry(each: Path | Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _of_another(path: Path, product: Path) -> bool:
-    """Whether a record belongs to another file of the same name but for its extension, such as a model and a raster."""
+    """Return whether a record belongs to another file of the same name but for its extension, such as a model and a
+    raster."""
     record = _read_record(path)
     other = product.name if record is None else record["file"]
     return other != product.name and product.with_name(str(other)).exists()
@@ -970,7 +972,7 @@ def _installed(name: str) -> str:
 
 @cache
 def jpeg_decoder() -> str:
-    """What GDAL decodes JPEG with, by the digest of a decoded picture, with its name where it is known."""
+    """Return GDAL's decoder of JPEG, by the digest of a decoded picture, with its name if it is known."""
     with not_georeferenced(), gdal_settings(), rasterio.MemoryFile(_PICTURE) as file, file.open() as picture:
         digest = hashlib.sha256(picture.read().tobytes()).hexdigest()[:12]
     return f"{_DECODERS.get(digest, 'another')} ({digest})"

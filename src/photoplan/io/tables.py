@@ -43,7 +43,7 @@ def decimal(text: str, decimal_comma: bool = False) -> float | None:
 
 
 def has_decimal_comma(text: str) -> bool:
-    """Whether a text is a number such as 1,5."""
+    """Return whether a text is a number such as 1,5."""
     return re.fullmatch(r"[-+]?\d+,\d+", text) is not None
 
 
@@ -141,7 +141,7 @@ _SNIFFED = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """What columns a kind of table has."""
+    """Columns of a kind of table."""
 
     roles: Mapping[str, Sequence[str]]
     """Header names, in small letters, of every role."""
@@ -152,21 +152,21 @@ class Columns:
     numbers: frozenset[str] = frozenset({"x", "y", "z", "sigma"})
     """Roles whose fields are numbers."""
     every: bool = False
-    """Whether the first line is a header whatever it says, and each of its names, in small letters, a role."""
+    """True if the first line is a header whatever it says, and each of its names, in small letters, a role."""
     untitled: bool = False
-    """Whether columns count in their order, the last of `orders`; a first line of words is passed over."""
+    """True if columns count in their order, the last of `orders`; a first line of words is passed over."""
     one_each: bool = False
-    """Whether a header with two names for one role is refused; else the first in the order of `roles` counts."""
+    """True if a header with two names for one role is refused; else the first in the order of `roles` counts."""
     row: str = "line with data"
-    """What a line is, for messages."""
+    """Name of a line in messages."""
     explain: Callable[[tuple[str, ...], str], str | None] = lambda first, why: None
-    """What to say of a first line that is no header, and of why it is none; None: nothing of its own."""
+    """Function that explains why a first line is no header; None if it adds nothing."""
 
 
 @storable
 @dataclass(frozen=True)
 class Dialect:
-    """What a table does not say of itself; checked at birth."""
+    """Properties that a table does not state itself; checked at birth."""
 
     columns: str | None = None
     """None: the header names the columns. ``"name=Label,x=East,…"``: roles and header names. ``"name,x,y,z,…"``: roles
@@ -174,7 +174,7 @@ class Dialect:
     delimiter: str | None = None
     """None: the one that splits all lines equally."""
     decimal_comma: bool = False
-    """Whether numbers are written 1,5 instead of 1.5."""
+    """True if numbers are written 1,5 instead of 1.5."""
 
     def __post_init__(self) -> None:
         if self.delimiter not in (None, *DELIMITERS):
@@ -185,7 +185,7 @@ class Dialect:
 
 @dataclass(frozen=True, kw_only=True)
 class TableLayout:
-    """What the columns of a file are."""
+    """Roles of the columns of a file."""
 
     delimiter: str
     roles: Mapping[str, int]
@@ -195,7 +195,7 @@ class TableLayout:
     header: int
     """Line of the header; 0: there is none."""
     by_order: bool = False
-    """Whether the roles are those of the format's own order."""
+    """True if the roles are those of the format's own order."""
 
     @property
     def width(self) -> int:
@@ -293,13 +293,13 @@ def read_table(path: Path, columns: Columns, dialect: Dialect = Dialect(), max_b
 
 
 def wrong_width(width: int, layout: TableLayout) -> str:
-    """What to say of a line with another number of fields."""
+    """Return the message for a line with another number of fields."""
     hint = "; is the decimal sign a comma? decimal commas need another delimiter" if layout.delimiter == "," else ""
     return f"{width} columns, the first line has {layout.width}{hint}"
 
 
 def find_layout(path: Path, lines: Sequence[Line], columns: Columns, dialect: Dialect = Dialect()) -> TableLayout:
-    """What the columns hold, from the first lines of a file; at least one of them holds data."""
+    """Return the roles of the columns, from the first lines of a file; at least one of them holds data."""
     data = [item for item in lines if not item[1].lstrip().startswith("#")][:_SNIFFED]
     line, delimiter = data[0][0], _delimiter(path, data, columns, dialect)
     first = split_line(path, data[0], delimiter)

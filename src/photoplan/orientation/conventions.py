@@ -40,19 +40,20 @@ class Reading:
     rotation: str = "opk"
     """Order of the angles, the first is the primary rotation."""
     direction: str = "camera-to-ground"
-    """What the matrix of the angles does."""
+    """Direction of the matrix of the angles."""
     camera_axes: str = "up-back"
     """Directions of the camera's y and z: up and towards the viewer, or down and forwards as in computer vision."""
     turned: int = 0
     """Angle by which the image is turned against the camera's axes, counter-clockwise, degrees."""
     mirrored: bool = False
-    """Whether left and right of the image are exchanged."""
+    """True if left and right of the image are exchanged."""
     swapped: bool = False
-    """Whether X and Y of the projection centres are exchanged."""
+    """True if X and Y of the projection centres are exchanged."""
 
     @property
     def changes(self) -> int:
-        """How much the reading differs from the usual one; of two that fit equally the simpler is listed first."""
+        """Return how much the reading differs from the usual one; of two that fit equally the simpler is listed
+        first."""
         return sum(getattr(self, name) != getattr(USUAL, name) for name in self.__dataclass_fields__)
 
 
@@ -370,7 +371,7 @@ DOWNWARD, MIDDLE_DOWNWARD = 0.01, 0.1
 
 @dataclass(frozen=True, eq=False)
 class JudgedView:
-    """What the check needs to know of an image."""
+    """Data of an image that the check requires."""
 
     name: str
     center: NDArray[np.float64]
@@ -386,7 +387,7 @@ class JudgedView:
     unit: str = "deg"
     """Unit of the angles in the project."""
     mirrored: bool = False
-    """Whether the camera is stated to be scanned through the back of its film."""
+    """True if the camera is stated to be scanned through the back of its film."""
 
     @property
     def R_ground_camera(self) -> NDArray[np.float64]:
@@ -396,7 +397,7 @@ class JudgedView:
 
 @dataclass(frozen=True)
 class ImagePlausibility:
-    """What follows from the orientation of one image."""
+    """Consequences of the orientation of one image."""
 
     name: str
     tilt: float
@@ -410,11 +411,11 @@ class ImagePlausibility:
     on_terrain: float
     """Share of the image that sees the terrain."""
     middle_on_terrain: bool
-    """Whether the middle of the image does; for a level photograph, whether any part shows terrain or an object."""
+    """True if the middle of the image does; for a level photograph, whether any part shows terrain or an object."""
     fault: str | None
-    """What cannot be right; None if the image is plausible."""
+    """Reason why the orientation cannot be right; None if the image is plausible."""
     level: bool = False
-    """Whether the image shows the horizon, and its middle lies near or above it: much of it cannot show terrain."""
+    """True if the image shows the horizon, and its middle lies near or above it: much of it cannot show terrain."""
 
 
 def look(view: JudgedView, heights: Heights, objects: NDArray[np.float64] | None = None) -> ImagePlausibility:
@@ -558,7 +559,7 @@ def other_reading(views: Sequence[JudgedView], images: Sequence[ImagePlausibilit
 def _seen(
     views: list[JudgedView], reading: OtherReading, heights: Heights, most: int
 ) -> list[ImagePlausibility] | None:
-    """What images show by a reading; None as soon as `_Evidence.better_than` is out of reach.
+    """Return what images show by a reading; None as soon as `_Evidence.better_than` is out of reach.
 
     That is where one has a fault, or more than `most` of them look beside the terrain.
     """
@@ -572,7 +573,7 @@ def _seen(
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What a reading makes of a sample of images."""
+    """Evidence of a sample of images for a reading."""
 
     faults: int
     middles: float
@@ -581,7 +582,7 @@ class _Evidence:
     median_tilt: float
     steepest: float
     alike: float
-    """How alike the image axes lie to the flight lines in all images, 0 to 1."""
+    """Agreement of the angles between image axes and flight lines in all images, 0 to 1."""
     offset: float
     """Mean angle between image axes and flight lines, degrees, modulo 90."""
     largest: float
@@ -621,7 +622,8 @@ class _Evidence:
         return bool(self.faults) or self.middles < 0.8 or self.tilted or self.astray
 
     def better_than(self, declared: _Evidence, reading: OtherReading) -> bool:
-        """Whether this reading removes what is wrong with the declared one; what only looks different is not better."""
+        """Return whether this reading removes what is wrong with the declared one; what only looks different is not
+        better."""
         if self.faults or self.middles < declared.middles:
             return False
         # The terrain may end inside the block, so it is the gain that counts, not a share.
@@ -640,7 +642,7 @@ class _Evidence:
 
 
 def _possible(reading: OtherReading, largest: float) -> bool:
-    """Whether the largest declared angle, in parts of a full circle, can be what the reading takes it for."""
+    """Return whether the largest declared angle, in parts of a full circle, can be what the reading takes it for."""
     if reading.unit == "rad":
         return largest * ANGLE_UNITS[reading.declared] < ANGLE_UNITS["rad"]
     if reading.unit is None or reading.declared != "rad":
@@ -658,7 +660,8 @@ def _sample(views: list[JudgedView], images: tuple[ImagePlausibility, ...]) -> l
 
 
 def _alignment(views: list[JudgedView], reading: OtherReading) -> tuple[float, float]:
-    """How the image axes lie to the flight lines: how alike in all images (0 to 1), and the mean difference (degrees).
+    """Return how image axes lie to the flight lines: their agreement in all images (0 to 1), and the mean difference
+    (degrees).
 
     The line through an image and its nearest neighbour is along or across a strip, so angles count modulo 90°.
     """
@@ -678,7 +681,8 @@ def _alignment(views: list[JudgedView], reading: OtherReading) -> tuple[float, f
 def _sentence(
     what: str, seen: tuple[list[ImagePlausibility], list[ImagePlausibility]], lines: tuple[tuple[float, float], ...]
 ) -> str:
-    """What would have to be declared, and what is better then: tilts, middles on the terrain, axes and flight lines."""
+    """Return what would have to be declared, and what is better then: tilts, middles on the terrain, axes and flight
+    lines."""
 
     def tilts(images: list[ImagePlausibility]) -> str:
         low, high = min(i.tilt for i in images), max(i.tilt for i in images)

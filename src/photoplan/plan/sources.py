@@ -1,4 +1,4 @@
-"""Which image paints a pixel of a mosaic: visibility, score, seams and feathering."""
+"""Source image of each pixel of a mosaic: visibility, score, seams and feathering."""
 
 from __future__ import annotations
 
@@ -172,7 +172,8 @@ class _OverTerrain:
         return found
 
     def _met(self, uvh: NDArray[np.float64], top: float, short: float) -> NDArray[np.bool_]:
-        """Whether terrain is met on the way down from the source to places (n, 3), more than `short` metres before."""
+        """Return whether terrain is met on the way down from the source to places (n, 3), more than `short` metres
+        before."""
         lines = sight_lines(self.projection, self.target, uvh)
         with np.errstate(divide="ignore"):
             rise = np.where(lines.step[:, 2] > 0, (top - uvh[:, 2]) / lines.step[:, 2], np.inf)
@@ -251,7 +252,7 @@ def _places(window: Window, relief: NDArray[np.float32], pixels: NDArray[np.int6
 
 @dataclass(frozen=True, eq=False)
 class Share:
-    """Who paints the pixels of a tile."""
+    """Source images of the pixels of a tile."""
 
     owner: NDArray[np.uint16] | None
     """Row of the table of sources, plus one, for every pixel, shape (height, width); 0: no source. None: there is one
@@ -270,7 +271,7 @@ class Ownership(Protocol):
     """
 
     def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
-        """Who paints each pixel of a tile."""
+        """Return the source image of each pixel of a tile."""
         ...
 
 
@@ -299,7 +300,7 @@ class InSight:
     """One source, and a look at which pixels it sees."""
 
     paints_hidden: bool = False
-    """Whether it paints those too that something hides, with what hides them."""
+    """True if it paints those too that something hides, with what hides them."""
 
     def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
         """The only source paints what it sees, or all."""
@@ -337,7 +338,7 @@ class Drawn(Protocol):
         ...
 
     def digest(self, margin: float) -> str:
-        """Of what lies in the product and `margin` metres around it."""
+        """Return the digest of what lies in the product and `margin` metres around it."""
         ...
 
 
@@ -353,7 +354,7 @@ class BestImage:
     drawn: Drawn | None = None
     """Regions that come before the score, where their image sees them."""
     paints_hidden: bool = False
-    """Whether ground that none of its images sees is painted with what hides it."""
+    """True if ground that none of its images sees is painted with what hides it."""
 
     def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
         """The least penalty of those that see a pixel; visibility is asked only of images that come first somewhere.
@@ -531,9 +532,9 @@ class Feather:
     """Weights of images along seams."""
 
     width: int
-    """Of the strip in which images pass into each other, pixels."""
+    """Width of the strip in which images pass into each other, pixels."""
     bands: bool = False
-    """Whether finer detail passes in narrower strips: each half as wide as the next."""
+    """True if finer detail passes in narrower strips: each half as wide as the next."""
 
     @property
     def reach(self) -> int:

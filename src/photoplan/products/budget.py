@@ -76,7 +76,7 @@ class SourceTables(Result):
     tilt: float
     """Admissible error of ω and φ in the worked example of §4.8.2.2, gon."""
     kappa: float
-    """Of κ, gon."""
+    """Standard deviation of κ, gon."""
     images: dict[str, tuple[float, ...]]
     """§8.2.2: displacement in the image corner by X0, Y0, Z0, ω, φ, κ of two images, µm."""
 
@@ -145,7 +145,7 @@ class ImagePolynomials:
     image: str
     file: Path
     rms: tuple[float, float]
-    """Of column and row, pixels."""
+    """Root mean squares of column and row, pixels."""
     worst: float
     """Pixels."""
     heights: tuple[float, float]
@@ -264,7 +264,7 @@ class ImageBudget:
     parts: dict[str, NDArray[np.float64]]
     """Contribution of every cause at `PLACES`."""
     total: NDArray[np.float64]
-    """Of all, at `PLACES`."""
+    """Total of all causes, at `PLACES`."""
     map: NDArray[np.float64]
     """The total over the image, rows downwards."""
 

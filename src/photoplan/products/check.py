@@ -64,9 +64,9 @@ class ImageCheck:
     curvature_px: float
     """Largest displacement by the earth's curvature if it were ignored, pixels (Ecker 1991, eq. 4.17)."""
     fault: str | None
-    """What cannot be right; None if the image is plausible."""
+    """Reason why the orientation cannot be right; None if the image is plausible."""
     notes: tuple[str, ...]
-    """What a user should know of the file."""
+    """Remarks on the file."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class ProjectCheck(Result):
     alternative: str | None
     """The reading of the orientation that would fit, where the declared one does not; None otherwise."""
     angles: bool
-    """Whether any image with a fault is oriented by angles, which might be read in another way."""
+    """True if any image with a fault is oriented by angles, which might be read in another way."""
     advice: tuple[str, ...]
     """Sentences that tell what would be better."""
     left_out: tuple[str, ...] = ()
@@ -99,7 +99,7 @@ class ProjectCheck(Result):
 
     @property
     def remedy(self) -> str:
-        """What may help where images have faults."""
+        """Return what may help if images have faults."""
         if self.angles:
             return self.alternative or "no other reading of the angles fits; look at heights, axes and image names"
         return self.alternative or "look at heights, the CRS, and whether geometry and image belong together"

@@ -74,7 +74,7 @@ class ConvertReport(Result):
     cameras: tuple[str, ...]
     crs: str | None
     notes: tuple[str, ...]
-    """How the file was read."""
+    """Remarks on how the file was read."""
     lost: tuple[Loss, ...]
     """Losses: what the target format cannot hold."""
     dry_run: bool
@@ -288,7 +288,7 @@ class ReadingsReport(Result):
     points: int
     images: int
     matrices: bool
-    """Whether the file states matrices, so that units and orders have no meaning."""
+    """True if the file states matrices, so that units and orders have no meaning."""
     fitting: tuple[FittedReading, ...]
     others: tuple[FittedReading, ...]
     """The next ones, for comparison."""

@@ -68,14 +68,14 @@ class ImageFiducials:
     camera: str
     size: tuple[int, int]
     grey: str
-    """Which grey values were used."""
+    """Grey values that were used."""
     band: int | None
     """Band that was used; None: luminance."""
     layout: MarkLayout
-    """What was sought."""
+    """Layout of the marks that were sought."""
     found: FiducialResult
     picture: Path | None
-    """Where it is drawn."""
+    """File of its picture."""
 
     def json_fields(self) -> dict[str, Any]:
         """Every mark, and the affine transformation."""
@@ -135,7 +135,7 @@ class UnfoundFiducials:
     layout: MarkLayout
     sought: tuple[SoughtMark, ...]
     picture: Path | None
-    """Where it is drawn."""
+    """File of its picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -540,7 +540,7 @@ class ResectResult(Result):
     left_out: tuple[str, ...]
     """Images with fewer than three control points."""
     changed: bool
-    """Whether orientations were written into the project."""
+    """True if orientations were written into the project."""
     notes: tuple[str, ...]
 
     def json_fields(self) -> dict[str, Any]:
@@ -662,7 +662,7 @@ class ResectedImage:
     angles: Array
     """(3,), in the unit and order of the project."""
     covariance: Array
-    """Of centre, angles and the parameters of the camera that were unknowns, (6 + k, 6 + k)."""
+    """Covariances of centre, angles and the parameters of the camera that were unknowns, (6 + k, 6 + k)."""
     angle_names: tuple[str, ...]
     """ω, φ, κ in the order of the angles."""
     angle_unit: str

@@ -42,20 +42,20 @@ _MOST = 30_000
 
 @dataclass(frozen=True, eq=False)
 class IlluminationReport(Result):
-    """What was found and made."""
+    """Result of a correction of illumination."""
 
     path: Path | None
     """None after a dry run."""
     model: LightModel
     sample: LitGround
-    """Of the pixels that parameters are estimated from, (n,)."""
+    """Pixels that parameters are estimated from, (n,)."""
     before: NDArray[np.float64]
     """Their grey values, (bands, n)."""
     after: NDArray[np.float64]
 
     @property
     def correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Of the grey values of lit pixels with cos i, before and after, by band."""
+        """Return the correlations of the grey values of lit pixels with cos i, before and after, by band."""
         lit = self.sample.lit
         each = [[np.corrcoef(band[lit], self.sample.cos_i[lit])[0, 1] for band in values] for values in self._both]
         return np.array(each[0]), np.array(each[1])
@@ -98,7 +98,7 @@ class _Place:
     light: Lighting
 
     def ground(self, window: Window) -> LitGround:
-        """What the terrain is like in a window of the picture."""
+        """Return slopes and light of the terrain in a window of the picture."""
         surface, sun = self.terrain.surface, directions(self.light)[0]
         slopes = even_slopes(surface, self.grid, window)
         tile = TileGround.of(MapTarget(self.grid), window, slopes.heights)

@@ -329,7 +329,7 @@ class OwnGeometry:
     place: tuple[float, float]
     """Latitude and longitude in the middle of what the polynomials hold for, degrees."""
     fault: str | None
-    """What is wrong with the size of the image, so that products are refused; None: nothing is."""
+    """Reason why the size of the image is wrong, so that products are refused; None if it is right."""
 
 
 def project_names(files: Sequence[Path]) -> dict[Path, str]:
@@ -375,7 +375,7 @@ class InitResult(Result):
     without_image: tuple[str, ...]
     """Names of the orientation that no image file has; they are left out."""
     unusable: tuple[str, ...] = ()
-    """Why files could not be opened; they are left out."""
+    """Reason why files could not be opened; they are left out."""
 
     def json_fields(self) -> dict[str, Any]:
         """Images and systems of the project, and what is left out."""

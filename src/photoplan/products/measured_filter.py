@@ -294,7 +294,7 @@ def _windows(size: tuple[int, int]) -> list[Window]:
 
 
 def _where(part: DesignedPart, parts: Sequence[DesignedPart]) -> str:
-    """Which of several parts is spoken of, and how many are restored how; empty for a single one."""
+    """Return which of several parts is meant, and how many are restored how; empty for a single one."""
     if len(parts) == 1:
         return ""
     methods = [one.design.method for one in parts]

@@ -42,14 +42,14 @@ COLUMNS = ("X", "Y", "Z", "sigma_X", "sigma_Y", "sigma_Z", "angle_deg", "reason"
 
 @dataclass(frozen=True)
 class MonoplotReport(Result):
-    """What came out."""
+    """Result of monoplotting."""
 
     output: Path
     vectors: Path | None
     points: int
     met: int
     reasons: dict[str, int]
-    """How many points have no ground point, by reason."""
+    """Numbers of points without ground point, by reason."""
     grazing: int
     through_holes: int
     median_sigma: tuple[float, float, float] | None
@@ -86,7 +86,7 @@ class _Given:
     line: NDArray[np.int64] | None
     """Number of the line that each point belongs to; None: single points."""
     names: tuple[str, ...]
-    """Of points, or of lines."""
+    """Names of points, or of lines."""
 
 
 def monoplot_file(request: MonoplotRequest, events: Events = SILENT) -> MonoplotReport:
@@ -228,7 +228,7 @@ def _text(value: float, digits: int) -> str:
 
 
 def _remark(found: MonoplotPoints, i: int) -> str:
-    """Why there is no point, or what is to be said about it."""
+    """Return why there is no point, or what is to be said about it."""
     if found.reasons[i]:
         return REASONS[str(found.reasons[i])]
     said = ["grazing"] if found.angle[i] < GRAZING else []

@@ -89,7 +89,7 @@ def _object_triangles(ground: Ground) -> _Floats | None:
 
 
 def _without_pose(project: Project, name: str, ground: Ground) -> ImagePlausibility:
-    """What follows for an image whose rays meet nowhere."""
+    """Return the result for an image whose rays meet nowhere."""
     camera = camera_without_pixels(project, name)
     place = camera.vantage.point
     seen = footprint(camera, ground.bare, ground.bounds)
@@ -173,7 +173,7 @@ def on_map(geodetic: _Floats, crs: str) -> _Floats:
 
 
 def position_fault(project: Project, image: Image) -> str | None:
-    """Why an orientation cannot be that of the image file; None if it can, or the file states no position."""
+    """Return why an orientation cannot be that of the image file; None if it can, or the file states no position."""
     if image.center is None:
         return None
     stated = on_map(geodetic_positions([project.resolve(image.file)]), project.crs)

@@ -58,11 +58,11 @@ class RegisterFigures:
     """Patches by what became of them, see `photoplan.matching.register.STATES`."""
     median: tuple[float, float]
     rms: tuple[float, float]
-    """Of dx and of dy."""
+    """Root mean squares of dx and of dy."""
     spread: tuple[float, float]
     """Standard deviation of dx and of dy about their means."""
     percentiles: dict[str, float]
-    """Of the vectors' lengths."""
+    """Percentiles of the vectors' lengths."""
     largest: float
     """Longest vector."""
     quarter: float
@@ -125,7 +125,7 @@ class Pair:
     common: Window
     """Pixels of the first image that may have a partner."""
     place: Placement | None
-    """Of the first image; None: compared pixel by pixel."""
+    """Placement of the first image; None if they are compared pixel by pixel."""
     crs: str | None
     notes: tuple[str, ...]
 
@@ -224,7 +224,7 @@ class PatchGrid:
 
 @dataclass(frozen=True, eq=False)
 class RegisterReport(Result):
-    """What was found."""
+    """Result of a comparison of two images."""
 
     output: Path | None
     """None after a dry run."""
@@ -238,11 +238,11 @@ class RegisterReport(Result):
     model: SmoothModel | None
     found: PatchDisplacements | None
     advice: str = ""
-    """What helps, if few patches were found."""
+    """Advice, if few patches were found."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What there is to say of the images, and of what was found."""
+        """Return remarks on the images, and on what was found."""
         return (*self.pair.notes, *([self.advice] if self.advice else []))
 
     def json_fields(self) -> dict[str, Any]:
@@ -410,14 +410,14 @@ def _together(
 
 
 def _nothing(found: PatchDisplacements, request: RegisterRequest) -> str:
-    """Why there is no vector."""
+    """Return why there is no vector."""
     counts = np.bincount(found.state, minlength=len(STATES))
     listed = ", ".join(f"{count} {name}" for name, count in zip(STATES, counts.tolist()) if count)
     return f"no patch of {request.first} was found in {request.second}: {listed}; {_advice(counts, request)}"
 
 
 def _few(found: PatchDisplacements, request: RegisterRequest) -> str:
-    """What helps if of the patches with pixels and texture few were found; empty if there were more."""
+    """Return what helps if few of the patches with pixels and texture were found; empty if there were more."""
     counts = np.bincount(found.state, minlength=len(STATES))
     counts[[MISSING, TEXTURELESS]] = 0
     if counts[FOUND] >= _FEW * counts.sum():
@@ -431,7 +431,7 @@ def _worst(counts: NDArray[np.int64]) -> str:
 
 
 def _advice(counts: NDArray[np.int64], request: RegisterRequest) -> str:
-    """What helps against what befell most patches."""
+    """Return what helps against the most frequent reason."""
     return {
         "missing": "the images have hardly a valid pixel in common; look at their nodata",
         "textureless": f"give a larger `radius` or `sigma`; they are {request.radius} and {request.sigma:g} px",

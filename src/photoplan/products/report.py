@@ -152,7 +152,7 @@ class RunRecord:
     """Centre and angles of images as they took part, where it states them."""
     inputs: tuple[_Input, ...]
     old: tuple[str, ...] = ()
-    """What has changed since, one sentence each; empty if nothing has."""
+    """Changes since, one sentence each; empty if there are none."""
 
     def json_fields(self) -> dict[str, Any]:
         """Name, kind, time and what has changed since."""
@@ -173,7 +173,7 @@ class ProjectReport(Result):
     warnings: tuple[str, ...]
     """Old and unreadable records, and failures."""
     missing: Mapping[str, str]
-    """What the chain lacks, and what makes it."""
+    """Steps that the chain lacks, and the commands that make them."""
     notes: tuple[str, ...]
     """Notes of all runs."""
     sections: tuple[Findings, ...]

@@ -400,7 +400,7 @@ class RestoreReport(Result):
 
     images: tuple[RestoredImage, ...]
     failed: dict[str, str]
-    """Why an image could not be restored, by its name."""
+    """Reason why an image could not be restored, by its name."""
     found: FoundFilter
     folder: Path
     jobs: tuple[Job, ...]

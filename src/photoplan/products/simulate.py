@@ -239,7 +239,7 @@ class Forming:
 
     @property
     def begun(self) -> bool:
-        """Whether an earlier run has left its log; its frames are among the outputs."""
+        """Return whether an earlier run has left its log; its frames are among the outputs."""
         return ResultLog.place(self.output).exists()
 
     def planned(self) -> SimulateReport:
@@ -360,7 +360,7 @@ class FileScene:
 
     @property
     def has_values(self) -> bool:
-        """Whether any pixel of the file has a value; reads as far as the first one."""
+        """Return whether any pixel of the file has a value; reads as far as the first one."""
         masks = (self.reader.read(tile)[1] for tile in Window(0, 0, *self.reader.size).tiles(1024))
         return any(valid is None or bool(valid.any()) for valid in masks)
 

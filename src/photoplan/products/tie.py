@@ -104,11 +104,11 @@ class TieImage:
     position: NDArray[np.float64] | None
     """Projection centre or antenna (3,), metres; None: not known."""
     geometry: str = ""
-    """What decides its pixels beside its file."""
+    """Values that decide its pixels in addition to its file."""
 
     @property
     def placed(self) -> bool:
-        """Whether orientation and height of the ground are known."""
+        """Return whether orientation and height of the ground are known."""
         return self.camera is not None and bool(np.isfinite(self.level))
 
     def on_ground(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -280,7 +280,7 @@ class FeatureStore:
     level: int = 0
     """Position of the settings among those that are tried."""
     names: tuple[tuple[str, ...], ...] = field(init=False)
-    """What the features of each image depend on beside the settings."""
+    """Values that the features of each image depend on in addition to the settings."""
     _cached: Callable[[int], Features] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -303,7 +303,7 @@ class FeatureStore:
 
     @property
     def seen(self) -> list[tuple[str, ...]]:
-        """What matches of each image depend on beside the settings."""
+        """Return the values that matches of each image depend on in addition to the settings."""
         return [(*name, repr(i.calibration), _place(i)) for name, i in zip(self.names, self.images)]
 
 
@@ -550,15 +550,15 @@ class TriedPair:
     first: str
     second: str
     scale: float
-    """Of the images in which features were looked for."""
+    """Scale of the images in which features were looked for."""
     features: int
     """Features per image at most."""
     matches: int
     """Features that look alike."""
     verified: int
-    """Those that fit the geometry of the pair."""
+    """Number of matches that fit the geometry of the pair."""
     reason: str
-    """Why it is not verified; empty if it is."""
+    """Reason why it is not verified; empty if it is."""
 
 
 @dataclass(frozen=True)
@@ -569,7 +569,7 @@ class TieReport(Result):
     """The table of image points; None after a dry run."""
     images: tuple[str, ...]
     chosen: str
-    """How pairs were chosen."""
+    """Way in which pairs were chosen."""
     factor: int
     """Features were searched in means of so many pixels along each side."""
     pairs: int
@@ -592,7 +592,7 @@ class TieReport(Result):
     tried: tuple[TriedPair, ...] = ()
     """All pairs at all levels."""
     advice: str = ""
-    """What may connect the images that are not; empty if all are."""
+    """Advice that may connect the other images; empty if all are connected."""
     sources: tuple[TieImage, ...] = ()
     """The images, as they were opened."""
     found: Tracks | None = None
@@ -778,7 +778,7 @@ class _Level:
 
     store: FeatureStore
     pairs: list[PairMatches]
-    """Those that are not verified have no matches."""
+    """Results of all pairs; pairs that are not verified have no matches."""
     found: TracksFound
 
     @property

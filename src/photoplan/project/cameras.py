@@ -116,7 +116,7 @@ def rpc_camera(project: Project, image: RpcImage, ground: Ground, size: tuple[in
 def size_fault(
     functions: RationalFunctions, size: tuple[int, int], shift: tuple[float, float], file: Path, *, stated: bool
 ) -> str | None:
-    """What is wrong if an image has another size than its polynomials, and what would fit; None: nothing is.
+    """Return what is wrong if an image has another size than its polynomials, and what would fit; None if nothing is.
 
     An image with the shape of the one that they are made for, but not its size, was scaled; `stated`: the project
     states a scale. An image that lies mostly outside of that one is another image.
@@ -233,7 +233,7 @@ def camera_of(project: Project, image: ImageEntry, ground: Ground, size: tuple[i
 
 
 def is_there(file: Path) -> bool:
-    """Whether anything is found under a name, be it one that no file can have."""
+    """Return whether anything is found under a name, be it one that no file can have."""
     try:
         file.stat()
     except (OSError, ValueError):

@@ -48,7 +48,7 @@ class OpenTerrain:
     """Outer edges xmin, ymin, xmax, ymax, metres."""
     crs: str
     height_system: str | None
-    """As the file gives it; None: not stated."""
+    """Height system as the file gives it; None if not stated."""
     resolution: float
     """Mesh width, of a hybrid model the finest, metres."""
     model: ModelReader | None = None
@@ -56,7 +56,7 @@ class OpenTerrain:
 
     @property
     def errors(self) -> HeightErrors | None:
-        """What its file knows of the errors of its heights; None: nothing."""
+        """Return what its file states of the errors of its heights; None if nothing."""
         return ModelHeightErrors(self.surface) if isinstance(self.surface, HybridSurface) else None
 
     def refuse_apart(self, bounds: tuple[float, float, float, float]) -> None:
@@ -211,7 +211,7 @@ class Ground:
     operations: tuple[CrsStep | HeightStep, ...]
     """Coordinate operations on the way from the file, for the run record."""
     height_systems: tuple[str, str]
-    """Those of the terrain file and of the orientation, as declared or read."""
+    """Height systems of the terrain file and of the orientation, as declared or read."""
     working_system: str
     """The one that surface and cameras are in."""
 
@@ -230,7 +230,7 @@ class Ground:
         return height_step(self.working_system, self.height_systems[1], crs, self.bounds)
 
     def is_open(self, XY: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether no object stands at map points (..., 2) or hangs over them, shape (...)."""
+        """Return whether no object stands at map points (..., 2) or hangs over them, shape (...)."""
         if not isinstance(self.surface, ObjectSurface):
             return np.ones(XY.shape[:-1], bool)
         return np.isneginf(self.surface.faces.heights(XY))
@@ -238,7 +238,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class _GroundAddress:
-    """What decides the ground of a project; hashable."""
+    """Values that decide the ground of a project; hashable."""
 
     terrain: StatedTerrain
     orientation_system: str | None
@@ -328,7 +328,7 @@ def _in_system(ground: Ground, address: _GroundAddress) -> Ground:
 
 @dataclass(frozen=True)
 class _Undulation:
-    """What a height step adds at map points.
+    """Heights that a height step adds at map points.
 
     Rays and tiles reach beyond the terrain, where the grid of the step may have ended: the next place of the terrain
     counts there. A place inside that the grid does not cover is an error.
@@ -336,7 +336,7 @@ class _Undulation:
 
     step: HeightStep
     bounds: tuple[float, float, float, float] | None
-    """Of the terrain; None: it is everywhere."""
+    """Bounds of the terrain; None if it is everywhere."""
 
     def __call__(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
         XYZ = np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1)

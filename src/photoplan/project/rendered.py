@@ -40,9 +40,9 @@ class DrapedTexture:
 
     reader: RasterReader
     other: SolidTexture
-    """Where the raster has no value, and on objects."""
+    """Texture where the raster has no value, and on objects."""
     classes: bool = False
-    """Whether its values are numbers of classes, which are never mixed."""
+    """True if its values are numbers of classes, which are never mixed."""
 
     @classmethod
     def of(cls, path: Path, crs: str, other: SolidTexture) -> DrapedTexture:
@@ -62,7 +62,7 @@ class DrapedTexture:
 
     @property
     def bands(self) -> int:
-        """Those of the raster."""
+        """Return the number of bands of the raster."""
         return self.reader.bands
 
     def __call__(self, hits: Hits) -> NDArray[np.float64]:
@@ -117,7 +117,7 @@ class DrapedTexture:
 
 @dataclass(frozen=True, eq=False)
 class ProjectScene:
-    """What the cameras of a project look at."""
+    """Scene that the cameras of a project look at."""
 
     project: Project
     texture: Texture
@@ -132,7 +132,7 @@ class ProjectScene:
         return cls(project, texture, ground_of(project), oversampling)
 
     def seen_by(self, name: str) -> RenderedScene:
-        """What an image shows."""
+        """Return the scene that an image shows."""
         camera = camera_without_pixels(self.project, name)
         x, y, z = camera.vantage.point.tolist()
         low, high = self._heights((x - FAR, y - FAR, x + FAR, y + FAR), f"image {name!r}")
@@ -149,7 +149,7 @@ class ProjectScene:
         )
 
     def from_above(self, grid: MapGrid) -> RenderedScene:
-        """What a true orthophoto shows: objects that only hide are left out."""
+        """Return the scene that a true orthophoto shows: objects that only hide are left out."""
         low, high = self._heights(grid.bounds, "the true orthophoto")
         above = FromAbove(grid, high + 1.0)
         return RenderedScene(

@@ -48,7 +48,7 @@ KINDS: dict[str, tuple[tuple[Term, ...], ...]] = {
     "polynomial 2": _full(2),
     "polynomial 3": _full(3),
 }
-"""What each kind fits, simple ones first: shift; shift and scale; these and a radial cubic part; polynomials."""
+"""Terms that each kind fits, simple ones first: shift; shift and scale; these and a radial cubic part; polynomials."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,15 +97,15 @@ class BandModel:
     sigmas: tuple[tuple[float, float], ...] = ()
     """Standard deviations of a and b of each term; empty: unknown."""
     kind: str = "polynomial"
-    """How it was chosen, a name of `KINDS`."""
+    """Rule by which it was chosen, a name of `KINDS`."""
     residual: float = float("nan")
     """Root mean square of the residuals, pixels."""
     count: int = 0
     """Discs or edges that it was fitted to."""
     rejected: int = 0
-    """Of these, left out as gross errors."""
+    """Number of these that were left out as gross errors."""
     trials: tuple[Trial, ...] = ()
-    """What was tried, for a report."""
+    """Models that were tried, for a report."""
 
     def __post_init__(self) -> None:
         if len(self.terms) > 60 or any(min(i, j) < 0 or i + j > _MOST_DEGREE for i, j, _, _ in self.terms):
@@ -130,7 +130,7 @@ class ChromaticModel:
     bands: tuple[BandModel, ...]
     """The others; a band that is missing stays too."""
     description: str = ""
-    """How it was measured."""
+    """Method of the measurement."""
 
     def __post_init__(self) -> None:
         numbers = [band.band for band in self.bands]
@@ -145,7 +145,8 @@ class ChromaticModel:
         return hypot(*self.size) / 2.0
 
     def displacement(self, band: int, x: _Array, y: _Array) -> tuple[_Array, _Array]:
-        """Where a band lies against the reference at columns x and rows y (which broadcast): dx and dy, pixels."""
+        """Return the place of a band against the reference at columns x and rows y (which broadcast): dx and dy,
+        pixels."""
         mine = [each for each in self.bands if each.band == band]
         u = (np.asarray(x, float) - (self.size[0] - 1) / 2.0) / self.half_diagonal
         v = (np.asarray(y, float) - (self.size[1] - 1) / 2.0) / self.half_diagonal

@@ -102,7 +102,7 @@ GAUSSIAN_WIDTH = 2.0 * sqrt(2.0 * log(2.0))
 
 @dataclass(frozen=True, eq=False)
 class SpreadFunction:
-    """Which share of the light of an object pixel falls on the pixels around it, in one direction.
+    """Share of the light of an object pixel that falls on the pixels around it, in one direction.
 
     The image is the object convolved with it (Kölbl 2006, eq. 1 and 2); Kölbl's Z, A, B are the values at 0, 1, 2.
     """
@@ -144,7 +144,7 @@ class SpreadFunction:
 
     @property
     def half(self) -> int:
-        """How many pixels it reaches to each side."""
+        """Return how many pixels it reaches to each side."""
         return int(self.values.size // 2)
 
     @property

@@ -52,7 +52,7 @@ _COMPONENTS, _PROBES = 15, 16
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """What is held, since overlaps alone do not tell it."""
+    """Values that are held, since overlaps alone do not determine them."""
 
     parts: NDArray[np.int64]
     """Images (n,) of one number hang together; each part gets a gauge of its own."""
@@ -79,9 +79,9 @@ class AdjustedBand:
     evidence: float
     """Logarithm of the observations' probability under the prior (Laplace's approximation), but for a constant."""
     curve_last: bool = True
-    """Whether curves act after trends."""
+    """True if curves act after trends."""
     relative: bool = False
-    """Whether only departures of the tables from their mean matter, since light becomes grey again by that mean."""
+    """True if only departures of the tables from their mean matter, since light becomes grey again by that mean."""
 
     @cached_property
     def sigmas(self) -> BandState:
@@ -97,14 +97,14 @@ class AdjustedBand:
 
 @dataclass(frozen=True, eq=False)
 class _Weights:
-    """What counts how much at a state."""
+    """Weights at a state."""
 
     of: _Floats
-    """Of the observations, inverse variances, (n,)."""
+    """Weights of the observations, inverse variances, (n,)."""
     ground: _Floats
-    """Of what holds the ground, (groups,)."""
+    """Weights of what holds the ground, (groups,)."""
     moved: _Floats
-    """What the ground lacks to that, (groups,)."""
+    """Differences of the ground from that, (groups,)."""
     robust: _Floats
     """By the size of residuals, (n,)."""
     sigma: float
@@ -119,7 +119,7 @@ class _Normals:
     alone: _Floats
     """Step of the ground if images stay, (groups,)."""
     lost: csr_array
-    """What that loses with theirs, (groups, unknowns)."""
+    """Change of that step with the unknowns of the images, (groups, unknowns)."""
 
 
 def adjust(band: Band, gauge: Gauge, prior: Prior, *, judged: bool = True) -> AdjustedBand:
@@ -246,7 +246,7 @@ def _normals_of(band: Band, state: BandState, weights: _Weights) -> _Normals:
 
 
 def _held(band: Band, state: BandState, sigma: float) -> tuple[_Floats, _Floats]:
-    """What ground lacks to the reference, and what that weighs."""
+    """Return the differences of the ground from the reference, and their weights."""
     share = np.bincount(band.group, band.weight) / np.bincount(band.group)
     moved = band.beside_reference(state)
     known = np.isfinite(moved)
@@ -350,17 +350,17 @@ class BlockMode:
 
     name: str
     value: float
-    """Of the exposures and trends that were found."""
+    """Part of it in the exposures and trends that were found."""
     sigma: float
     """Standard deviation of what the balanced images still have of it."""
     prior: float
     """Standard deviation before overlaps were compared."""
     order: float
-    """What it differs, contained in `sigma`, if curves and fall-off act in the other order."""
+    """Difference, contained in `sigma`, if curves and fall-off act in the other order."""
 
     @property
     def held(self) -> bool:
-        """Whether it is the prior that determines it, not the overlaps."""
+        """Return whether it is the prior that determines it, not the overlaps."""
         return self.sigma > 0.5 * self.prior
 
 
@@ -377,18 +377,19 @@ class Balanced:
     parts: NDArray[np.int64]
     """Images of one number hang together by what they show."""
     bands: tuple[AdjustedBand, ...]
-    """What each band's adjustment found."""
+    """Results of each band's adjustment."""
     contrast: tuple[float, ...]
     """Local contrast of the block after the adjustment, per band, before a common factor made it what it was."""
     modes: tuple[BlockMode, ...]
-    """What overlaps hardly determine, the largest standard deviation of all bands; none for factors from ratios."""
+    """Modes that overlaps hardly determine, the largest standard deviation of all bands; none for factors from
+    ratios."""
     shoulder: bool
-    """Whether a common shoulder keeps bright and dark grey values inside the range."""
+    """True if a common shoulder keeps bright and dark grey values inside the range."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """How much images of a pair differ, root mean square of single pixels of the map."""
+    """Differences between images of a pair, root mean square of single pixels of the map."""
 
     images: NDArray[np.int64]
     """Numbers of both, (n, 2)."""
@@ -557,7 +558,7 @@ def shoulder(value: _Floats, limits: tuple[float, float]) -> _Floats:
 
 
 def pairs_of(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.int64]) -> Pairs:
-    """How images differ before and after; those without tones stay as they are."""
+    """Return how images differ before and after; those without tones stay as they are."""
     a, b = neighbours(cells)
     pair, of, count = np.unique(
         np.stack([cells.image[a], cells.image[b]], axis=1), axis=0, return_inverse=True, return_counts=True
@@ -719,7 +720,7 @@ def _beyond(
     tones: Sequence[Sequence[Tone]],
     limits: tuple[float, float],
 ) -> bool:
-    """Whether more pixels leave the range than may."""
+    """Return whether more pixels leave the range than may."""
     after = _values(cells, dict(zip(images.tolist(), tones)), sizes)
     inside = (cells.pixels > limits[0]) & (cells.pixels < limits[1])
     beyond = inside & ((after <= limits[0]) | (after >= limits[1]))

@@ -426,7 +426,7 @@ class Solved:
     factor: SuperLU
     H: _Floats
     back: _Floats
-    """What fulfils the conditions if they lack one, N⁻¹ Hᵀ (H N⁻¹ Hᵀ)⁻¹."""
+    """Matrix that fulfils the conditions if they lack one, N⁻¹ Hᵀ (H N⁻¹ Hᵀ)⁻¹."""
 
     @classmethod
     def of(cls, N: csr_array, H: _Floats) -> Solved:
@@ -534,7 +534,7 @@ class Band:
     reference: _Floats
     """Mean G of each group's cell as a reference has it, (groups,); NaN where there is none."""
     curve_last: bool = True
-    """Whether F acts after v."""
+    """True if F acts after v."""
 
     @classmethod
     def of(cls, cells: Cells, band: int, sizes: NDArray[np.int64], basis: Basis, nodes: _Floats) -> Band:
@@ -569,11 +569,11 @@ class Band:
 
     @property
     def referred(self) -> bool:
-        """Whether there is a reference."""
+        """Return whether there is a reference."""
         return bool(np.isfinite(self.reference).any())
 
     def beside_reference(self, state: BandState) -> _Floats:
-        """What the cell of each group lacks to its reference in the mean, (groups,); NaN where there is none."""
+        """Return the mean difference of the cell of each group from its reference, (groups,); NaN if there is none."""
         group_cell = np.empty(len(self.reference), np.int64)
         group_cell[self.group] = self.cell
         mean = np.bincount(group_cell, state.ground) / np.bincount(group_cell)
@@ -590,7 +590,7 @@ class Band:
         return BandState(np.tile(self.nodes, (images, 1)), trends, self.own, np.zeros(common))
 
     def predicted(self, state: BandState) -> tuple[_Floats, _Floats]:
-        """What the images show (n,), and its derivatives by G (n,)."""
+        """Return what the images show (n,), and its derivatives by G (n,)."""
         v, k, part = self._at(state)
         low, high = state.tables[self.image, k], state.tables[self.image, k + 1]
         shown = low + part * (high - low)

@@ -46,7 +46,7 @@ _PARTS = ("artist", "cm", "collections", "colors", "figure", "image", "lines", "
 
 
 def has_matplotlib() -> bool:
-    """Whether it is installed."""
+    """Return whether it is installed."""
     return importlib.util.find_spec("matplotlib") is not None
 
 
@@ -74,7 +74,7 @@ mpl: Any = _Matplotlib()
 
 
 def styled(draw: Callable[P, T]) -> Callable[P, T]:
-    """What draws, in the style of all plots."""
+    """Return a drawing function that draws in the style of all plots."""
 
     @wraps(draw)
     def drawing(*args: P.args, **options: P.kwargs) -> T:
@@ -166,7 +166,7 @@ def draw_normalised(values: NDArray[np.float64], limit: float, what: str) -> byt
 
 
 def lettering(size: float) -> Lettering:
-    """What draws texts of a size in pixels, in the font of all plots."""
+    """Return what draws texts of a size in pixels, in the font of all plots."""
     load_matplotlib("a view with labels", "leave the labels out (label= of the lines)")
     fonts = importlib.import_module("matplotlib.ft2font")
     path = importlib.import_module("matplotlib.font_manager").findfont("DejaVu Sans")

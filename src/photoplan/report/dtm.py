@@ -72,7 +72,7 @@ class CovarianceTest:
     empirical: NDArray[np.float64]
     """Mean product of the pairs' residuals from a plane, shape (k,), m²; NaN: no pairs."""
     expected: NDArray[np.float64]
-    """What the fitted functions let expect of these means, shape (k,), m²."""
+    """Expectations of these means by the fitted functions, shape (k,), m²."""
     pairs: NDArray[np.int64]
     """Pairs in each class, shape (k,)."""
 
@@ -89,7 +89,7 @@ class CovarianceTest:
 
     @property
     def warning(self) -> str:
-        """What to say where measured and expected covariances differ by more than chance and noise; or empty."""
+        """Return a warning if measured and expected covariances differ by more than chance and noise; else empty."""
         first = int(np.argmax(self.pairs > 0))
         measured, expected = float(self.empirical[first]), float(self.expected[first])
         if not abs(measured - expected) > self.noise / 2 or 1 / _DIFFER <= self.ratio <= _DIFFER:
@@ -334,7 +334,7 @@ class FilterEffect:
     """Measured minus filtered heights of one class."""
 
     name: str
-    """What the class is called."""
+    """Name of the class."""
     count: int
     """Members of the class, of which `xy` may be a part."""
     sigma: float
@@ -353,7 +353,7 @@ class PlottedError:
     X: float
     Y: float
     height: float
-    """As measured, metres."""
+    """Height as measured, metres."""
     difference: float
     """Measured height minus the model's, metres; NaN: no surface there."""
     normalised: float
@@ -362,13 +362,13 @@ class PlottedError:
 
 @dataclass(frozen=True, eq=False)
 class BuildSamples:
-    """What the report shows beside the model's own figures: a map, and samples where there is much."""
+    """Contents of the report besides the model's own figures: a map, and samples if there is much."""
 
     map: ReportMap
     normalised: NDArray[np.float64]
     """Normalised residuals of points that were used, or a sample of them."""
     spread: float
-    """Of all of them; NaN: too few points."""
+    """Spread of all of them; NaN if there are too few points."""
     covariance: CovarianceTest
     effects: tuple[FilterEffect, ...]
     gross: tuple[PlottedError, ...]
@@ -610,7 +610,7 @@ def draw_filter_histograms(effects: Sequence[FilterEffect]) -> bytes:
 
 @styled
 def draw_filter_map(effects: Sequence[FilterEffect], area: ReportMap) -> bytes:
-    """Where heights were changed, and which way."""
+    """Draw where heights were changed, and in which direction."""
     fig, axes = _map_plots(area)
     _grey_relief(axes, area)
     xy = np.concatenate([effect.xy for effect in effects])
@@ -828,7 +828,7 @@ def _fit(built: Built, samples: BuildSamples) -> list[str]:
 
 
 def _held_out(found: SigmaFactor, spacing: float) -> list[str]:
-    """What blocks that were held out say of the standard deviations."""
+    """Return what held-out blocks show of the standard deviations."""
     classes, bent = ([c for c in each if c.count] for each in (found.classes, found.bends))
     if not classes:
         return []

@@ -33,7 +33,7 @@ class Tree:
     numbers: NDArray[np.int64]
     """Numbers of its data."""
     count: int
-    """How many of them are taken."""
+    """Number of them that are taken."""
 
     def query(self, middles: NDArray[np.float64]) -> NDArray[np.int64]:
         """Numbers of the nearest data, shape (p, count)."""
@@ -80,7 +80,7 @@ class Neighbours:
 
 
 def _in_a_row(xy: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which sets of points (p, k, 2) are narrow."""
+    """Return which sets of points (p, k, 2) are narrow."""
     centred = xy - xy.mean(axis=1, keepdims=True)
     a = (centred[..., 0] ** 2).mean(axis=1)
     b = (centred[..., 1] ** 2).mean(axis=1)
@@ -121,7 +121,7 @@ class Covariance:
     family: int
     """Number of the family, see `photoplan.terrain.settings.FAMILIES`."""
     variance: float
-    """Of the signal, m²."""
+    """Variance of the signal, m²."""
     length: float
     """Distance at which the correlation is one half, metres."""
     noise: float
@@ -187,7 +187,7 @@ def _ground(found: list[tuple[NDArray[np.float64], Covariance]], noise: float) -
 
 
 def _clearly_better(gain: NDArray[np.float64]) -> bool:
-    """Whether blocks gain much by a rougher family, or most of them clearly: a few ditches are no reason."""
+    """Return whether blocks gain much by a rougher family, or most of them clearly: a few ditches are no reason."""
     return bool(gain.mean() > _MUCH or (gain.mean() > _CLEARLY and (gain > 0).mean() > _MOST))
 
 

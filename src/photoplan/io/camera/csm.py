@@ -50,7 +50,7 @@ _LARGEST = 1e30
 
 @dataclass(frozen=True, eq=False)
 class FocalPlane:
-    """Where detectors lie, in lines and samples of the whole detector from its outer corner, each (2,)."""
+    """Positions of detectors, in lines and samples of the whole detector from its outer corner, each (2,)."""
 
     to_detector: _Floats
     """(x, y) in the focal plane, millimetres, to (line, sample), shape (2, 2)."""
@@ -73,7 +73,7 @@ class Isd:
         self.lines, self.samples = int(lines), int(samples)
 
     def has(self, name: str) -> bool:
-        """Whether an entry (a.b) is there."""
+        """Return whether an entry (a.b) is there."""
         return self.find(name) is not None
 
     def numbers(self, name: str, shape: tuple[int, ...]) -> Any:
@@ -130,7 +130,7 @@ class Isd:
         return FocalPlane(A, centre + [row[0] for row in rows], first, focal)
 
     def summing(self, name: str) -> float:
-        """How many lines or samples ("line", "sample") of the detector are one of the image."""
+        """Return how many lines or samples ("line", "sample") of the detector are one of the image."""
         found = float(self.numbers(f"detector_{name}_summing", ()))
         if not found > 0:
             raise InputError(f"{self._path}: {found:g} {name}s of the detector in one of the image")
@@ -206,7 +206,7 @@ def lens_of(isd: Isd, kind: str | None) -> tuple[float, Lens]:
 
 
 def not_known(kind: str, known: list[str]) -> InputError:
-    """What is said of another distortion."""
+    """Return the error for another distortion."""
     return InputError(
         f"the distortion {kind!r} is not known; {', '.join(known)} are. Where all its coefficients are 0, or are "
         "not needed, take optical_distortion out of the file"
@@ -305,7 +305,7 @@ def read_frame(path: Path) -> StatedFrame:
 
 
 def is_frame(path: Path) -> bool:
-    """Whether a file states a frame camera; a file that cannot be read does not."""
+    """Return whether a file states a frame camera; a file that cannot be read does not."""
     if path.suffix.lower() not in SUFFIXES:
         return False
     try:

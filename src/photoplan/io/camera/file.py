@@ -133,7 +133,7 @@ class CameraFile:
     cameras: dict[str, CameraEntry]
     """Descriptions by name."""
     normalised: bool
-    """Whether the format relates everything to the image's size, so that a camera fits its images at any resolution."""
+    """True if the format relates everything to the image's size, so that a camera fits its images at any resolution."""
 
 
 def read_cameras(path: str | Path) -> CameraFile:

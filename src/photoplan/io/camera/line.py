@@ -79,9 +79,10 @@ class StatedLine:
     radii: tuple[float, float]
     """Equatorial and polar radius of the body, metres."""
     beside: float | None = None
-    """How far elements of a table of detectors lie beside the curve that stands for them, columns; None: no table."""
+    """Largest distance of elements of a table of detectors from the curve that stands for them, columns; None without a
+    table."""
     chips: tuple[LineLook, ...] = ()
-    """Of a line of several chips, all of them, with `look` the first; empty: it is one."""
+    """All chips of a line that has several, with `look` the first; empty if it has one."""
     lens: str | None = None
     """Focal length and kind of distortion in words; None: the file states directions alone."""
 
@@ -150,7 +151,7 @@ _Plane = Callable[[_Floats], _Floats]
 
 
 def _even(isd: Isd) -> _Plane:
-    """What depends on even powers of the distance; for the odd ones see `LineBend`."""
+    """Return the part that depends on even powers of the distance; for the odd ones see `LineBend`."""
     shift = [isd.numbers(f"optical_distortion.kaguyalism.boresight_{axis}", ()) for axis in "xy"]
     k = _kaguya(isd)
     return lambda d: np.asarray(d + shift + k[0] + (d**2).sum(axis=1, keepdims=True) * k[2])
@@ -420,7 +421,7 @@ class StripChip(Entry):
 
     columns: Pixels
     x_mm: _Polynomial | None = None
-    """As of a line, by the chip's own columns; None with a table, or: 0."""
+    """Coefficients as those of a line, by the chip's own columns; None with a table, or for 0."""
     y_mm: _Polynomial | None = None
 
 
@@ -430,13 +431,15 @@ class StripDetectors(Entry):
     columns: Pixels
     focal_mm: Positive
     x_mm: _Polynomial | None = None
-    """Where the detectors are in the direction of flight: coefficients of the powers of the column, mm; None: 0."""
+    """Positions of the detectors in the direction of flight: coefficients of the powers of the column, mm; None for
+    0."""
     y_mm: _Polynomial | None = None
     """The same across it, to the left."""
     table: Annotated[str, Field(min_length=1, max_length=4000)] | None = None
     """Instead of both: a file with a row for each element, mm: CSV with the header ``x,y``, or NPY (columns, 2)."""
     chips: Annotated[tuple[StripChip, ...], Field(min_length=2, max_length=64)] | None = None
-    """Where a line is made of several chips, in the order of their columns: each follows a smooth curve of its own."""
+    """Chips of a line that is made of several, in the order of their columns: each follows a smooth curve of its
+    own."""
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -627,7 +630,7 @@ def _strip_record(path: Path) -> _Floats:
 
 
 def _gaps(t: _Floats) -> tuple[tuple[float, float], ...]:
-    """Where a record is silent for much longer than from row to row otherwise."""
+    """Return the times in which a record is silent for much longer than from row to row otherwise."""
     step = np.diff(t)
     long = np.flatnonzero(step > _GAP * np.median(step))
     return tuple((float(t[k]), float(t[k + 1])) for k in long)

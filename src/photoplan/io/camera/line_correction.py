@@ -50,13 +50,13 @@ class CorrectionFile(Entry):
     lever_arm_m: Triple = (0.0, 0.0, 0.0)
     time_offset_s: Number = 0.0
     covariance: Annotated[tuple[Number, ...], Field(max_length=28)] | None = None
-    """Of boresight, lever arm and time offset in these units: the lower triangle by rows, 28 numbers."""
+    """Covariances of boresight, lever arm and time offset in these units: the lower triangle by rows, 28 numbers."""
     spline: _SplineEntries | None = None
     accuracy: _AccuracyEntries | None = None
 
 
 def read_pose_errors(path: Path) -> PoseErrors | None:
-    """How exactly a corrected trajectory is known; None: the file does not say."""
+    """Return the standard deviations of a corrected trajectory; None if the file does not state them."""
     found = read_entries(path, CorrectionFile, MAX_BYTES).accuracy
     if found is None:
         return None

@@ -87,7 +87,7 @@ class BrownLens(LensEntry):
 
     type: Literal["brown"]
     unit: Literal["tangent", "mm", "px"] = "tangent"
-    """What the coefficients multiply: image coordinates divided by the camera constant, in millimetres or in pixels."""
+    """Unit of the coordinates that the coefficients multiply: divided by the camera constant, millimetres or pixels."""
     y_axis: Literal["up", "down"] = "up"
     """Direction of y where they were determined."""
     meaning: Literal["distortion", "correction"] = "distortion"
@@ -198,7 +198,7 @@ AnyLens = Annotated[
 
 
 class Restoration(Entry):
-    """How images are restored before anything is made of them."""
+    """Restoration of images before anything is made of them."""
 
     filter: Annotated[str, Field(min_length=1, max_length=4000)]
     """A restoration filter: TOML, or one kernel as rows of numbers."""
@@ -248,9 +248,9 @@ class FiducialSystem:
     model: str
     """Transformation from them to a scan: one of `photoplan.cameras.fiducials.MODELS`."""
     mirrored: bool
-    """Whether the film was scanned through its back."""
+    """True if the film was scanned through its back."""
     looks: Marks | None
-    """What they look like; None: not described."""
+    """Appearance of the marks; None if it is not described."""
 
     def fit(self, measured: Fiducials | None, model: str | None = None) -> FiducialFit:
         """Adjustment of the marks of a scan, with residuals and sigma0; `model` in place of the camera's."""
@@ -283,7 +283,7 @@ class CameraEntry(Entry, ABC):
     @property
     @abstractmethod
     def states_pixels(self) -> bool:
-        """Whether its interior orientation is computed in pixels; else in millimetres."""
+        """Return whether its interior orientation is computed in pixels; else in millimetres."""
 
     @property
     @abstractmethod
@@ -302,7 +302,7 @@ class CameraEntry(Entry, ABC):
         """
 
     def places(self, fiducials: Fiducials | None) -> bool:
-        """Whether the interior orientation of an image with these measured marks is known."""
+        """Return whether the interior orientation of an image with these measured marks is known."""
         return bool(fiducials) or self.fiducial_system is None
 
     @property
@@ -412,7 +412,7 @@ class FrameEntry(CameraEntry):
 
     @property
     def states_pixels(self) -> bool:
-        """Whether the principal point is stated in pixels, or nothing is in millimetres."""
+        """Return whether the principal point is stated in pixels, or nothing is in millimetres."""
         return self.camera_constant_mm is None or self.principal_point_px is not None
 
     @property
@@ -457,11 +457,11 @@ class FilmEntry(CameraEntry):
     """Principal point of the calibration report in the system of the fiducial marks."""
     interior: Literal["similarity", "affine", "bilinear"] = "affine"
     mirrored: Annotated[bool, Strict()] = False
-    """Whether the film was scanned through its back, so that left and right are exchanged."""
+    """True if the film was scanned through its back, so that left and right are exchanged."""
     size: tuple[Pixels, Pixels] | None = None
     """Width and height of the scans in pixels, where all are equal."""
     marks: Marks | None = None
-    """What the fiducial marks look like: one description for all, or one for each by name."""
+    """Appearance of the fiducial marks: one description for all, or one for each by name."""
 
     comments: ClassVar[Mapping[str, str]] = {
         "type": "scanned film; each image states its measured fiducial marks",

@@ -57,7 +57,7 @@ class OpenCVForm:
 
     @property
     def rational(self) -> bool:
-        """Whether the denominator k4–k6 is used."""
+        """Return whether the denominator k4–k6 is used."""
         return not self.fisheye and any(self.k[3:])
 
 
@@ -82,7 +82,7 @@ def opencv_form(camera: CameraEntry) -> OpenCVForm | None:
 
 
 def opencv_losses(block: OrientationBlock, *, rational: bool = True, fisheye: bool = True) -> list[Loss]:
-    """What of a block's cameras a format with OpenCV's lenses cannot hold."""
+    """Return the properties of a block's cameras that a format with OpenCV's lenses cannot hold."""
     lost = []
     for name, camera in block.cameras.items():
         if camera.pixels is None:
@@ -174,7 +174,7 @@ _WIDTH, _HEIGHT = ("image_width", "width", "imagewidth"), ("image_height", "heig
 
 
 def is_opencv(path: Path) -> bool:
-    """Whether a YAML or JSON file is a calibration of this kind."""
+    """Return whether a YAML or JSON file is a calibration of this kind."""
     return re.search(r"camera_?matrix", read_head(path), re.I) is not None
 
 

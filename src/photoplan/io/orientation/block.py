@@ -68,13 +68,13 @@ class OrientationTable:
     """Latitude, longitude (degrees, WGS 84) and height of a local tangential system (east, north, up), where positions
     and rotations refer to one; None where they refer to `crs`."""
     true_metres: bool = False
-    """Whether the poses were computed in a Cartesian system of true metres (geocentric, or about a point) and brought
+    """True if the poses were computed in a Cartesian system of true metres (geocentric, or about a point) and brought
     into `crs` place by place; else they were adjusted in map coordinates, whose scale and curvature they absorbed."""
     positions: NDArray[np.float64] | None = None
     """Latitude, longitude (degrees, WGS 84) and height that a receiver measured, shape (n, 3), where the file states
     them beside the poses; NaN for images without. They were not used to place the poses."""
     notes: tuple[str, ...] = ()
-    """What a user should know of how the file was read."""
+    """Remarks on how the file was read."""
     map_unit: float = 1.0
     """Metres in the unit in which the file states X and Y; `in_metres` has converted them."""
     height_unit: float | None = None
@@ -146,7 +146,8 @@ class OrientationTable:
 
     @property
     def cartesian(self) -> bool:
-        """Whether the poses are right in true metres, so that ground of the map needs `earth_curvature` strict."""
+        """Return whether the poses are right in true metres, so that ground of the map needs `earth_curvature`
+        strict."""
         return self.true_metres or self.origin is not None
 
     @cached_property
@@ -210,7 +211,7 @@ class Loss:
     """``lens``: a file with the camera but without its lens would be wrong; such a file is written only on demand.
     Everything else is only told."""
     text: str
-    """What is lost, and where to keep it; a sentence without a full stop."""
+    """Sentence without a full stop: the property that is lost, and where to keep it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +227,8 @@ class OrientationBlock:
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     """Width and height in pixels by image name, where the camera does not state them."""
     matrix: Direction | None = None
-    """What rotation matrices do in a file that is written, where its format leaves that open; None: as is usual."""
+    """Direction of rotation matrices in a file that is written, if its format leaves that open; None for the usual
+    one."""
 
     def __post_init__(self) -> None:
         names = {image.name for image in self.table.images}
@@ -278,24 +280,26 @@ class OrientationFormat:
     """A file format for orientations."""
 
     name: str
-    """As users spell it."""
+    """Name as users spell it."""
     title: str
-    """As users know it."""
+    """Title as users know it."""
     sniff: Callable[[Path, str], bool]
-    """Whether a file may be of this format: its path and its first 64 KiB as text (line ends are newlines, bytes that
-    are not UTF-8 are replaced; empty for a folder). If two formats claim one file, the user is asked; a format without
-    any mark of its own claims none and has to be stated. What no format claims is read as a table of text."""
+    """Test of a file that may be of this format: its path and its first 64 KiB as text (line ends are newlines, bytes
+    that are not UTF-8 are replaced; empty for a folder). If two formats claim one file, the user is asked; a format
+    without any mark of its own claims none and has to be stated. A file that no format claims is read as a table of
+    text."""
     read: Callable[[Path, TableFormat], OrientationBlock]
-    """What the file holds; `TableFormat` only where the format leaves conventions open. Raises InputError."""
+    """Function that reads a file; `TableFormat` counts only if the format leaves conventions open. Raises
+    InputError."""
     render: Callable[[OrientationBlock, Path], Mapping[Path, str]] | None = None
     """Text of all files to be written under a path that the user gave (a folder for formats of several files); writes
     nothing itself. Raises InputError where something that the format needs is not known. None: read only."""
     losses: Callable[[OrientationBlock], Iterable[Loss]] = lambda block: ()
-    """What of a block the format cannot hold."""
+    """Function that returns the properties of a block that the format cannot hold."""
     suffix: str = ".txt"
-    """Of a file that the user gives no name; empty for a folder."""
+    """Suffix of a file that the user gives no name; empty for a folder."""
     angles: bool = False
-    """Whether files hold three angles that could mean something else than they are taken for."""
+    """True if files hold three angles that could mean something else than they are taken for."""
 
 
 def require_map(block: OrientationBlock, path: Path) -> None:

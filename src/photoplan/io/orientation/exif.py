@@ -55,7 +55,7 @@ class Folder:
     """Images of a folder, or one image, by what they state."""
 
     placed: tuple[ImageMetadata, ...]
-    """Those that state a position."""
+    """Images that state a position."""
     count: int
     """All images."""
     notes: tuple[str, ...]

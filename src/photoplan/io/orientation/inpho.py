@@ -203,7 +203,8 @@ class _Pose:
 
 
 def _direction(poses: list[_Pose], file: _InphoFile, form: TableFormat, path: Path) -> tuple[Direction, str]:
-    """What the matrices do: as declared, as the angles of `$INS` tell, or as MATCH-AT writes them; and the reason."""
+    """Return the direction of the matrices, as declared, as the angles of `$INS` show, or as MATCH-AT writes them; and
+    the reason."""
     if form.declares("direction"):
         return form.direction, ""
     unit = _ANGLE_UNITS.get((file.other.text("$ANGULAR_UNITS") or "deg").lower(), np.nan)
@@ -324,7 +325,7 @@ ASSUMED_PIXEL = 0.005
 
 
 def _losses(block: OrientationBlock) -> list[Loss]:
-    """What of a block an Inpho project does not hold."""
+    """Return the properties of a block that an Inpho project does not hold."""
     lost = common_losses(block, cameras=True, film=False, crs=True)
     direction = DIRECTIONS[block.matrix or OWN]
     lost.append(

@@ -163,7 +163,7 @@ def _chunk(path: Path) -> Element:
 
 
 def _component_transforms(chunk: Element, path: Path) -> tuple[_Similarity | None, dict[str, _Similarity | None]]:
-    """Of the chunk, and of its components by their id; None: it has no position."""
+    """Return the transforms of the chunk, and of its components by their id; None without a position."""
     shared = _similarity(chunk.find("./transform"), f"{path}: chunk")
     found: dict[str, _Similarity | None] = {}
     for component in chunk.findall("./components/component"):
@@ -214,7 +214,7 @@ def _camera_pose(camera: Element, where: str) -> tuple[_Floats, _Floats]:
 
 
 def _reference(camera: Element) -> list[float]:
-    """What a receiver measured, in the CRS of the chunk; NaN where the camera states nothing, or does not use it."""
+    """Return a receiver's measurement, in the CRS of the chunk; NaN if the camera states none, or does not use it."""
     stated = camera.find("reference")
     if stated is None or stated.get("enabled", "true") in ("0", "false"):
         return [np.nan] * 3
@@ -351,7 +351,7 @@ _LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["me
 
 
 def losses(block: OrientationBlock) -> Iterable[Loss]:
-    """What of a block the format cannot hold."""
+    """Return the properties of a block that the format cannot hold."""
     for name, camera in block.cameras.items():
         if camera.pixels is None:
             yield Loss("camera", f"no camera {name!r}: film has no pixels of its own")

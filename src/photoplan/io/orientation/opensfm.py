@@ -174,7 +174,7 @@ _FAR, _FARTHER = 50.0, 10.0
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What positions and rotations refer to."""
+    """System that positions and rotations refer to."""
 
     crs: str | None
     """UTM zone; None: east, north, up about the reference."""
@@ -247,7 +247,7 @@ def _utm_offset(origin: tuple[float, float, float]) -> tuple[str, _Floats] | Non
 
 
 def _votes_of_files(path: Path, shots: Shots) -> dict[str, bool]:
-    """Whether the poses are UTM (True), by the name of the file and by what lies beside it."""
+    """Return whether the poses are UTM (True), by the name of the file and by what lies beside it."""
     votes = {}
     topocentric = path.name.endswith(".topocentric.json")
     beside = path.with_name(f"{path.stem}.topocentric.json")
@@ -271,7 +271,7 @@ def _votes_of_files(path: Path, shots: Shots) -> dict[str, bool]:
 
 
 def _equal(shots: Shots, rotations: dict[str, object], file: Path) -> bool | None:
-    """Whether shots have the rotation vectors of another file, digit for digit; None: no image is in both."""
+    """Return whether shots have the rotation vectors of another file, digit for digit; None if no image is in both."""
     apart = [
         float(np.abs(np.subtract(vector, finite(rotations[name], f"{file}: rotation of {name!r}", 3))).max())
         for name, vector in zip(shots.names, shots.vectors)
@@ -281,7 +281,7 @@ def _equal(shots: Shots, rotations: dict[str, object], file: Path) -> bool | Non
 
 
 def _vote_of_gps(shots: Shots, map_gps: _Floats) -> dict[str, bool]:
-    """Whether positions of the receiver fit the poses better in UTM (True), where they tell."""
+    """Return whether positions of the receiver fit the poses better in UTM (True), if they decide."""
     fit = agreement(map_gps, shots.centers)
     if fit.count < 4:
         return {}
@@ -315,7 +315,7 @@ def _refuse_far(path: Path, worlds: dict[str, _Floats], shots: Shots) -> None:
 
 
 def _losses(block: OrientationBlock) -> Iterable[Loss]:
-    """What of a block the format cannot hold."""
+    """Return the properties of a block that the format cannot hold."""
     yield from opencv_losses(block, rational=False)
     yield from height_losses(block.table)
 

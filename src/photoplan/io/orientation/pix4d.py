@@ -335,7 +335,7 @@ def _render_full(block: OrientationBlock, stem: Path) -> dict[Path, str]:
 
 
 def _square(camera: CameraEntry) -> bool:
-    """Whether pixels are square, as in Pix4D."""
+    """Return whether pixels are square, as in Pix4D."""
     form = opencv_form(camera)
     return form is None or abs(form.focal[0] - form.focal[1]) <= 1e-9 * form.focal[0]
 

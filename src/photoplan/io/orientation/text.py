@@ -116,7 +116,7 @@ class AngleLines:
     width: int
     """Characters that names are filled up to; with a keyword, names have no more."""
     described: bool
-    """Whether the unit of angles is known (gon)."""
+    """True if the unit of angles is known (gon)."""
 
     def read(self, path: Path, form: TableFormat) -> OrientationBlock:
         """Read a block; `form` is used only where it declares other conventions."""

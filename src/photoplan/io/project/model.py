@@ -56,7 +56,7 @@ class ImageEntry(Entry, ABC):
     size: tuple[Pixels, Pixels] | None = None
     """Width and height of this image, where nothing else states them."""
     alpha: Annotated[bool, Strict()] | None = None
-    """Whether bands that are tagged as alpha are masks (true) or colours (false); None: their values decide."""
+    """True if bands tagged as alpha are masks, false if they are colours; None if their values decide."""
     restore: Restore | None = None
     """Filter that it is restored with before anything is made of it; None: that of its camera, if there is one."""
     balance: InputName | None = None
@@ -78,12 +78,12 @@ class ImageEntry(Entry, ABC):
 
     @property
     def unoriented(self) -> str | None:
-        """Why products leave the image out; None if it is oriented."""
+        """Return why products leave the image out; None if it is oriented."""
         return None
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a user should know of its geometry, a clause each."""
+        """Return remarks on its geometry, a clause each."""
         return ()
 
     def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
@@ -138,7 +138,7 @@ class LineImage(ImageEntry):
     line: InputName
     """File of the line camera."""
     detectors: Name | None = None
-    """Which line of detectors, where the file has several."""
+    """Name of the line of detectors, if the file has several."""
     correction: InputName | None = None
     """File of corrections of its trajectory, as `photoplan adjust` writes them."""
     mount: Name | None = None
@@ -207,13 +207,14 @@ class RpcImage(ImageEntry):
     rpc: InputName
     """``tags``: the image file holds them; else the file that does."""
     shift: Pair | None = None
-    """What is added to the polynomials' column and row, pixels."""
+    """Shift that is added to the polynomials' column and row, pixels."""
     scale: Positive | None = None
     """Pixels of the image file for one of the polynomials, before the shift; None: one, and sizes are compared."""
     drift: tuple[Number, Number, Number, Number] | None = None
-    """What is added beside: to the column by column and row, to the row by column and row, per pixel."""
+    """Drift that is added to the shift: to the column by column and row, to the row by column and row, per pixel."""
     covariance: Annotated[tuple[Number, ...], Field(max_length=21)] | None = None
-    """Of shift and drift: the lower triangle by rows, of two or six numbers; pixels and pixels per pixel."""
+    """Covariances of shift and drift: the lower triangle by rows, of two or six numbers; pixels and pixels per
+    pixel."""
 
     @field_validator("rpc")
     @classmethod
@@ -346,7 +347,7 @@ class Image(ImageEntry):
     """The correlation matrix of centre, angles and, after a calibration, what `sigma` of the camera lists, below its
     diagonal, row by row; None: they are not correlated."""
     approximate: Annotated[bool, Strict()] | None = None
-    """Whether center and angles are initial values that `photoplan adjust` could not improve: products leave the image
+    """True if center and angles are initial values that `photoplan adjust` could not improve: products leave the image
     out."""
     fiducials: Fiducials | None = None
     """Measured fiducial marks of a film scan: name = [column, row], pixels."""
@@ -495,7 +496,7 @@ def lens_of(camera: CameraEntry) -> Lens:
 
 
 class StatedTerrain(Entry):
-    """Where the ground is: a raster of heights, a terrain model, or one height everywhere."""
+    """Terrain of a project: a raster of heights, a terrain model, or one height everywhere."""
 
     file: InputName | None = None
     height: Number | None = None
@@ -536,16 +537,16 @@ class Objects(Entry):
     file: InputName
     """CityJSON; polygons in space as GeoPackage, GeoJSON, Shapefile or DXF; meshes as OBJ or PLY."""
     role: Literal["paint", "occluder"] | None = None
-    """Whether a true orthophoto shows them, or they only hide what is behind them; None: what the file says, else
-    meshes hide and all others are shown."""
+    """True if a true orthophoto shows them, false if they only hide what is behind them; None for what the file states,
+    else meshes hide and all others are shown."""
     layer: Name | None = None
     """Type of CityJSON's objects, if not buildings and bridges; layer of a vector file or a drawing."""
     crs: Name | None = None
     """Horizontal CRS, where the file does not state it."""
     height_system: Name | None = None
-    """Where the file does not state it; "same": that of the terrain."""
+    """Height system of a file that does not state it; "same" for that of the terrain."""
     offset: Triple | None = None
-    """What is added to X, Y, Z of the file, metres: of meshes with an origin of their own."""
+    """Vector that is added to X, Y, Z of the file, metres, for meshes with an origin of their own."""
     sigma: tuple[NotNegative, NotNegative] | None = None
     """Standard deviations of each horizontal coordinate and of the height of an object as a whole, metres."""
 
@@ -556,7 +557,7 @@ class Objects(Entry):
 
 
 class Orientation(Entry):
-    """What the numbers of all [[images]] mean."""
+    """Meaning of the numbers of all [[images]]."""
 
     height_system: Name | None = None
     angle_unit: Literal["deg", "gon", "rad"] = "deg"
@@ -580,7 +581,7 @@ class ObservationsEntry(Entry):
     control_columns: InputName | None = None
     """Columns of tables of ground points, as ``name,-,x,y,z`` in their order or ``name=Nr,x=East,y=North,z=H``."""
     decimal_comma: Annotated[bool, Strict()] | None = None
-    """Whether tables of image and ground points write numbers as 1,5."""
+    """True if tables of image and ground points write numbers as 1,5."""
     positions: InputName | None = None
     """Table of observed projection centres, with or without attitudes."""
     sigma_image: Positive = 0.5
@@ -607,16 +608,16 @@ Parameter = Literal["c", "x0", "y0", "k1", "k2", "k3", "p1", "p2", "b1", "b2"]
 
 
 class RpcAdjustment(Entry):
-    """What is unknown of images with rational polynomials."""
+    """Unknowns of images with rational polynomials."""
 
     correction: Literal["shift", "drift", "affine"] = "shift"
     """A shift; a shift and what changes by row; or all six parameters of an affine correction."""
     sigma: tuple[Positive, Positive] = (10.0, 2.0)
-    """What is known beforehand: standard deviation of the shift, and of what changes until the border, pixels."""
+    """Standard deviations a priori: of the shift, and of what changes until the border, pixels."""
 
 
 class StripAdjustment(Entry):
-    """What is unknown of trajectories of line cameras, as standard deviations known beforehand; 0: held fixed."""
+    """Unknowns of trajectories of line cameras, as standard deviations a priori; 0 holds them fixed."""
 
     boresight: NotNegative = 0.0
     """About each axis of the camera, degrees."""
@@ -627,17 +628,17 @@ class StripAdjustment(Entry):
     knots: Positive | None = None
     """Seconds between knots of corrections that change with time; None: there are none."""
     position: Positive = 0.05
-    """Of corrections of the positions, metres."""
+    """Standard deviation of corrections of the positions, metres."""
     attitude: Positive = 0.005
-    """Of corrections of the attitudes, degrees."""
+    """Standard deviation of corrections of the attitudes, degrees."""
     smooth_position: Positive | None = None
-    """Of their second differences from knot to knot, metres; None: they are not known to be smooth."""
+    """Standard deviation of their second differences from knot to knot, metres; None if they need not be smooth."""
     smooth_attitude: Positive | None = None
     """The same of the attitudes, degrees."""
 
 
 class Adjustment(Entry):
-    """What `photoplan adjust` estimates besides orientations and points; options of the command override it."""
+    """Unknowns of `photoplan adjust` besides orientations and points; options of the command override them."""
 
     calibrate: dict[Name, tuple[Parameter, ...]] = Field(default_factory=dict)
     """Parameters of each camera that are unknowns."""
@@ -648,11 +649,11 @@ class Adjustment(Entry):
     lever_arm_sigma: NotNegative = 0.0
     """Its standard deviation, metres; 0: it is held fixed."""
     datum: Literal["observations", "orientations"] = "observations"
-    """What places the block: control and observed positions, or the orientations that the project states."""
+    """Datum of the block: control and observed positions, or the orientations that the project states."""
     drift: Literal["none", "shift", "linear"] = "none"
     """Drift of observed positions in each strip: none, a shift, or a shift and a change linear in time."""
     boresight: Annotated[bool, Strict()] = False
-    """Whether three small rotations between the observed attitudes and the camera are unknowns."""
+    """True if three small rotations between the observed attitudes and the camera are unknowns."""
     rpc: RpcAdjustment = RpcAdjustment()
     strips: StripAdjustment = StripAdjustment()
 
@@ -684,7 +685,7 @@ class Project(Entry):
     format: Literal[1] = 1
     crs: Annotated[str, Field(min_length=1, max_length=20_000)]
     beyond_area: Annotated[bool, Strict()] = False
-    """Whether places far outside the area of use of the CRS are meant; they are refused otherwise."""
+    """True if places far outside the area of use of the CRS are meant; they are refused otherwise."""
     terrain: StatedTerrain | None = None
     objects: tuple[Objects, ...] = ()
     orientation: Orientation = Orientation()
@@ -765,7 +766,8 @@ class Project(Entry):
         return self.terrain
 
     def area_fault(self, XY: ArrayLike, names: Sequence[str] = ()) -> str | None:
-        """Why places (n, 2 or more columns) cannot be in the project's CRS; None if they can, or are meant to be."""
+        """Return why places (n, 2 or more columns) cannot be in the project's CRS; None if they can, or are meant to
+        be."""
         return None if self.beyond_area else area_fault(self.crs, XY, names)
 
     def resolve(self, file: str) -> Path:
@@ -815,12 +817,14 @@ class Project(Entry):
         return [name for name in names if reasons[name] is None], left_out
 
     def restoration(self, image: ImageEntry) -> Restoration | None:
-        """How an image of the project is restored: as it states itself, else as its camera does; None: not at all."""
+        """Return how an image of the project is restored: as it states itself, else as its camera does; None if it is
+        not."""
         camera = image.described_by
         return image.restore or (None if camera is None else self.cameras[camera].restore)
 
     def ortho_settings(self) -> dict[str, Any]:
-        """What the `[ortho]` table states, by the names of `photoplan.products.orthophoto.plan.OrthoSettings`."""
+        """Return the values of the `[ortho]` table, by the names of
+        `photoplan.products.orthophoto.plan.OrthoSettings`."""
         stated = self.ortho.model_dump(exclude_none=True)
         if "nodata" in stated:
             stated["nodata"] = str(stated["nodata"])

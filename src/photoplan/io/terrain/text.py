@@ -57,7 +57,7 @@ _NONE = (*NOTHING, "-")
 
 
 def _explain(first: tuple[str, ...], why: str) -> str | None:
-    """What a first line is that holds no record: no header either."""
+    """Return the message for a first line that is neither record nor header."""
     if all(decimal(f) is not None for f in first[:3]):
         return None
     hint = ""
@@ -84,7 +84,7 @@ _Block = dict[str, Any]
 
 
 def points_layout(path: Path, lines: Sequence[str], dialect: Dialect) -> TableLayout | None:
-    """What the columns hold, from the first lines of a file; None: they hold no data."""
+    """Return the roles of the columns, from the first lines of a file; None if they hold no data."""
     head = [item for item in enumerate(lines[:1000], 1) if item[1].strip()]
     data = [item for item in head if not item[1].lstrip().startswith("#")]
     if not data:
@@ -231,7 +231,8 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
 
 
 def _unused(path: Path, layout: TableLayout, lines: list[str], options: ReadOptions) -> list[str]:
-    """What to note of columns that are not used; refused where they hold codes of the table and no column has codes."""
+    """Return notes on columns that are not used. They are refused if they hold codes of the table and no column has
+    codes."""
     if not layout.header:
         return []
     unused = {at: name for at, name in enumerate(layout.names) if at not in layout.roles.values()}
@@ -370,7 +371,7 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class PointTableFormat:
-    """What a table does not say of itself."""
+    """Properties that a table does not state itself."""
 
     x: str | None = None
     """Name of the column of X, or its number from 1; None: `x`, `east`, `easting` …"""
@@ -378,7 +379,7 @@ class PointTableFormat:
     dialect: Dialect = field(default_factory=Dialect)
     """Delimiter and decimal sign."""
     header: bool = True
-    """Whether the first line names the columns."""
+    """True if the first line names the columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -437,7 +438,7 @@ class PointTable:
         return next((d for d in tried if d in text.strip()), tried[0])
 
     def _column(self, axis: str, line: int) -> int:
-        """Where the column of an axis is."""
+        """Return the index of the column of an axis."""
         wanted = getattr(self.form, axis)
         lower = [name.casefold() for name in self.names]
         if wanted is None:

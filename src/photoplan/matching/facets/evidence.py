@@ -1,4 +1,4 @@
-"""What images say of each height of a surface: whether they agree there, and whether they agree at others as well.
+"""Evidence of images for each height of a surface: whether they agree there, and whether they agree at others as well.
 
 Around every post, patches of all images are compared at the height that was found and at all others within the reach
 (of the pairs of images the better ones, as what hides a place from one spoils the pairs that it is in). Differences of
@@ -58,12 +58,12 @@ _RESAMPLED = 0.3
 
 @dataclass(frozen=True, eq=False)
 class HeightEvidence:
-    """Of the posts of a block, all of shape (rows, columns)."""
+    """Evidence for the posts of a block, all of shape (rows, columns)."""
 
     count: NDArray[np.uint8]
     """Images that see the post."""
     variance: _Doubles
-    """Of the choice among the heights within the reach, m²."""
+    """Variance of the choice among the heights within the reach, m²."""
     probability: _Doubles
     """Probability that the height is right to a pixel of parallax."""
     fit: _Doubles
@@ -71,7 +71,7 @@ class HeightEvidence:
 
 
 def visible(block: FacetBlock) -> NDArray[np.bool_]:
-    """Which views see the posts of a block over its surface, shape (views, rows, columns)."""
+    """Return which views see the posts of a block over its surface, shape (views, rows, columns)."""
     facets, heights = block.facets, block.heights
     XYZ = np.concatenate([facets.posts, heights[..., None]], axis=-1)
     out = np.zeros((len(block.views), *facets.shape), bool)

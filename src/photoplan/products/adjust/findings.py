@@ -69,7 +69,7 @@ class CorrectionFigures:
     seconds: _Floats
     """Time of each measurement that takes part, (k,); empty where time means nothing."""
     residuals: _Floats
-    """Of these, (k, 2), pixels."""
+    """Residuals of these, (k, 2), pixels."""
     over_time: tuple[_Floats, _Floats] | None
     """Times and corrections that change with them: metres, radians."""
     angles: tuple[_Floats, _Floats] | None = None
@@ -84,7 +84,7 @@ class GroundFigures:
     check: bool
     rays: int
     XYZ: tuple[float, float, float]
-    """As given; NaN: not known."""
+    """Coordinates as given; NaN if not known."""
     residual: tuple[float, float, float]
     """Adjusted minus given, metres."""
     stated: tuple[float, float, float]
@@ -92,7 +92,7 @@ class GroundFigures:
     normalised: tuple[float, float, float]
     rejected: tuple[bool, bool, bool]
     covariance: _Floats
-    """Of the adjusted X, Y, Z, (3, 3), m²."""
+    """Covariances of the adjusted X, Y, Z, (3, 3), m²."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class ResidualField:
 
     camera: str
     unit: str
-    """Of the image plane: mm or px."""
+    """Unit of the image plane: mm or px."""
     at: _Floats
     """Middles of the cells, (n, 2), x right, y up."""
     mean: _Floats

@@ -61,7 +61,7 @@ class AdjustInputs:
 
     project: Project
     images: tuple[Image, ...]
-    """Those with poses that are wanted."""
+    """Images with poses that are wanted."""
     projected: tuple[ImageEntry, ...]
     """The others that are wanted."""
     points: ImagePoints
@@ -73,7 +73,7 @@ class AdjustInputs:
     attitudes: ObservedAttitudes | None
     files: tuple[Path, ...]
     notes: tuple[str, ...]
-    """What a user should know of how the files were read."""
+    """Remarks on how the files were read."""
     lost: tuple[tuple[str, str], ...] = ()
     """Images that cannot be oriented to begin with, and why."""
 
@@ -464,8 +464,8 @@ class MapResult:
     angles: _Floats
     """(n, 3), in the unit and order of the project."""
     covariances: tuple[_Floats, ...]
-    """Of each image: projection centre (metres), angles in the unit and order of the project, then the parameters of
-    its camera that were unknowns, in the project's units, (6 + k, 6 + k)."""
+    """Covariances of each image, (6 + k, 6 + k): projection centre (metres), angles in the unit and order of the
+    project, then the parameters of its camera that were unknowns, in the project's units."""
     XYZ: _Floats
     """All adjusted points, (m, 3)."""
     covariance: _Floats
@@ -475,9 +475,9 @@ class MapResult:
     position_residuals: _Floats
     """Computed minus observed, (p, 3), metres."""
     cameras: tuple[Calibrated, ...]
-    """Those that had unknowns."""
+    """Cameras that had unknowns."""
     corrections: tuple[tuple[str, Geometry, FoundCorrection], ...]
-    """Of the images without poses: name, kind, and what came out."""
+    """Corrections of the images without poses: name, kind, and what was found."""
 
     @property
     def pose_of(self) -> dict[str, Pose]:

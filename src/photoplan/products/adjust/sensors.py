@@ -101,7 +101,7 @@ class FoundCorrection:
     """Correction that was found for an image."""
 
     entries: Mapping[str, Any]
-    """Of its table in the project; None takes one out."""
+    """Entries of its table in the project; None takes one out."""
     parameters: tuple[FoundParameter, ...]
     file: str | None = None
     """Text of a file of corrections; the project's entry `correction` names it."""
@@ -122,9 +122,10 @@ class Geometry:
     away: Callable[[Any], float]
     """About how far a correctable is from the ground, metres."""
     correctable: Callable[[Project, Any, Ground, tuple[int, int]], Correctable]
-    """Of an image's entry; cameras are over the ground's height system."""
+    """Function that returns the correctable geometry of an image's entry; cameras are over the ground's height
+    system."""
     found: Callable[[Any, Mapping[str, AdjustedCorrections]], FoundCorrection]
-    """Of a correctable and its adjusted sets."""
+    """Function that returns the corrections of a correctable from its adjusted sets."""
     output: Callable[[str], str | None] = field(default=lambda name: None)
     """Name of the file of corrections of an image, in the output folder, by the stem of its products."""
 

@@ -45,7 +45,7 @@ class SettingsRun:
         return tuple(float(getattr(setting.first, self.name)) for setting in self.settings)
 
     def saturation(self, data: SeriesData, plane: Plane) -> Saturation | None:
-        """Where its levels saturate; it has four at least."""
+        """Return the level where it saturates; it has four levels at least."""
         levels = [data.levels(setting)[plane.name] for setting in self.settings]
         variance = np.array([level.temporal_variance for level in levels])
         return find_saturation(
@@ -69,7 +69,7 @@ def exposure_runs(data: SeriesData, kinds: Sequence[str], least: int) -> list[Se
 
 
 def no_run(data: SeriesData, kinds: Sequence[str], least: int, what: str) -> str | None:
-    """Why there is no run for an analysis; None: there is one."""
+    """Return why there is no run for an analysis; None if there is one."""
     if exposure_runs(data, kinds, least):
         return None
     return (
@@ -79,7 +79,7 @@ def no_run(data: SeriesData, kinds: Sequence[str], least: int, what: str) -> str
 
 
 def no_pair(data: SeriesData) -> str | None:
-    """Why frames of one setting cannot be compared; None: they can."""
+    """Return why frames of one setting cannot be compared; None if they can."""
     enough = data.settings("dark", "flat", least=2)
     return None if enough else "no setting of dark or flat frames has two frames or more"
 

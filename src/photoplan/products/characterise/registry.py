@@ -27,7 +27,7 @@ class Analysis:
     """Its name on the command line."""
     title: str
     needs: str
-    """Which frames it needs, for the documentation and dry runs."""
+    """Frames that it needs, for the documentation and dry runs."""
     module: str
     """Holds `missing` and `analyse`; imported when it is asked."""
 

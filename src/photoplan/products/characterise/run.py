@@ -87,7 +87,7 @@ class AnalysisRun:
     missing: str | None = None
     """Data that the series lacks for it."""
     failed: str | None = None
-    """Why it stopped."""
+    """Reason why it stopped."""
 
     @property
     def state(self) -> str:

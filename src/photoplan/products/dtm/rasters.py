@@ -44,11 +44,11 @@ GridTiles = Callable[[Window], GridTile]
 
 @dataclass(frozen=True)
 class GridOptions:
-    """How a grid is written, and what is told of it."""
+    """Options of writing a grid, and the entries of its record."""
 
     _: KW_ONLY
     kind: str
-    """What it is, such as "hillshade"."""
+    """Kind of the grid, such as "hillshade"."""
     settings: Mapping[str, Any]
     """All that decides its values beside the inputs and the place: goes into the record and the run's key."""
     inputs: Sequence[Path]
@@ -66,7 +66,7 @@ class GridOptions:
     overviews: bool = True
     """Reduced copies inside the file."""
     resampling: str = "average"
-    """How they are reduced: `average`; `mode` or `nearest` for classes and directions, which have no mean."""
+    """Reduction of its overviews: `average`; `mode` or `nearest` for classes and directions, which have no mean."""
     colours: Mapping[int, tuple[int, int, int]] | None = None
     """Colour table of one band of uint8: red, green, blue, 0 to 255, of each value."""
     tags: Mapping[str, str] | None = None
@@ -76,7 +76,8 @@ class GridOptions:
 
     @classmethod
     def of(cls, request: Any, kind: str, inputs: Sequence[Path], events: Events, **more: Any) -> GridOptions:
-        """Those of a request: its fields that may decide values are the settings; its files are inputs or outputs."""
+        """Return those of a request: its fields that may decide values are the settings; its files are inputs or
+        outputs."""
         # How exactly volumes are integrated does not change the raster beside them.
         settings = {name: value for name, value in settings_of(request).items() if name != "tolerance"}
         given = {"settings": settings, "workers": request.workers, "overwrite": request.overwrite, "events": events}
@@ -197,7 +198,7 @@ class TerrainPicture:
     bands: int
     nodata: Nodata
     settings: dict[str, Any]
-    """What it was made with: goes into the file's tags and the key of its run."""
+    """Settings that it was made with, for the file's tags and the key of its run."""
     tile: Callable[[OpenTerrain, MapGrid, Window], GridTile]
     resampling: str = "average"
     colours: dict[int, tuple[int, int, int]] | None = None
@@ -205,7 +206,7 @@ class TerrainPicture:
 
 @dataclass(frozen=True)
 class ShadingFacts(Result):
-    """What was made."""
+    """Result of a hillshade, slope or tint."""
 
     path: Path
     preview: Path | None
@@ -455,7 +456,7 @@ _TILE = 512
 
 @dataclass(frozen=True)
 class ExportReport(Result):
-    """What was written."""
+    """Result of an export."""
 
     paths: tuple[Path, ...]
     figures: dict[str, Any]

@@ -237,7 +237,7 @@ class PatternReport(Result):
     pattern: str
     images: tuple[ImagePattern, ...]
     failed: Mapping[str, str]
-    """Why, by name of the image."""
+    """Reasons of the failures, by name of the image."""
     linearisation: Linearisation
     pixel_um: float | None
     csv: Path | None

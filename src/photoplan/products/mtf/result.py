@@ -256,7 +256,7 @@ class MtfReport(Result):
 
     images: tuple[ImageMtf, ...]
     failed: dict[str, str]
-    """Why, by name of the image."""
+    """Reasons of the failures, by name of the image."""
     groups: tuple[EdgeGroup, ...]
     """Means over the edges of all images; the first is that of all edges of the first channel."""
     enhancement: Enhancement | None

@@ -51,7 +51,7 @@ class ProductResult(Result):
     failed: tuple[int, ...]
     """Tiles that could not be computed; the product is then not written."""
     reason: str = ""
-    """Why the first of them failed."""
+    """Reason why the first of them failed."""
 
     def written(self) -> Sequence[Path]:
         """Return the product and what belongs to it; nothing if tiles failed."""

@@ -32,9 +32,9 @@ class Level:
     mean: float
     """Grey value, mean over pixels and frames."""
     temporal_variance: float
-    """Of a pixel from frame to frame, without the variation of the frames' means; NaN for a single frame."""
+    """Variance of a pixel from frame to frame, without the variation of the frames' means; NaN for a single frame."""
     spatial_variance: float
-    """Of the mean image, with the rest of the temporal noise in it."""
+    """Variance of the mean image, with the rest of the temporal noise in it."""
     frame_mean_sigma: float
     """Standard deviation of the frames' means; NaN for a single frame."""
     saturated_share: float
@@ -46,7 +46,7 @@ class Level:
 
     @property
     def is_cut_off(self) -> bool:
-        """Whether black is cut off: more zeros than noise about a positive bias would give."""
+        """Return whether black is cut off: more zeros than noise about a positive bias would give."""
         return self.zero_share > ZERO_SHARE
 
     @property
@@ -144,7 +144,7 @@ class StackSums:
         self._squares += difference * (values - self._mean)
 
     def stack(self) -> FrameStack:
-        """What the frames say."""
+        """Return the statistics of the frames."""
         count = len(self._means)
         if self._mean is None or self._squares is None:
             raise InputError("no frame given")
@@ -260,7 +260,7 @@ class PatternVariance:
     total: float
     total_sigma: float
     row: float
-    """Of rows against each other."""
+    """Variance of rows against each other."""
     row_sigma: float
     column: float
     column_sigma: float
@@ -269,7 +269,7 @@ class PatternVariance:
     mean: float
     """Grey value."""
     filtered: bool
-    """Whether the slow variation was taken out."""
+    """True if the slow variation was taken out."""
 
 
 def pattern_variance(
@@ -482,7 +482,7 @@ def _scatter(values: NDArray[np.float64], least: float) -> float:
 
 
 def _factor(count: int) -> float:
-    """How many standard deviations a Gaussian value exceeds by chance in 0.01 of such images."""
+    """Return how many standard deviations a Gaussian value exceeds by chance in 0.01 of such images."""
     return float(-special.ndtri(_ALARMS / max(count, 1) / 2))
 
 
@@ -608,7 +608,7 @@ def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
 
 @dataclass(frozen=True, eq=False)
 class LogHistogram:
-    """How many pixels deviate by how much, and how many would by Gaussian noise."""
+    """Histogram of deviations of pixels, measured and expected for Gaussian noise."""
 
     deviation: NDArray[np.float64]
     """Middles of the classes, grey values."""

@@ -44,7 +44,7 @@ class VarianceCurve:
     bend: float
     """0 for a line."""
     covariance: tuple[tuple[float, ...], ...]
-    """Of value, slope and, where there is one, bend."""
+    """Covariances of value, slope and, if there is one, bend."""
     chi_square: float
     degrees: int
 
@@ -55,7 +55,7 @@ class VarianceCurve:
 
     @property
     def fits(self) -> bool:
-        """Whether the residuals may be noise alone."""
+        """Return whether the residuals may be noise alone."""
         return not self.degrees or chance_chi_square(self.chi_square, self.degrees) >= LEVEL
 
     @property
@@ -99,7 +99,7 @@ class PhotonTransfer:
 
     @property
     def bent(self) -> bool:
-        """Whether the response is not linear, with a chance of error of 1 ‰."""
+        """Return whether the response is not linear, with a chance of error of 1 ‰."""
         return self.curve.chance_straight < LEVEL
 
     @property
@@ -114,7 +114,7 @@ class PhotonTransfer:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the levels say against a line."""
+        """Return what the levels show against a line."""
         notes = []
         if self.curve.bend:
             notes.append(
@@ -283,7 +283,7 @@ def _bias(dark: Sequence[Level], exposures_ms: Sequence[float], black_level: flo
 
 
 def _no_read_noise(total: float, total_sigma: float, bias: float, dark: Sequence[Level], step: float) -> str:
-    """Why there is no read noise; empty: there is."""
+    """Return why there is no read noise; empty if there is."""
     cut = cut_off(dark, " of the dark frames")
     if cut:
         return f"{cut}, so that their noise is not that of the sensor; raise the camera's black level"
@@ -339,7 +339,7 @@ class Linearity:
     """Result for one series of levels."""
 
     exposure: NDArray[np.float64]
-    """Of the levels, increasing, in the unit that was given (ms, photons …)."""
+    """Exposures of the levels, increasing, in the unit that was given (ms, photons …)."""
     signal: NDArray[np.float64]
     """Grey values above black."""
     response: NDArray[np.float64]
@@ -449,7 +449,7 @@ _DEPARTED = 0.05
 
 @dataclass(frozen=True)
 class Saturation:
-    """Where and why it saturates."""
+    """Level of saturation, and its cause."""
 
     level_dn: float
     """Mean grey value of the most exposed level: what saturation looks like."""
@@ -709,7 +709,7 @@ def _responsivity(
 def _dark_noise(
     p: EmvaPoints, gain_of: tuple[float, float], step: float, refused: dict[str, str]
 ) -> tuple[float, float, float]:
-    """Of the shortest exposure: grey values, electrons, sigma."""
+    """Return the noise of the shortest exposure: grey values, electrons, sigma."""
     gain, gain_sigma = gain_of
     least, rounding = LEAST_VARIANCE * step**2, QUANTISATION * step**2
     variance = float(p.dark_variance[0])

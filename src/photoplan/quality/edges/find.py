@@ -201,7 +201,7 @@ def _straight(points: Array, normal: Array, size: Array, least_length: float) ->
 
 
 def _cut(t: Array, d: Array) -> float | None:
-    """Where a chain must be parted to be straight; None: it is."""
+    """Return the place at which a chain must be parted to be straight; None if it is."""
     order = np.argsort(t)
     ts, ds = t[order], d[order]
     length = float(ts[-1] - ts[0])
@@ -257,7 +257,7 @@ _MOST_STRIP = 16_000_000
 
 @dataclass(frozen=True)
 class Blur:
-    """How far an edge reaches, pixels."""
+    """Reach of an edge, pixels."""
 
     dark: float
     """From the line to the even dark side."""
@@ -298,7 +298,7 @@ class Strip:
         return _median(means.T)
 
     def blur(self) -> Blur | None:
-        """How far the step reaches to both sides, and the seam beside it; None: unknown.
+        """Return how far the step reaches to both sides, and the seam next to it; None if unknown.
 
         The step ends where its slope has fallen to a twentieth; the seam is as wide as the step's rise: there is what
         edge enhancement does.
@@ -336,7 +336,7 @@ class Strip:
         return Sides.of(self, dark, bright, slice(outer, 2 * self.half - outer))
 
     def worst_reason(self) -> str:
-        """Why no profile could be made."""
+        """Return why no profile could be made."""
         return "saturated" if self.saturated.sum() > self.invalid.sum() else "invalid"
 
 
@@ -349,7 +349,7 @@ class Sides:
     bright: slice
     window: slice
     means: tuple[Array, Array]
-    """Of the blocks, on the dark and on the bright side; NaN: without a pixel."""
+    """Means of the blocks, on the dark and on the bright side; NaN without a pixel."""
     noises: tuple[float, float]
     """Medians over the blocks of the deviation of pixels about the means of their bins, of both sides."""
 
@@ -384,7 +384,7 @@ class Sides:
         return contrast / max(self.noise, 1e-4 * contrast) if contrast > 0.0 else 0.0
 
     def good_blocks(self, evenness: float) -> tuple[NDArray[np.bool_], Counter[str]]:
-        """Which blocks are clean, and what the others are."""
+        """Return which blocks are clean, and what the others are."""
         s = self.strip
         everything = (s.count + s.saturated + s.invalid)[:, self.window].sum(axis=1)
         saturated = s.saturated[:, self.window].sum(axis=1) > _SPOILT * everything
@@ -411,7 +411,7 @@ class Sides:
         return good, +why
 
     def reason(self, evenness: float, least_snr: float) -> str:
-        """Why the blocks together are no edge to measure; empty if they are one."""
+        """Return why the blocks together are no edge to measure; empty if they are one."""
         contrast = self.contrast
         inner = self.strip.profile()[self.dark.stop : self.bright.start]
         low, high = (float(_median(mean)) for mean in self.means)
@@ -555,7 +555,7 @@ CHANCE = 1e-4
 
 @dataclass(frozen=True)
 class EdgeSettings:
-    """What an edge must be like, and how its profile is described."""
+    """Demands on an edge, and the description of its profile."""
 
     curve: int = 1
     """1: a straight line; 2: a parabola, for edges that a lens bends."""
@@ -593,7 +593,7 @@ class EdgeSettings:
 
 @dataclass(frozen=True, eq=False)
 class EdgeResiduals:
-    """What a profile leaves of the pixels, relative to the step, with where they are; shape (n,) each."""
+    """Residuals of the pixels after a profile, relative to the step, with their places; shape (n,) each."""
 
     across: NDArray[np.float64]
     along: NDArray[np.float64]
@@ -802,7 +802,7 @@ _RUN = 5
 
 @dataclass(frozen=True)
 class EdgeRules:
-    """What an edge must be like."""
+    """Demands on an edge."""
 
     least_length: float = 20.0
     """Pixels."""
@@ -1000,5 +1000,5 @@ def _longest(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def _is_aligned(line: StraightEdge) -> bool:
-    """Whether the edge crosses less than one row or column of pixels along its length."""
+    """Return whether the edge crosses less than one row or column of pixels along its length."""
     return min(abs(line.tx), abs(line.ty)) * line.length < 1.0

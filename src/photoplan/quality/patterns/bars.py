@@ -276,7 +276,7 @@ def _few_level(x: Array, phase: float, solution: Array, harmonics: tuple[int, ..
 
 
 def _alias(hidden: tuple[int, ...], amplitude: float) -> float:
-    """What waves that are hidden may add to the amplitude: those of a square wave, blurred as a Gaussian blurs.
+    """Return what hidden waves may add to the amplitude: those of a square wave, blurred as a Gaussian blurs.
 
     A Gaussian that leaves the share m of the fundamental wave leaves m to the power k² of the k-th one. m is not
     known here; it is at most 1, and 0.5 is taken: bars so fine that harmonics hide are seldom transferred better.
@@ -416,7 +416,7 @@ class BarCurve:
     high: float
     """Light of wide bright areas."""
     levels_from: str
-    """Where these levels come from, in words."""
+    """Source of these levels, in words."""
     contrast: MtfCurve
     """Contrast transfer of square waves (CTF), from the extremes; not an MTF."""
     mtf: MtfCurve

@@ -68,7 +68,7 @@ class StarRing:
     cosine: float
     sine: float
     covariance: Array
-    """Of cosine and sine, (2, 2)."""
+    """Covariances of cosine and sine, (2, 2)."""
     third: tuple[float, float] | None
     """Cosine and sine of the third harmonic wave; None where it is not fitted."""
     residual: float
@@ -215,7 +215,7 @@ _MOST_SIDE = 4096
 
 @dataclass(frozen=True)
 class StarRules:
-    """How a star is measured."""
+    """Rules of measuring a star."""
 
     sectors: int | None = None
     """Bright sectors, to be confirmed; None: as counted."""
@@ -247,7 +247,7 @@ class StarRules:
 
 @dataclass(frozen=True, eq=False)
 class StarMtf:
-    """What a Siemens star says of an image."""
+    """Result of an image of a Siemens star."""
 
     centre: tuple[float, float]
     """Column and row in the window."""
@@ -262,7 +262,7 @@ class StarMtf:
     radii: tuple[float, float]
     """Inner and outer radius that were measured, pixels."""
     mtf: MtfCurve
-    """Of whole rings: the mean over all directions."""
+    """Curve of whole rings: the mean over all directions."""
     directional: dict[float, MtfCurve]
     """By direction of the frequency, degrees from the columns' direction towards increasing rows, 0 to 180. A star's
     sectors at an angle hold frequencies across it."""

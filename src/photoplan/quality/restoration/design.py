@@ -101,7 +101,7 @@ def kept_by_compression(pixels: Array) -> Array:
 
 
 def at_frequencies(kept: Array, u: Array, v: Array) -> Array:
-    """What `kept_by_compression` found at frequencies up to 0.5 cycles per pixel; arrays that broadcast."""
+    """Return what `kept_by_compression` found at frequencies up to 0.5 cycles per pixel; arrays that broadcast."""
     at = np.arange(BLOCK) / (2.0 * BLOCK)
     along, down = (np.stack([np.interp(np.abs(f), at, unit) for unit in np.eye(BLOCK)]) for f in (u, v))
     return np.asarray(np.einsum("ij,i...,j...->...", kept, down, along))
@@ -186,14 +186,14 @@ _FREQUENCIES = np.linspace(0.0, 0.5, 1001)
 
 @dataclass(frozen=True)
 class Condition:
-    """Whether a spread function can be inverted exactly."""
+    """Conditions on which a spread function can be inverted exactly."""
 
     neighbour_ratio: float
     """A / Z; exact restoration needs less than 1/2: two objects one pixel apart do not fuse (Kölbl 2006, §2)."""
     least_transfer: float
     """Smallest modulus of the transfer function up to 0.5 cycles/pixel; 0: a frequency is lost."""
     at_frequency: float
-    """Where it is, cycles per pixel."""
+    """Frequency of that, cycles per pixel."""
     smallest_singular: float
     """Smallest singular value of the band matrix."""
     largest_singular: float
@@ -206,7 +206,7 @@ class Condition:
 
     @property
     def holds(self) -> bool:
-        """Whether the exact inverse exists and means something."""
+        """Return whether the exact inverse exists and means something."""
         return self.neighbour_ratio < 0.5 and self.least_transfer > 1e-6 and self.number < 1e6
 
     def __str__(self) -> str:
@@ -326,7 +326,7 @@ class Expectation:
     def of(
         cls, transfer: Transfer, scene: SceneStatistics, aperture: float = 1.0, kept: Array | None = None
     ) -> Expectation:
-        """What is expected of an image."""
+        """Return what is expected of an image."""
         u, v = frequency_grid()
         power, (modulation, sigma) = scene.power(u, v), transfer(u, v)
         ideal = np.sinc(aperture * u) * np.sinc(aperture * v)
@@ -451,7 +451,8 @@ def _check(across: NDArray[np.float64], along: NDArray[np.float64]) -> None:
 
 
 def _axis_weights(half: int, digits: int | None) -> NDArray[np.float64]:
-    """How each weight follows from those on the axes, shape (2 n + 1, 2 n + 1, 1 + 2 n): centre, x axis, y axis."""
+    """Return how each weight follows from those on the axes, shape (2 n + 1, 2 n + 1, 1 + 2 n): centre, x axis, y
+    axis."""
     offset = np.arange(-half, half + 1.0)
     x, y = np.meshgrid(offset, offset)
     distance = np.hypot(x, y)
@@ -490,7 +491,7 @@ _NAMES = {"none": "as it is", "regularised": "regularised", "exact": "exact"}
 
 @dataclass(frozen=True, eq=False)
 class Sharpness:
-    """What is known of an image's sharpness in one direction."""
+    """Sharpness of an image in one direction, as far as it is known."""
 
     spread: SpreadFunction
     curve: MtfCurve | None = None
@@ -508,7 +509,7 @@ class Sharpness:
 
     @property
     def doubt(self) -> str:
-        """Why the spread function is practically unknown, with figures; empty if it is known."""
+        """Return why the spread function is practically unknown, with figures; empty if it is known."""
         curve = self.modulation()
         low, high = curve.mtf50_interval()
         value = float(np.nan_to_num(curve.mtf50, nan=curve.frequency[-1]))
@@ -517,11 +518,11 @@ class Sharpness:
 
 @dataclass(frozen=True)
 class DesignOptions:
-    """What a user decides."""
+    """Choices of the user."""
 
     method: Literal["auto", "exact", "regularised"] = "auto"
     rotation: Literal["radial", "separable"] = "radial"
-    """How an exact inverse becomes two-dimensional."""
+    """Way in which an exact inverse becomes two-dimensional."""
     half: int | None = None
     """Pixels to each side; None: 5, or as many as an exact inverse needs."""
     aperture: float = 1.0
@@ -542,8 +543,8 @@ class Design:
     expected: Mapping[str, float] = field(default_factory=dict)
     """Expected root mean square error in light by method, ``none`` for the image as it is; empty if unknown."""
     scene: SceneStatistics | None = None
-    """What the errors are expected for: the first of the scenes, or where nothing is done that in which a filter would
-    gain least."""
+    """Scene that the errors are expected for: the first one, or if nothing is done that in which a filter would gain
+    least."""
 
     @property
     def noise_gain(self) -> float:
@@ -660,7 +661,7 @@ class _Choice:
     def of(
         cls, transfer: Transfer, scenes: Sequence[SceneStatistics], aperture: float, kept: NDArray[np.float64] | None
     ) -> _Choice:
-        """Of an image of a modulation transfer."""
+        """Return the choice for an image of a modulation transfer."""
         cases = ((transfer, None), (transfer, kept), (sharpest(transfer), kept))
         return cls(scenes, *([Expectation.of(h, s, aperture, lost) for s in scenes] for h, lost in cases))
 
@@ -669,11 +670,11 @@ class _Choice:
         return int(np.argmax([model.gain(kernel) for model in self.models]))
 
     def gain(self, kernel: NDArray[np.float64]) -> float:
-        """What a filter leaves of the error in its worst scene."""
+        """Return what a filter leaves of the error in its worst scene."""
         return self.models[self.worst(kernel)].gain(kernel)
 
     def regularised(self, half: tuple[int, int]) -> NDArray[np.float64]:
-        """Of the best filters of each scene and of their mean the one that gains most in its worst scene."""
+        """Return the filter that gains most in its worst scene, of the best filters of each scene and of their mean."""
         means = [Expectation.mean(self.plain)] if len(self.plain) > 1 else []
         return min((model.best(half) for model in [*self.plain, *means]), key=self.gain)
 

@@ -42,7 +42,7 @@ _SMOOTHED = 0.8
 
 @dataclass(frozen=True)
 class SceneStatistics:
-    """What a filter is designed for, in linear light.
+    """Scene that a filter is designed for, in linear light.
 
     The scene's power spectrum is a power of the frequency and, besides, the same at all frequencies.
     """
@@ -111,7 +111,7 @@ def block_spectra(grey: Array, usable: NDArray[np.bool_] | None = None) -> Array
 def scenes_of(
     spectrum: Array, transfer: Transfer, even: float, stated: float | None = None
 ) -> tuple[SceneStatistics, ...]:
-    """What an image may show by its mean spectrum: what is fine in it is texture, or it is noise.
+    """Return what an image may show by its mean spectrum: what is fine in it is texture, or it is noise.
 
     A blurred white texture and noise that was smoothed have the same spectrum, and the mean spectrum alone cannot tell
     which it is. So there are two answers: noise of any size and smoothing, and no texture; and white noise, no more
