@@ -16,7 +16,7 @@ from photoplan.kernels import (
     facets_transfer,
 )
 from photoplan.kernels.jit import COMPILED
-from photoplan.matching.facets.fine import shares
+from photoplan.matching.facets.grey import shares
 from photoplan.matching.facets.means import means_around
 
 

@@ -21,7 +21,7 @@ from photoplan.kernels.facets_height import MOMENTS, GreyFacets, Pixels, add_hei
 from photoplan.kernels.facets_signs import signs_at
 from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
 from photoplan.kernels.facets_sums import OFFSETS, PAD, add_grey, count_pixels, sort_pixels
-from photoplan.matching.facets.fine import shares
+from photoplan.matching.facets.grey import GreyTexture, shares
 from photoplan.matching.facets.means import away_from_border, corners, smoothed
 from photoplan.matching.facets.observe import (
     Facets,
@@ -34,7 +34,6 @@ from photoplan.matching.facets.observe import (
     first_guess,
     levelled,
 )
-from photoplan.matching.facets.texture import GreyTexture
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]

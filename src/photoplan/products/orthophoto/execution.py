@@ -18,7 +18,8 @@ from photoplan.engine.run import Kept, Tally, Work
 from photoplan.errors import InputError, PhotoplanError, TilesFailed
 from photoplan.events import Events
 from photoplan.io.disk import make_folder
-from photoplan.io.product import ProductFacts, ProductFile, is_product, refuse_foreign_virtual
+from photoplan.io.files import safe_stem
+from photoplan.io.product import ProductFacts, ProductFile, is_product, refuse_foreign_virtual, write_stacked
 from photoplan.io.project.model import Project
 from photoplan.io.quicklook import refuse_foreign_overview, write_overview
 from photoplan.io.raster_info import ImageForm, bands_of
@@ -46,7 +47,6 @@ from photoplan.products.orthophoto.finished import (
     stale_files,
 )
 from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, known_errors, painting, tile_keys
-from photoplan.products.orthophoto.stack import stack_index, write_stack
 from photoplan.products.plausibility import one_colour, one_colour_told
 from photoplan.products.run import Run, refuse_inputs, tile_bytes
 from photoplan.project.scene import Scene, Scenes, ScenesAddress, input_files, open_scene
@@ -112,7 +112,7 @@ def execute_all(plan: OrthoPlan, folder: Path, run: Run) -> list[ProductResult]:
     if in_sheets:
         # Shapely and vector files: a quarter of the start, and only here.
         from photoplan.products.orthophoto.sheets import sheet_index, write_index  # noqa: PLC0415
-    index = sheet_index(plan, folder) if in_sheets else stack_index(plan, folder)
+    index = sheet_index(plan, folder) if in_sheets else _stack_index(plan, folder)
     refuse_inputs(input_files(plan.project), index[:1])
     for path in index:
         refuse_foreign_virtual(path)
@@ -140,7 +140,7 @@ def execute_all(plan: OrthoPlan, folder: Path, run: Run) -> list[ProductResult]:
     if picture is not None:
         write_overview([r.path for r in results if not r.failed], picture, plan.command)
     for path in index:
-        (write_index if in_sheets else write_stack)(plan, path, [r for r in results if not r.failed])
+        (write_index if in_sheets else _write_stack)(plan, path, [r for r in results if not r.failed])
     if not any(r.failed for r in results):
         marker.end()
     return results
@@ -365,3 +365,16 @@ def _image_record(name: str, scene: Scene, look: Look) -> dict[str, Any]:
         "restored": None if step is None else step.describe(),
         "tremor": tremor_told(scene.camera, look.footprint.usual_height),
     }
+
+
+def _stack_index(plan: OrthoPlan, folder: Path) -> list[Path]:
+    """Return the file that shows orthophotos as bands (lines of one camera on the same ground); none unless wanted."""
+    name = plan.settings.stack
+    return [folder / f"{safe_stem(name)}.vrt"] if name else []
+
+
+def _write_stack(plan: OrthoPlan, path: Path, results: Sequence[ProductResult]) -> None:
+    """Write that file, of the orthophotos that are there."""
+    images = {product.plan.name: product.images[0] for product in plan.products}
+    if results:
+        write_stacked(path, {images[result.path.stem]: result.path for result in results})

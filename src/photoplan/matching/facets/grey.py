@@ -1,17 +1,10 @@
-"""Texture told from noise: what part of the slopes with which pixels tell heights is the ground's own.
-
-Grey values of the surface hold noise, whose slopes add to the sensitivities of the pixels to height: Σ p (a − ā)² with
-them is larger than with those of the texture, by the part 1 / w. But misfits change with height by the texture's
-slopes alone. So a right-hand side Σ p (a − ā) v changes by w of these sums with a metre, and scatters as all of them.
-So what noise adds to the variances of heights is larger by a factor between 1, where curvatures hold them, and
-1 / w², where pixels alone do; 1 / w is taken. Heights are solved with all of the sums: what does not fit yet, or never,
-looks like noise.
-"""
+"""Grey facets: their texture told from noise, and waves between coefficients of facets coarser than pixels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +21,22 @@ _Doubles = NDArray[np.float64]
 _SEEN, _DRAWN = 3, 9
 #: Least part that is taken to be texture: sums over so few facets tell no less from none.
 _LEAST = 0.05
+#: Coefficients along a row or column, waves of how many radians a facet they give (2.6 facets long), parts of a facet.
+_TAPS, _SHORTEST, _PARTS = 8, 2.4, 128
+_WAVES = 60
 
 
 @dataclass(frozen=True, eq=False)
 class GreyTexture:
-    """What errors that are drawn tell of the grey values of a block."""
+    """Texture of a block and its noise: the part of the slopes of grey values that is the ground's own.
+
+    Grey values of the surface hold noise, whose slopes add to the sensitivities of the pixels to height: Σ p (a − ā)²
+    with them is larger than with those of the texture, by the part 1 / w. But misfits change with height by the
+    texture's slopes alone. So a right-hand side Σ p (a − ā) v changes by w of these sums with a metre, and scatters as
+    all of them. So what noise adds to the variances of heights is larger by a factor between 1, where curvatures hold
+    them, and 1 / w², where pixels alone do; 1 / w is taken. Heights are solved with all of the sums: what does not fit
+    yet, or never, looks like noise.
+    """
 
     errors: _Floats
     """Errors of the coefficients: one standard deviation each, with their covariance."""
@@ -73,3 +77,23 @@ class GreyTexture:
         for out, coefficients in zip(found, (values, self.errors)):
             sample_grey(coefficients, ratio, at, out)
         return 1 - float(found[1].var()) / max(float(found[0].var()), 1e-30)
+
+
+@cache
+def shares() -> NDArray[np.float64]:
+    """Return shares of the coefficients next to a place, see `add_missed`: those with which waves have, by least
+    squares, the size that cubic facets give them, and nothing else.
+
+    A cubic spline through samples of a wave with k radians a facet has beside it one with k − 2π, about (k / (2π − k))⁴
+    as large. Pixels that lie nearly as the facets do see it as a shift of the first, over as long a stretch as they
+    keep in step, and hardly as residuals. The same coefficients with more of their neighbours give the wave alone.
+    """
+    k = np.linspace(0, _SHORTEST, _WAVES)
+    sizes = np.sinc(k / (2 * np.pi)) ** 4
+    at = np.arange(_TAPS) - (_TAPS // 2 - 1)
+    out = np.empty((_PARTS + 1, _TAPS))
+    for n in range(_PARTS + 1):
+        turns = k[:, None] * (at - n / _PARTS)
+        equations = np.concatenate([np.cos(turns), np.sin(turns)])
+        out[n] = np.linalg.lstsq(equations, np.concatenate([sizes, np.zeros(_WAVES)]), rcond=None)[0]
+    return np.asarray(out / out.sum(axis=1, keepdims=True))

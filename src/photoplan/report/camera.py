@@ -1,14 +1,31 @@
-"""Report of the characterisation of a camera: the findings of every analysis, and what could not be known."""
+"""Reports of cameras: their characterisation from image series, and the figures of a sensor's description."""
 
 from __future__ import annotations
 
-from photoplan.products.characterise.run import CharacteriseReport
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 from photoplan.report.findings import findings_section
 from photoplan.report.page import headline, page, section, table, text
 
+if TYPE_CHECKING:
+    from photoplan.products.characterise.run import CharacteriseReport
+    from photoplan.products.sensor import SensorReport
+
+#: Titles of the sections of a sensor's report.
+_TITLES = {
+    "viewing": "Viewing",
+    "video": "Video norm",
+    "sensor": "Sensor",
+    "image": "Digital image",
+    "transfer": "Charge transfer",
+    "noise": "Noise",
+    "optics": "Lens",
+}
+
 
 def characterise_page(made: CharacteriseReport) -> str:
-    """Return the report as one HTML document."""
+    """Return the findings of every analysis, and what could not be known, as one HTML document."""
     series = made.series
     done = [(run.analysis.title, run.outcome) for run in made.runs if run.outcome is not None]
     kinds = dict.fromkeys(frame.kind for frame in series.frames)
@@ -37,3 +54,9 @@ def characterise_page(made: CharacteriseReport) -> str:
         sections.append(section("Not done", [table(("analysis", "state", "why"), others)]))
     title = f"Camera characterisation: {series.camera.name or series.path.stem}"
     return page(title, f"From the image series {series.path.name}", [head, *remarks, *sections])
+
+
+def sensor_page(found: SensorReport) -> str:
+    """Return figures and plots of charge transfer, noise and transfer functions as one HTML document."""
+    parts = [findings_section(replace(each, title=_TITLES[each.title])) for each in found.sections]
+    return page(f"Sensor: {found.described.name}", "Figures of a sensor, computed from its description", parts)

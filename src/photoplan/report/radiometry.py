@@ -1,4 +1,4 @@
-"""The picture of balanced images: overlaps before and after, on the map too, tables, and trends."""
+"""Pictures of radiometry: balanced images (overlaps, tables, maps, trends), and light on slopes before and after."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.products.balance import BalanceReport
+from photoplan.products.illumination import IlluminationReport
 from photoplan.radiometry.balance import Balanced, Pairs
 from photoplan.radiometry.equations import SIDE
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, figure_of, png, styled
@@ -16,6 +17,8 @@ _BANDS = (RED, GREEN, BLUE, ORANGE)
 _PAIRS, _TRENDS = 30, 4
 #: Points of a trend along the longer side of an image.
 _SIDE = 60
+#: Points of light on slopes that are drawn, and classes of cos i of which the mean is.
+_POINTS, _CLASSES = 4000, 20
 
 
 @styled
@@ -116,3 +119,35 @@ def _spread(found: Balanced) -> list[int]:
     """Places of some images with tones, spread over all."""
     count = len(found.images)
     return sorted({int(k) for k in np.linspace(0, count - 1, min(_TRENDS, count))}) if count else []
+
+
+@styled
+def draw_light(report: IlluminationReport) -> bytes:
+    """Draw grey values over the light on slopes: a row of plots before, a row after, as PNG."""
+    bands = min(len(report.before), len(_BANDS))
+    lit = np.flatnonzero(report.sample.lit)
+    some = lit[np.linspace(0, len(lit) - 1, min(_POINTS, len(lit))).astype(int)]
+    fig = figure_of(1.0 + 3.2 * bands, 5.6)
+    axes = fig.subplots(2, bands, sharex=True, sharey="col", squeeze=False)
+    rows = zip(("before", "after"), (report.before, report.after), report.correlations, axes)
+    for word, values, correlations, row in rows:
+        for band, at in enumerate(row):
+            _cloud(at, report, values[band], some, band)
+            at.set_title(f"Band {band + 1} {word}: correlation {correlations[band]:+.3f}")
+    for at in axes[1]:
+        at.set_xlabel("cos i: 1 faces the sun")
+    axes[0, 0].set_ylabel("grey value")
+    axes[1, 0].set_ylabel("grey value")
+    return png(fig)
+
+
+def _cloud(axes: Any, report: IlluminationReport, values: Any, some: Any, band: int) -> None:
+    """Draw pixels on which the sun shines, the means of classes, and the light on level ground."""
+    light = report.sample.cos_i[some]
+    axes.plot(light, values[some], ".", markersize=1.5, color=_BANDS[band], alpha=0.35)
+    edges = np.linspace(0, 1, _CLASSES + 1)
+    of = np.digitize(light, edges) - 1
+    each = [(light[of == k].mean(), values[some][of == k].mean()) for k in range(_CLASSES) if (of == k).sum() > 5]
+    axes.plot(*np.array(each).T, color=INK, linewidth=1.2)
+    axes.axvline(report.model.cos_z, color=SOFT, linewidth=0.8, linestyle=":")
+    axes.set_xlim(0, 1)
