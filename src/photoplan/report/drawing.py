@@ -21,6 +21,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 #: Colours of Okabe and Ito.
 BLUE, RED, ORANGE, GREEN, PURPLE, SKY = "#0072B2", "#D55E00", "#E69F00", "#009E73", "#CC79A7", "#56B4E9"
+COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
+"""Colours of curves, in their order."""
 INK, SOFT = "#1c2730", "#5c6b77"
 STYLE = {
     "font.family": "DejaVu Sans",

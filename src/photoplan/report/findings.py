@@ -8,26 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.findings import Bars, Chart, Findings, Picture, Table, Trace, number, shrunk, spaced
-from photoplan.report.drawing import (
-    BLUE,
-    GREEN,
-    INK,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    SOFT,
-    axes_of,
-    mpl,
-    png,
-    round_down,
-    styled,
-)
+from photoplan.report.drawing import BLUE, COLOURS, INK, RED, SOFT, axes_of, mpl, png, round_down, styled
 from photoplan.report.page import Cell, figure, section, table, text
 
 Array = NDArray[np.float64]
 
-COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 _SIZE = (6.6, 3.6)
 #: Letters that fit side by side in a legend, and those that the sign of a curve takes.
 _LEGEND, _HANDLE = 84, 7
