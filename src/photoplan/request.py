@@ -206,7 +206,7 @@ IMAGES: Any = opt("Images or patterns; may be repeated [all].", (), listed=True,
 PICTURE: Any = opt("Write a picture of the result.", True, flag="no-picture", section="result",
                    off="Write no picture of the result.")  # fmt: skip
 REPORT_FORMAT: Any = opt("Format of the report.", "html", section="result")
-DRY_RUN: Any = opt("Say what would be done, and stop.", False, section="run")
+DRY_RUN: Any = opt("Print what would be done, and stop.", False, section="run")
 _EXECUTORS = "threads, processes, or the address of a Dask scheduler, tcp://host:port."
 EXECUTOR: Any = opt(_EXECUTORS, "threads", metavar="KIND", section="run")
 MEMORY: Any = opt("Largest memory of the run, such as 2GB.", None, size=True, metavar="SIZE", section="run")

@@ -221,7 +221,7 @@ def _fit(project: Project, name: str, path: Path) -> tuple[ImagePolynomials, Pat
     camera = camera_without_pixels(project, name)
     seen = footprint(camera, ground.bare, ground.bounds)
     if seen.bounds is None:
-        raise GeometryError(f"image {name!r} sees nothing of the terrain; `photoplan check` says where it looks")
+        raise GeometryError(f"image {name!r} sees nothing of the terrain; `photoplan check` reports where it looks")
     heights = _heights(camera, seen.height_range)
     try:
         found = fit_rpc(camera, GeodeticGround(project.crs, ground.working_system), heights)

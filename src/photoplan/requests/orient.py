@@ -61,7 +61,7 @@ class ConvertRequest(Request):
         if self.list_readings and (self.image_points is None or self.control is None):
             raise UsageError("`list_readings` needs `image_points` FILE and `control` FILE")
         if not self.list_readings and self.target is None:
-            raise UsageError("say the format to write with `target` FORMAT")
+            raise UsageError("set `target` to the format to write")
         if not self.list_readings and (self.image_points is not None or self.control is not None):
             raise UsageError("`image_points` and `control` go with `list_readings`")
 
@@ -135,7 +135,7 @@ class InteriorRequest(Request):
     def check(self) -> None:
         """Refuse to write no model."""
         if self.write and self.model is None:
-            raise UsageError("`write` sets the model of the cameras; say which with `model`")
+            raise UsageError("`write` sets the model of the cameras; set `model`, too")
 
 
 class ControlRequest(Request):

@@ -515,7 +515,7 @@ class SkylineRequest(MeasuringRequest):
             raise UsageError(f"`{given[0]}` belongs to a photograph; give `photo`, too")
         for name in ("focal", "refined"):
             if getattr(self, name) and not self.refine:
-                raise UsageError(f"`{name}` belongs to a camera that is turned; say `refine`, too")
+                raise UsageError(f"`{name}` belongs to a camera that is turned; set `refine`, too")
         if self.border < 0 or (self.search is not None and self.search < 2):
             raise UsageError(f"`border` {self.border}, `search` {self.search}; pixels from 0 and from 2 are needed")
         for path, suffix in ((self.picture, ".png"), (self.refined, ".toml")):
