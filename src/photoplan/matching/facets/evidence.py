@@ -9,7 +9,7 @@ where there is no texture: there all heights are as good. What a post alone does
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,9 +140,7 @@ def evidence(
     some[::_THIRD, ::_THIRD] = True
     at = np.ix_(*(np.minimum(np.arange(n) // _THIRD * _THIRD, n - 1) for n in facets.shape))
     spoken = strong & ~some & strong[at]
-    sizes = (1, *_AROUND)
-    lowest: dict[int, _Doubles] = {}
-    sums, before, barrier = dict(lowest), dict(lowest), dict(lowest)
+    choices: dict[int, _Choice] = {}
     edges = edge_variances(block)[inner] > 0
     for k in (*range(counts[0] + 1), *range(-1, -counts[1] - 1, -1)):
         far = abs(k) * _STEP > _NEARBY
@@ -153,7 +151,7 @@ def evidence(
         allowed = (heights + offset >= low - step) & (heights + offset <= high + step) | (abs(k) <= 2)
         if k == 0:
             flat = _open(L)
-        for size in sizes:
+        for size in (1, *_AROUND):
             # Posts around count as they stand relative to their own heights: a roof is lifted as a whole.
             total = L
             if size > 1:
@@ -163,38 +161,14 @@ def evidence(
             if k == 0:
                 # Another height takes a break of the surface, if the images agree around: as rare as breaks are.
                 rare = (1.0 - _open(total)) * np.log((edges.sum() + 1) / (edges.size + 1))
-                lowest[size], before[size] = total, total
-                sums[size] = np.stack([np.ones(facets.shape), *np.zeros((2, *facets.shape))])
-                continue
-            if abs(k) == 1:
-                barrier[size] = before[size].copy()
-            # The same valley is no other choice, unless there is none: gradually, as evidence has noise.
-            distant = abs(k) * _STEP > _SAME
-            rises = _RISES if distant else _RISES_NEAR
-            other = np.clip(barrier[size] - rises - total, 0.0, 1.0)
-            if distant:
-                other = np.maximum(other, _open(before[size]))
-            barrier[size] = np.maximum(barrier[size], total)
-            total = np.where(allowed, total - rare, np.inf)
-            least = np.minimum(lowest[size], total)
-            kept, p = np.exp(least - lowest[size]), np.exp(least - total)
-            for n, weight in enumerate((1.0, np.maximum(other, flat) * offset**2, other)):
-                sums[size][n] = sums[size][n] * kept + p * weight
-            lowest[size] = least
-    around = np.maximum(maximum_filter(heights, _RANGE) - heights, heights + maximum_filter(-heights, _RANGE)) ** 2 / 3
-    variance, agreed = np.zeros((2, *facets.shape))
+                choices[size] = _Choice(total)
+            else:
+                choices[size].add(total, k, offset, np.where(allowed, total - rare, np.inf), flat)
     with np.errstate(invalid="ignore"):
         # All pixels fit, or those of the images that agree best: what hides a place from one image is no misfit.
         fit = np.fmin(misfit, np.sqrt(here[0] / variances(here[1])))
-    against = np.nan_to_num(fit) ** 2 > _AGAINST
-    for size in sizes:
-        none = _NONE * sum(counts) * np.exp(np.minimum(lowest[size], 50.0) + rare)
-        whole = sums[size][0] + none
-        right = 1.0 - (sums[size][2] + none) / whole
-        # What a post decides against its height the posts around do not overrule.
-        better = (right > agreed) & ~against | (size == 1)
-        variance = np.where(better, (sums[size][1] + none * around) / whole, variance)
-        agreed = np.where(better, right, agreed)
+    none = {size: _NONE * sum(counts) * np.exp(np.minimum(each.lowest, 50.0) + rare) for size, each in choices.items()}
+    variance, agreed = _decided(choices, none, heights, fit)
     beside = (
         np.maximum(maximum_filter(heights, _BESIDE) - heights, heights + maximum_filter(-heights, _BESIDE)) ** 2 / 3
     )
@@ -202,8 +176,54 @@ def evidence(
     return HeightEvidence(seen.sum(axis=0).astype(np.uint8), variance, agreed, fit)
 
 
+class _Choice:
+    """Choice among heights by evidence that was added over squares of a size; the first one is the surface's own."""
+
+    def __init__(self, here: _Doubles) -> None:
+        self._here = self._barrier = here
+        self.lowest = here
+        """Evidence of the best height so far."""
+        self.sums = np.stack([np.ones(here.shape), *np.zeros((2, *here.shape))])
+        """Sums of p, of p times the squared distance, and of p of other heights, relative to the best height's p."""
+
+    def add(self, total: _Doubles, k: int, offset: float, allowed: _Doubles, flat: _Doubles) -> None:
+        """Add the k-th height to one side, from near to far; `allowed` is `total` as far as the height may be taken."""
+        if abs(k) == 1:
+            self._barrier = self._here
+        # The same valley is no other choice, unless there is none: gradually, as evidence has noise.
+        distant = abs(k) * _STEP > _SAME
+        rises = _RISES if distant else _RISES_NEAR
+        other = np.clip(self._barrier - rises - total, 0.0, 1.0)
+        if distant:
+            other = np.maximum(other, _open(self._here))
+        self._barrier = np.maximum(self._barrier, total)
+        least = np.minimum(self.lowest, allowed)
+        kept, p = np.exp(least - self.lowest), np.exp(least - allowed)
+        for n, weight in enumerate((1.0, np.maximum(other, flat) * offset**2, other)):
+            self.sums[n] = self.sums[n] * kept + p * weight
+        self.lowest = least
+
+
+def _decided(
+    choices: Mapping[int, _Choice], none: Mapping[int, _Doubles], heights: _Doubles, fit: _Doubles
+) -> tuple[_Doubles, _Doubles]:
+    """Return the variance of the choice and the probability of the height, from squares of those sizes that are surest;
+    `none` is the weight of no height at all."""
+    around = np.maximum(maximum_filter(heights, _RANGE) - heights, heights + maximum_filter(-heights, _RANGE)) ** 2 / 3
+    variance, agreed = np.zeros((2, *heights.shape))
+    against = np.nan_to_num(fit) ** 2 > _AGAINST
+    for size, choice in choices.items():
+        whole = choice.sums[0] + none[size]
+        right = 1.0 - (choice.sums[2] + none[size]) / whole
+        # What a post decides against its height the posts around do not overrule.
+        better = (right > agreed) & ~against | (size == 1)
+        variance = np.where(better, (choice.sums[1] + none[size] * around) / whole, variance)
+        agreed = np.where(better, right, agreed)
+    return variance, agreed
+
+
 def _open(L: _Doubles) -> _Doubles:
-    """By how much evidence leaves a height undecided, 0 to 1."""
+    """Return by how much evidence leaves a height undecided, 0 to 1."""
     return np.clip((L - _UNDECIDED) / 2 + 0.5, 0.0, 1.0)
 
 
