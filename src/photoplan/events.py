@@ -1,4 +1,4 @@
-"""How long work tells what it is at, and is spread over workers: one protocol each for the whole package.
+"""Progress, messages and workers of long work: one protocol each for the whole package.
 
 Whoever works calls it; a command shows it on a terminal or writes a line now and then, a test keeps it, most callers
 want nothing of it (`SILENT`).

@@ -1,4 +1,4 @@
-"""Results and findings of operations: what a command prints, writes as JSON and tables, and shows in a report."""
+"""Results and findings of operations: figures with standard deviations, tables and charts, as text, JSON and report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What everything that maps ground to an image can do. The rest of photoplan knows no more of a camera."""
+"""Projections and cameras in general: everything that maps ground to an image; the rest of photoplan knows no more."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is measured to orient images: points in images, points on the ground, positions and attitudes of cameras."""
+"""Measurements that orient images: points in images, points on the ground, positions and attitudes of cameras."""
 
 from __future__ import annotations
 

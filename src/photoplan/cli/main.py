@@ -28,8 +28,8 @@ from photoplan.errors import PhotoplanError, PhotoplanWarning, ResourceError
 def photoplan() -> None:
     """Photographs with known geometry become measurable pictures.
 
-    A job goes: init → (fiducials → tie → adjust) → check → ortho. Results are printed on stdout, talk and progress
-    on stderr.
+    A job goes: init → (fiducials → tie → adjust) → check → ortho. Results are printed on stdout, messages and
+    progress on stderr.
     Exit codes: 0 done, 1 failed, 2 wrong use, 3 bad input, 4 finished, but tiles or images failed, 5 out of disk or
     memory, 130 interrupted.
     """

@@ -1,4 +1,4 @@
-"""What cameras and drones write into their images: position, attitude, time, focal length.
+"""Metadata that cameras and drones write into their images (EXIF, XMP): position, attitude, time, focal length.
 
 Read from EXIF entries and the XMP packet in the header of a JPEG or TIFF file; the pixels are not touched. EXIF is a
 TIFF structure (CIPA DC-008, TIFF 6.0): a chain of directories of entries (tag, type, count, value or offset). Own

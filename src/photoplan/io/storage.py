@@ -1,4 +1,4 @@
-"""How a product is stored, and how a finished tile becomes the bytes of a block."""
+"""Storage of a product: nodata values, blocks of finished tiles, cloud-optimised GeoTIFFs and pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether an orientation that was computed can be right, and which other reading of its measurements would be.
+"""Judgement of a computed orientation: whether it can be right, and which other reading of its measurements would be.
 
 Least squares finds a pose for mirrored, exchanged and wrongly scaled coordinates as well: it lies under the ground and
 looks up, throws much of the control out, or misses it by many times what was stated. Whatever writes an orientation

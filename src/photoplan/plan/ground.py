@@ -1,4 +1,4 @@
-"""What of a tile is the same for all its sources: its relief, and where on the ground its boxes are."""
+"""Ground of a tile, the same for all its sources: its relief, and the places of its boxes on the ground."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a film camera's fiducial marks look like: from its description to the patterns that are sought."""
+"""Appearance of a film camera's fiducial marks: from its description to the patterns that are sought."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What images show of a map, by what seams compare them: on pixels of several sizes, kept in a store."""
+"""Grey values of images on a map, by which seams compare them: on pixels of several sizes, kept in a store."""
 
 from __future__ import annotations
 

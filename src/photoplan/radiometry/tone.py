@@ -1,4 +1,4 @@
-"""What becomes of grey values: light by the image's curve, without the trend over the image, then a monotone table."""
+"""Tones of grey values: light by the image's curve, without the trend over the image, then a monotone table."""
 
 from __future__ import annotations
 

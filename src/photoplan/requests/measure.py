@@ -1,4 +1,4 @@
-"""Requests of commands that measure in images: registration of two images, ground points of image points."""
+"""Requests of commands that measure in images: register (two images), monoplot (ground points of image points)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requests of commands that orient images: from the conversion of orientations to bundle adjustment."""
+"""Requests of commands that orient images: convert, fiducials, interior, tie, control, resect, adjust."""
 
 from __future__ import annotations
 

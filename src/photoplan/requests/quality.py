@@ -1,4 +1,4 @@
-"""Requests of commands about image quality: sensors, sharpness, restoration, cameras, simulated images."""
+"""Requests of commands about image quality: mtf, restore, characterise, sensor, simulate."""
 
 from __future__ import annotations
 

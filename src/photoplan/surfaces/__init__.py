@@ -1,4 +1,4 @@
-"""Where the object is: a depth for every pixel of a target."""
+"""Surfaces: a depth for every pixel of a target."""
 
 from photoplan.public import public
 

@@ -1,4 +1,4 @@
-"""What is seen of a surface: view buffers, lines, skylines."""
+"""Visible parts of a surface: view buffers, lines, skylines."""
 
 from __future__ import annotations
 

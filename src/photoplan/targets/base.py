@@ -1,4 +1,4 @@
-"""What every target can do."""
+"""Targets in general: what every one of them can do."""
 
 from __future__ import annotations
 

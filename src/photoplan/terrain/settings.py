@@ -1,4 +1,4 @@
-"""How a terrain model is built."""
+"""Settings of building a terrain model: grid, covariance function, filter values, gross errors."""
 
 from __future__ import annotations
 

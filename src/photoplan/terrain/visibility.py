@@ -1,4 +1,4 @@
-"""What can be seen from a point over a grid of heights, with earth curvature and refraction."""
+"""Visibility from a point over a grid of heights, with earth curvature and refraction."""
 
 from __future__ import annotations
 

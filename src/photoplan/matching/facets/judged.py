@@ -1,4 +1,4 @@
-"""What an adjusted block says of itself: standard deviations of its grey values, and how the pixels fit it."""
+"""Accuracy of an adjusted block: standard deviations of its grey values, and how the pixels fit it."""
 
 from __future__ import annotations
 
