@@ -8,6 +8,7 @@ within the package uses the modules themselves, without this.
 from __future__ import annotations
 
 import dataclasses
+import errno
 import functools
 import importlib
 import inspect
@@ -151,6 +152,14 @@ def file_of(value: Any) -> str | os.PathLike[str] | None:
 def _path(file: str | os.PathLike[str], where: str) -> Path:
     if not os.fspath(file).strip():
         raise UsageError(f"{where}: the name is empty; give the name of a file or folder")
+    try:
+        Path(file).stat()
+    except (OSError, ValueError) as error:
+        if not isinstance(error, OSError) or error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+            why = getattr(error, "strerror", None) or error
+            raise UsageError(
+                f"{where} {os.fspath(file)[:60]!r}: no file can be there ({why}); give another name"
+            ) from None
     return file if isinstance(file, Path) else Path(file)
 
 

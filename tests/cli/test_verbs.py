@@ -171,3 +171,20 @@ def test_a_folder_stands_for_its_project(photoplan: Here, small: Block) -> None:
     said = photoplan("check", small.project.parent, "--json")
     assert said.code == 0 and said.out == photoplan("check", small.project, "--json").out
     assert pp.load_project(small.project.parent) == pp.load_project(small.project)
+
+
+@pytest.mark.parametrize(
+    "words", [("tie", "{}"), ("dtm", "info", "{}"), ("mosaic", "project.toml", "-o", "{}"), ("report", "p", "-o", "{}")]
+)
+@pytest.mark.parametrize("kind", ["long", "loop"])
+def test_names_that_no_file_can_have_are_refused(
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    kind: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop").symlink_to("loop")
+    said = Here(capsys)(*(word.format("x" * 3000 if kind == "long" else "loop") for word in words))
+    assert said.code == 2 and "no file can be there" in said.err and "give another name" in said.err

@@ -19,7 +19,7 @@ _REMARK = re.compile(r" \(`[a-z][a-z0-9_]*`[^()`]*\)")
 
 
 def spelled(text: str, verb: click.Command | None, group: click.Command | None = None) -> str:
-    """A text of the library with its parameters as options."""
+    """Return a text of the library with its parameters as options and arguments."""
     if "`" not in text or verb is None:
         return text
     spellings: dict[str, str] = {}
@@ -27,6 +27,8 @@ def spelled(text: str, verb: click.Command | None, group: click.Command | None =
         options = [p for p in command.params if isinstance(p, click.Option)]
         spellings |= {"--" + (p.name or "").replace("_", "-"): p.opts[-1] for p in options}
         spellings |= {o: o for p in options for o in (*p.opts, *p.secondary_opts)}
+        arguments = [p for p in command.params if isinstance(p, click.Argument)]
+        spellings |= {"--" + (p.name or "").replace("_", "-"): p.human_readable_name for p in arguments}
 
     def option(found: re.Match[str]) -> str:
         return spellings.get("--" + "no-" * bool(found[2]) + found[1].replace("_", "-"), found[0])

@@ -254,14 +254,14 @@ def load_project(path: str | Path) -> Project:
 
 def stated_defaults(path: Path) -> tuple[Path, dict[str, dict[str, Any]]]:
     """Return the folder of a project file, and the options that it states by command; of a file with faults none."""
-    if (path / "project.toml").is_file():
-        path = path / "project.toml"
     try:
-        tables = read_toml(path)[0].get("defaults")
-    except InputError:
-        tables = None
+        if (path / "project.toml").is_file():
+            path = path / "project.toml"
+        tables, folder = read_toml(path)[0].get("defaults"), path.resolve().parent
+    except (InputError, OSError, RuntimeError):  # names that no file can have, links that lead to themselves
+        return Path(), {}
     found = tables if isinstance(tables, dict) else {}
-    return path.resolve().parent, {verb: dict(each) for verb, each in found.items() if isinstance(each, dict)}
+    return folder, {verb: dict(each) for verb, each in found.items() if isinstance(each, dict)}
 
 
 def _with_sizes(data: dict[str, Any], folder: Path) -> dict[str, Any]:
