@@ -90,6 +90,16 @@ class Request(BaseModel):
                     raise UsageError(f"{path}: `{other}` and `{name}` are the same file; choose two names")
         self.check()
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
+        """Return the JSON schema without fields that are no options: they have no help and hold no request."""
+        schema: dict[str, Any] = handler.resolve_ref_schema(handler(core))
+        for name, field in cls.model_fields.items():
+            kinds = get_args(field.annotation) or (field.annotation,)
+            if field.description is None and not any(hasattr(kind, "model_fields") for kind in kinds):
+                schema["properties"].pop(name, None)
+        return schema
+
     def check(self) -> None:
         """Refuse values that are allowed one by one, but not together."""
 

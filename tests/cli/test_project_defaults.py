@@ -9,7 +9,10 @@ import pytest
 from PIL import Image
 from tools.command import Here
 
+from photoplan.cli.table import schema as make_schema
+from photoplan.events import SILENT
 from photoplan.requests.orient import TieRequest
+from photoplan.requests.project import SchemaRequest
 
 
 def with_defaults(folder: Path, text: str) -> Path:
@@ -111,3 +114,11 @@ def test_a_schema_states_what_the_field_is_and_the_help_what_the_flag_does(
     assert fields["refine"]["description"] == "Refine the places of features by least-squares matching."
     assert "Take features as they are" in Here(capsys)("tie", "--help").out
     assert not [name for name, each in fields.items() if "Write no" in each["description"]]
+
+
+@pytest.mark.parametrize("verb", ["view", "view sequence", "view matrix", "mosaic", "simulate"])
+def test_a_schema_states_options_alone(verb: str) -> None:
+    schema = make_schema(SchemaRequest(tuple(verb.split())), SILENT).json_fields()
+    for each in (schema, *schema.get("$defs", {}).values()):
+        for name, field in each.get("properties", {}).items() if "Options" in each.get("description", "") else ():
+            assert "description" in field or "$ref" in json.dumps(field), name
