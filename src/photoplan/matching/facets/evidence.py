@@ -159,7 +159,8 @@ def evidence(
                 alike = flat > 0.5 if size > _AROUND[0] else every
                 total = L + _ADDED * (size**2 - 1) * means_around(np.where(alike, np.minimum(L, 4.0), 0.0), size)
             if k == 0:
-                # Another height takes a break of the surface, if the images agree around: as rare as breaks are.
+                # Another height takes a break of the surface, if the images agree around, in the widest square (the
+                # last): as rare as breaks are.
                 rare = (1.0 - _open(total)) * np.log((edges.sum() + 1) / (edges.size + 1))
                 choices[size] = _Choice(total)
             else:
