@@ -259,7 +259,7 @@ def test_what_makes_no_sense_is_refused(mountains: tuple[Path, Path], tmp_path: 
     words = ("--from", 502000, 5300300, "--altitude", 900, "--azimuth", 3, "--size", 480, 300, "-o", tmp_path / "s.csv")
     for more, why in (
         (("--refine",), "belongs to a photograph"),
-        (("--photo", photo, "--focal"), "say --refine"),
+        (("--photo", photo, "--focal"), "set --refine"),
         (("--photo", photo, "--exaggeration", 2, "--reference", 500, "--force"), "heights as they are"),
         (("--photo", photo, "--refine", "--panorama", "cylinder", "--force"), "panorama"),
         (("--photo", photo, "--picture", tmp_path / "p.jpg"), "written as .png"),

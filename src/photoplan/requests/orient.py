@@ -61,7 +61,7 @@ class ConvertRequest(Request):
         if self.list_readings and (self.image_points is None or self.control is None):
             raise UsageError("`list_readings` needs `image_points` FILE and `control` FILE")
         if not self.list_readings and self.target is None:
-            raise UsageError("set `target` to the format to write")
+            raise UsageError("the format is missing: set `target` FORMAT")
         if not self.list_readings and (self.image_points is not None or self.control is not None):
             raise UsageError("`image_points` and `control` go with `list_readings`")
 
