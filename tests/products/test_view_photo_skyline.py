@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -225,8 +224,7 @@ def test_normalised_errors_of_the_turn(tmp_path: Path, focal: bool) -> None:
         real = write_mountains(tmp_path / "real.tif", seed=100 + k)
         photo = photograph(tmp_path / "photo.png", real, TRUE, k)
         rng = np.random.default_rng(k)
-        start = replace(
-            TRUE,
+        start = TRUE.replace(
             azimuth=3.0 + rng.uniform(-1, 1), pitch=-1.0 + rng.uniform(-1, 1),
             roll=1.5 + rng.uniform(-1, 1),
             field_of_view=50.0 + (rng.uniform(-1, 1) if focal else 0.0),
