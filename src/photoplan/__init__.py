@@ -1,4 +1,4 @@
-"""photoplan: photographs with known geometry become measurable pictures.
+"""photoplan: orthophotos, mosaics, terrain models and views from images, with their accuracy.
 
 From arrays::
 

@@ -305,62 +305,18 @@ def with_points(folder: Path) -> None:
     )
 
 
-def as_tiff(folder: Path, to: str, count: int) -> None:
-    """Some images of the included block as TIFF."""
-    (folder / to).mkdir(exist_ok=True)
-    for image in sorted((DEMO / "images").glob("*.jpg"))[8 : 8 + count]:
-        with rasterio.open(image) as file:
-            values = file.read()
-        options = {"driver": "GTiff", "dtype": "uint8", "count": 3, "width": values.shape[2], "height": values.shape[1]}
-        with rasterio.open(folder / to / f"{image.stem}.tif", "w", **options) as file:
-            file.write(values)
-
-
-def own_images(folder: Path) -> None:
-    block(folder, terrain="dtm.tif", orientation="orientation.csv")
+def typical_jobs(folder: Path, shared: Path) -> None:
+    """The included block under the names of the README, positions with their accuracy, and the road survey."""
+    block(folder)
     shutil.copy(DEMO / "int.yaml", folder / "camera.yaml")
-    as_tiff(folder, "scans", 4)
-
-
-def film_and_block(folder: Path, shared: Path) -> None:
-    """A film project and a block without orientation, whose camera is called "drone"."""
-    film(folder, shared)
-    shutil.copytree(DEMO / "images", folder / "images")
-    shutil.copy(DEMO / "dsm.tif", folder / "dsm.tif")
-    camera = (DEMO / "int.yaml").read_text()
-    name = re.search(r"^(?:\"|)?([^\n:]*?)(?:\"|)?:\s*$", camera, re.M)
-    assert name
-    (folder / "int.yaml").write_text(camera.replace(name[1], "drone", 1))
-    for ending in ("csv", "prj"):
-        shutil.copy(DEMO / f"ext.{ending}", folder / f"ext.{ending}")
-    text = (folder / "ext.csv").read_text()
-    (folder / "ext.csv").write_text(text.replace(name[1], "drone"))
-    rows = [",".join(row.split(",")[:4]) for row in text.splitlines()[1:]]
-    (folder / "positions.csv").write_text("\n".join(["name,x,y,z", *rows]) + "\n")
-    said = inside(
-        *("init", folder / "block", "--images", f"{folder}/images/*.jpg", "--camera", folder / "int.yaml"),
-        *("--orientation", folder / "ext.csv", "--terrain", folder / "dsm.tif", "--height-system", "same"),
-        *("--positions", folder / "positions.csv"),
-    )
-    assert said.code == 0, said.err
-    stated = (folder / "block" / "project.toml").read_text()
-    found = re.sub(r"^(positions = .*)$", r"\1\nsigma_position = [0.1, 0.1]", stated, flags=re.M)
-    assert found != stated
-    (folder / "block" / "project.toml").write_text(found)
-
-
-def road(folder: Path, shared: Path) -> None:
+    rows = [row.split(",")[:4] for row in (DEMO / "ext.csv").read_text().splitlines()[1:]]
+    stated = ["name,x,y,z,sigma_x,sigma_y,sigma_z", *(",".join([*row, "0.1", "0.1", "0.1"]) for row in rows)]
+    (folder / "gnss.csv").write_text("\n".join(stated) + "\n")
     survey(folder, shared)
-    places = np.load(shared / "data" / "m3_road_survey" / "m3_terrain_parsed.npz")
-    points = places[next(name for name in places.files if places[name].ndim == 2 and places[name].shape[1] == 3)]
-    rows = [f"{x:.2f},{y:.2f}" for x, y in points[::2000, :2]]
-    (folder / "points.csv").write_text("\n".join(["x,y", *rows]) + "\n")
 
 
-def flight_and_camera(folder: Path) -> None:
-    named_block(folder)
-    sharp_images(folder, "flight", "tif")
-    camera_series(folder)
+def data_sheet(folder: Path) -> None:
+    """A sensor by its data sheet, and the degradation of the page on simulation."""
     shutil.copy(DOCS / "templates" / "sensor-frame.toml", folder / "sensor.toml")
     page = (DOCS / "reference" / "simulate.md").read_text("utf-8")
     model = re.search(r"^```toml\n(seed = 1\n.*?)^```$", page, re.M | re.S)
@@ -484,11 +440,8 @@ def seen_image(folder: Path, shared: Path) -> None:
 
 #: What a section needs before it runs, by the page's name, or by page and title.
 STAGES: dict[str, Callable[..., None]] = {
-    "README: Two commands": lambda folder: None,
-    "README: Your own images": own_images,
-    "README: Without orientation": film_and_block,
-    "README: Your own terrain": road,
-    "README: Sharper images, known cameras": flight_and_camera,
+    "README: Try it": lambda folder: None,
+    "README: Three typical jobs": typical_jobs,
     "tutorial": lambda folder: None,
     "mosaic": mosaics,
     "balance": named_block,
@@ -500,6 +453,7 @@ STAGES: dict[str, Callable[..., None]] = {
     "register": two_ortho,
     "illumination": lit_slopes,
     "camera: Write the series file": camera_series,
+    "camera: From a data sheet": data_sheet,
     "orientation: From one format to another": without_lens,
     "sharpness: Measure an image flight": sharp_images,
     "sharpness: Compare with the laboratory": chart,
@@ -564,3 +518,12 @@ def test_commands_of_a_page(section: Section, tmp_path: Path, monkeypatch: pytes
             given += expanded or [word]
         said = inside(*given)
         assert said.code == 0, f"photoplan {' '.join(words)}\n{said.err}"
+
+
+@pytest.mark.slow
+def test_python_of_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    named_block(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "README.md").read_text("utf-8"), re.M | re.S)
+    exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
+    assert len(list((tmp_path / "block" / "products").glob("*_ortho.tif"))) == 18

@@ -26,10 +26,10 @@ from photoplan.errors import PhotoplanError, PhotoplanWarning, ResourceError
 )
 @click.version_option(package_name="photoplan")
 def photoplan() -> None:
-    """Photographs with known geometry become measurable pictures.
+    """Make orthophotos, mosaics, terrain models and views from images, with their accuracy.
 
-    A job goes: init → (fiducials → tie → adjust) → check → ortho. Results are printed on stdout, messages and
-    progress on stderr.
+    The usual order is: init → (fiducials → tie → adjust) → check → ortho. Results are printed on stdout, messages
+    and progress on stderr.
     Exit codes: 0 done, 1 failed, 2 wrong use, 3 bad input, 4 finished, but tiles or images failed, 5 out of disk or
     memory, 130 interrupted.
     """
