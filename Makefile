@@ -45,7 +45,7 @@ test-slow: $(STAMP) test-plain test-oldest
 	$(BIN)/python -m pytest -m "slow"
 	$(BIN)/python -m pytest -m "hypothesis and not bench" --hypothesis-profile search
 
-# The kernels from plain loops, as with a numba that `kernels/numba_parts.py` does not know.
+# The kernels from plain loops, as with a numba that `kernels/numba_internals.py` does not know.
 test-plain: $(STAMP)
 	PHOTOPLAN_PLAIN_KERNELS=1 NUMBA_CACHE_DIR=$(CURDIR)/build/plain-kernels $(BIN)/python -m pytest -q -m "not slow and not bench" tests/kernels
 

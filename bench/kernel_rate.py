@@ -17,8 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from photoplan.kernels.pack import pack
-from photoplan.kernels.position import positions
+from photoplan.kernels.positions import positions
+from photoplan.kernels.raster import interleave
 from photoplan.kernels.rectify import rectify_tile
 
 SIDE = 512
@@ -70,7 +70,7 @@ def kernel_rates(repeats: int = 31) -> dict[str, Any]:
     rates: dict[str, Any] = {}
     for dtype, bands in CASES:
         source = (np.random.default_rng(1).random((bands, window, window)) * 250).astype(dtype)
-        image, packed = np.ascontiguousarray(source.transpose(1, 2, 0)), pack(source)
+        image, packed = np.ascontiguousarray(source.transpose(1, 2, 0)), interleave(source)
         out, valid = np.empty((bands, SIDE, SIDE), dtype), np.empty((SIDE, SIDE), bool)
 
         def ours(packed: Any = packed, out: Any = out, valid: Any = valid) -> None:
@@ -81,7 +81,7 @@ def kernel_rates(repeats: int = 31) -> dict[str, Any]:
 
         a, b, ratio = pairs(ours, theirs, repeats)
         assert valid.all()
-        packing = statistics.median(seconds(lambda source=source: pack(source)) for _ in range(repeats))
+        packing = statistics.median(seconds(lambda source=source: interleave(source)) for _ in range(repeats))
         rates[f"{dtype} x {bands}"] = {
             "ours": round(a, 1),
             "cv2_remap": round(b, 1),
@@ -91,7 +91,7 @@ def kernel_rates(repeats: int = 31) -> dict[str, Any]:
     alone = statistics.median(seconds(lambda: positions(anchors, relief)) for _ in range(repeats))
     rates["positions"] = {"ours": round(SIDE * SIDE / 1e6 / alone, 1)}
     anchors, relief, window = scene(2.0)
-    packed = pack((np.random.default_rng(1).random((3, window, window)) * 250).astype(np.uint8))
+    packed = interleave((np.random.default_rng(1).random((3, window, window)) * 250).astype(np.uint8))
     out, valid = np.empty((3, SIDE, SIDE), np.uint8), np.empty((SIDE, SIDE), bool)
     rectify_tile(anchors, relief, packed, None, None, "bicubic", out, valid)
     coarse = seconds(lambda: rectify_tile(anchors, relief, packed, None, None, "bicubic", out, valid))

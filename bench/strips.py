@@ -23,7 +23,7 @@ from tools.shaken_strip import ShakenStrip
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.camera.line import read_line
-from photoplan.kernels.pack import pack
+from photoplan.kernels.raster import interleave
 from photoplan.kernels.rectify import rectify_tile
 from photoplan.plan.anchors import AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
@@ -57,7 +57,7 @@ def rectified(camera: LineCamera, target: MapTarget, window: Window) -> tuple[fl
     edges = (-0.5 - part.col, -0.5 - part.row, SIDE - 0.5 - part.col, SIDE - 0.5 - part.row)
     out, valid = np.zeros((1, *relief.shape), np.uint8), np.zeros(relief.shape, bool)
     begin = time.process_time()
-    rectify_tile(anchors.arrays, relief, pack(pixels), None, edges, "bicubic", out, valid)
+    rectify_tile(anchors.arrays, relief, interleave(pixels), None, edges, "bicubic", out, valid)
     return planned, time.process_time() - begin, int(valid.sum())
 
 

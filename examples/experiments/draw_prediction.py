@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from photoplan.kernels.collocation import EXPONENTIAL, GAUSSIAN, MATERN, correlation
 from photoplan.kernels.jit import kernel
+from photoplan.kernels.prediction import EXPONENTIAL, GAUSSIAN, MATERN, correlation
 
 FAMILIES = {"gaussian": GAUSSIAN, "matern": MATERN, "exponential": EXPONENTIAL}
 COLOURS = {"gaussian": "#4477aa", "matern": "#228833", "exponential": "#cc3311"}

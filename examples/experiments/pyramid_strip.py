@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
-from photoplan.kernels.patch_match import sample_spline, spline_coefficients
+from photoplan.kernels.matching import sample_spline, spline_coefficients
 from photoplan.matching.facets.pyramid import Pyramid
 from photoplan.matching.features import GreyImage
 from photoplan.matching.register import (

@@ -9,7 +9,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 from photoplan.cli.main import run
-from photoplan.kernels.numba_parts import USABLE
+from photoplan.kernels.numba_internals import USABLE
 
 #: Not needed for an orthophoto over a raster of heights.
 HEAVY = [

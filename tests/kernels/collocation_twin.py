@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.collocation import EXPONENTIAL, GAUSSIAN
+from photoplan.kernels.prediction import EXPONENTIAL, GAUSSIAN
 
 _MATERN = 1.6783469900166605
 

@@ -16,14 +16,14 @@ from tools.small_block import write_block
 
 from photoplan.errors import PhotoplanWarning
 from photoplan.events import COMPILATIONS
-from photoplan.kernels import jit, numba_parts
+from photoplan.kernels import jit, numba_internals
 from photoplan.kernels.jit import COMPILED
 from photoplan.kernels.rectify import is_compiled
 
 SCRIPT = """
 import numpy as np
-from photoplan.kernels.gather import gather_runs
-from photoplan.kernels.place import place_runs
+from photoplan.kernels.resample import gather_runs
+from photoplan.kernels.positions import find_taps
 from photoplan.kernels.rectify import is_compiled, rectify_tile
 before = is_compiled("int16", 3, "bilinear")
 corners = np.array([[[u, v, 1.0] for h in (0, 1) for v in (-.5, 3.5) for u in (-.5, 3.5)]])
@@ -32,7 +32,7 @@ anchors = (np.array([[0, 0, 4, 4]], np.int32), np.array([0, 1], np.int32), np.ar
 arrays = np.ones((3, 4, 4), np.int16), np.empty((3, 4, 4), np.int16), np.empty((4, 4), bool)
 rectify_tile(anchors, np.zeros((4, 4), np.float32), arrays[0], None, None, "bilinear", arrays[1], arrays[2])
 assert (arrays[1] == 1).all()
-compiled = [sum(kernel.stats.cache_misses.values()) for kernel in (gather_runs, place_runs)]
+compiled = [sum(kernel.stats.cache_misses.values()) for kernel in (gather_runs, find_taps)]
 print(before, is_compiled("int16", 3, "bilinear"), *compiled)
 """
 
@@ -49,7 +49,7 @@ def test_second_process_loads_what_the_first_compiled(tmp_path):
     ]
     assert talk[0].split() == ["False", "True", "1", "1"]
     # What lies on the disk is asked of numba's inside; where that is not leaned on, the answer is no.
-    assert talk[1].split() == [str(numba_parts.USABLE), "True", "0", "0"]
+    assert talk[1].split() == [str(numba_internals.USABLE), "True", "0", "0"]
 
 
 def _compiled(path: Path):
@@ -88,9 +88,9 @@ def test_only_kernels_whose_sources_have_changed_are_compiled_again(tmp_path):
     }
 
     def stamps():
-        for function in (numba_parts.stamp, numba_parts.source):
+        for function in (numba_internals.stamp, numba_internals.source):
             function.cache_clear()
-        return {name: numba_parts.stamp(str(tmp_path / f"{name}.py"), str(tmp_path)) for name in sources}
+        return {name: numba_internals.stamp(str(tmp_path / f"{name}.py"), str(tmp_path)) for name in sources}
 
     for name, text in sources.items():
         (tmp_path / f"{name}.py").write_text(text)
@@ -111,19 +111,19 @@ def test_all_that_kernels_import_from_each_other_is_found():
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("photoplan.kernels"):
                 named = node.module.removeprefix("photoplan.kernels").strip(".")
                 wanted |= {named} if named else {name.name for name in node.names}
-        assert {Path(each).stem for each in numba_parts.source(str(path), str(folder))[1]} == wanted, path.name
+        assert {Path(each).stem for each in numba_internals.source(str(path), str(folder))[1]} == wanted, path.name
 
 
 LOADED = """
 import sys
 import numpy as np
-from photoplan.kernels.extent import height_ranges
+from photoplan.kernels.terrain import height_ranges
 ranges = height_ranges(np.ones((2, 3), np.float32), np.array([[0, 0, 3, 2]], np.int32))
 print(ranges[0], "numba.np.linalg" in sys.modules)
 """
 
 
-@pytest.mark.skipif(not numba_parts.USABLE, reason="nothing is compiled, or by numba's documented ways")
+@pytest.mark.skipif(not numba_internals.USABLE, reason="nothing is compiled, or by numba's documented ways")
 def test_what_is_compiled_is_loaded_without_the_compiler_s_libraries(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     for compiles in (True, False):
@@ -137,9 +137,9 @@ class Old:
     """A class of types of a kernel, which another version of the package does not have."""
 
 
-@pytest.mark.skipif(not numba_parts.USABLE, reason="nothing is compiled, or by numba's documented ways")
+@pytest.mark.skipif(not numba_internals.USABLE, reason="nothing is compiled, or by numba's documented ways")
 def test_what_was_kept_by_another_version_or_is_damaged_is_compiled_again(tmp_path, monkeypatch):
-    kept = numba_parts._Index(str(tmp_path), "kernel", ("sources", 0))
+    kept = numba_internals._CacheIndex(str(tmp_path), "kernel", ("sources", 0))
     kept.save(Old, "code")
     assert kept.load(Old) == "code"
     with monkeypatch.context() as without:
@@ -290,7 +290,7 @@ def test_without_any_folder_kernels_work_and_it_is_said(monkeypatch):
     def no_folder():
         raise FileNotFoundError("No usable temporary directory found")
 
-    monkeypatch.setattr(jit, "keep", refuse)
+    monkeypatch.setattr(jit, "enable_cache", refuse)
     monkeypatch.setattr(jit.tempfile, "gettempdir", no_folder)
     with pytest.warns(PhotoplanWarning, match="NUMBA_CACHE_DIR"):
         twice = jit.kernel(lambda x: 2 * x)

@@ -8,9 +8,8 @@ from collocation_twin import covariance, stacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photoplan.kernels.collocation import EXPONENTIAL, GAUSSIAN, MATERN, correlation, factorise, solve_transposed
 from photoplan.kernels.jit import kernel
-from photoplan.kernels.patch_system import system
+from photoplan.kernels.prediction import EXPONENTIAL, GAUSSIAN, MATERN, correlation, factorise, solve_transposed, system
 
 FAMILIES = (GAUSSIAN, MATERN, EXPONENTIAL)
 

@@ -7,8 +7,8 @@ import pytest
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.kernels.convolve import round_clipped
 from photoplan.kernels.jit import COMPILED
+from photoplan.kernels.raster import round_clipped
 from photoplan.quality.restoration.restorer import LEFT, RIGHT, Convolution, FilterKernel, Margin
 
 NONE = np.empty((0, 0), bool)

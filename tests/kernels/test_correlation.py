@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from photoplan.kernels.correlation import correlate, sample_template
+from photoplan.kernels.matching import correlate, sample_template
 
 RNG = np.random.default_rng(4)
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from photoplan.kernels.coverage import cover
+from photoplan.kernels.raster import polygon_coverage
 
 
 def covered(outline: NDArray[np.float64], rows: int = 9, columns: int = 12) -> NDArray[np.float64]:
     total = np.full((rows, columns + 1), np.nan)
-    cover(np.ascontiguousarray(outline), total)
+    polygon_coverage(np.ascontiguousarray(outline), total)
     return total[:, :-1]
 
 

@@ -5,28 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.kernels import (
-    facets_fine,
-    facets_grey,
-    facets_height,
-    facets_radiometry,
-    facets_signs,
-    facets_solve,
-    facets_sums,
-    facets_transfer,
-)
+from photoplan.kernels import facet_transfer, facets
 from photoplan.kernels.jit import COMPILED
 from photoplan.matching.facets.grey import shares
 from photoplan.matching.facets.means import means_around
 
 
 def carried(low, high, posts, out, wall=np.inf) -> None:
-    steep = np.empty((-(-(len(posts) - 1) // facets_transfer.CELL), -(-(posts.shape[1] - 1) // facets_transfer.CELL)))
-    facets_transfer.steepness(posts, steep)
+    steep = np.empty((-(-(len(posts) - 1) // facet_transfer.CELL), -(-(posts.shape[1] - 1) // facet_transfer.CELL)))
+    facet_transfer.steepness(posts, steep)
     ways = np.concatenate([low, (high - low) / 100.0, *np.zeros((2, *low.shape))], axis=-1)
     bent = np.empty((2, *posts.shape))
-    facets_transfer.bends(posts, bent)
-    facets_transfer.transfer(ways, 1, 1, posts, bent, steep, wall, out)
+    facet_transfer.facet_curvatures(posts, bent)
+    facet_transfer.transfer(ways, 1, 1, posts, bent, steep, wall, out)
 
 
 def test_a_ray_ends_at_the_first_facet_that_it_meets() -> None:
@@ -90,12 +81,12 @@ def spline(f: float) -> np.ndarray:
 
 def grey(values: np.ndarray, at: np.ndarray, ratio: int = 2) -> np.ndarray:
     out = np.empty(len(at))
-    facets_grey.sample_grey(values, ratio, np.asarray(at, float), out)
+    facets.sample_grey(values, ratio, np.asarray(at, float), out)
     return out
 
 
 def test_grey_facets_reproduce_a_plane() -> None:
-    v, u = np.mgrid[:9, :11].astype(np.float32) - facets_sums.PAD
+    v, u = np.mgrid[:9, :11].astype(np.float32) - facets.PAD
     at = np.random.default_rng(0).uniform(0, 2, (50, 2))
     assert np.abs(grey(3 * u - 2 * v + 5, at) - (6 * at[:, 0] - 4 * at[:, 1] + 5)).max() < 1e-5
 
@@ -108,7 +99,7 @@ def grey_equations(seed: int = 0):
     places[..., 2:] = rng.normal(0, 0.1, (14, 16, 2))
     weights = rng.uniform(0.5, 1.5, (14, 16)).astype(np.float32)
     weights[3, 4] = 0.0
-    shape = (2 * 2 + 1 + 2 * facets_sums.PAD, 3 * 2 + 1 + 2 * facets_sums.PAD)
+    shape = (2 * 2 + 1 + 2 * facets.PAD, 3 * 2 + 1 + 2 * facets.PAD)
     A = np.zeros((14 * 16, *shape))
     for row, (u, v) in enumerate(places[..., :2].reshape(-1, 2).astype(float) * 2):
         A[row, int(v) + 1 : int(v) + 5, int(u) + 1 : int(u) + 5] = np.outer(spline(v - int(v)), spline(u - int(u)))
@@ -118,23 +109,23 @@ def grey_equations(seed: int = 0):
 def test_grey_values_are_those_of_least_squares() -> None:
     rng, places, weights, shape, A = grey_equations()
     seen = rng.normal(100, 20, (14, 16)).astype(np.float32)
-    counts = np.zeros((shape[0] - 2 * facets_sums.PAD, shape[1] - 2 * facets_sums.PAD), np.int32)
-    facets_sums.count_pixels(places, weights, 2, counts)
+    counts = np.zeros((shape[0] - 2 * facets.PAD, shape[1] - 2 * facets.PAD), np.int32)
+    facets.count_pixels(places, weights, 2, counts)
     assert counts.sum() == 14 * 16 - 1
     ends = np.cumsum(counts, dtype=np.int32).reshape(counts.shape) - counts
     pixels = np.empty((int(counts.sum()), 4), np.float32)
     for rows in (slice(0, 9), slice(9, 14)):
-        facets_sums.sort_pixels(places[rows], seen[rows], weights[rows], 2, ends, pixels)
-    system = np.zeros((shape[0], facets_sums.OFFSETS, shape[1]), np.float32)
+        facets.sort_pixels(places[rows], seen[rows], weights[rows], 2, ends, pixels)
+    system = np.zeros((shape[0], facets.GREY_ENTRIES, shape[1]), np.float32)
     right, density = np.zeros((2, *shape), np.float32)
-    facets_sums.add_grey(pixels, ends, system, right, density)
-    nearest = np.rint(places[..., :2].astype(float) * 2).astype(int) + facets_sums.PAD
+    facets.add_grey(pixels, ends, system, right, density)
+    nearest = np.rint(places[..., :2].astype(float) * 2).astype(int) + facets.PAD
     expected = np.zeros(shape)
     np.add.at(expected, (nearest[..., 1], nearest[..., 0]), weights)
     assert np.abs(density - expected).max() < 1e-4
     system[:, 0] += np.float32(0.01)
     values = np.zeros(shape, np.float32)
-    facets_grey.solve_grey(system, right, np.ones(shape, np.float32), values, 300, 1e-7)
+    facets.solve_grey(system, right, np.ones(shape, np.float32), values, 300, 1e-7)
     N = A.T @ (weights.reshape(-1, 1) * A) + 0.01 * np.eye(A.shape[1])
     expected = np.linalg.solve(N, A.T @ (weights * seen).reshape(-1))
     assert np.abs(values.reshape(-1) - expected).max() < 1e-2
@@ -144,10 +135,10 @@ def test_errors_have_the_covariance_of_the_equations() -> None:
     """One standard deviation each, of a pixel of an image always the same."""
     _, places, weights, shape, A = grey_equations()
     right, moved = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    facets_grey.add_errors(places, (7, 3), weights, 2, right)
-    facets_grey.add_errors(places[4:, 5:], (12, 7), weights[4:, 5:], 2, moved)
+    facets.add_random_errors(places, (7, 3), weights, 2, right)
+    facets.add_random_errors(places[4:, 5:], (12, 7), weights[4:, 5:], 2, moved)
     layers = np.empty((4, 14, 5))  # of column c the layer c % 4
-    facets_signs.signs_at(1, 3, layers)
+    facets.rademacher(1, 3, layers)
     signs = layers.transpose(1, 2, 0).reshape(14, -1)[:, 3:19]
     drawn = np.sqrt(weights) * signs
     assert np.abs(right.reshape(-1) - A.T @ drawn.reshape(-1)).max() < 1e-4 and abs(signs.mean()) < 0.2
@@ -162,12 +153,12 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
     seen = rng.normal(0, 10, (14, 16)).astype(np.float32)
     means = rng.normal(0, 0.05, (2, 3, 2))
     residuals, factors, sums = np.empty((14, 16), np.float32), np.ones((14, 16), np.float32), np.zeros(3)
-    moments, trusted = np.zeros((2, 3, facets_height.MOMENTS)), np.arange(4) < np.full((3, 1), 2)
-    pixels = facets_height.Pixels(first=(0, 0), places=places, grey=seen, weights=weights)
-    ground = facets_height.GreyFacets(values=values, ratio=2, means=means, trusted=trusted)
-    facets_height.add_heights(pixels, ground, 8.0, 2.0, moments, residuals, factors, sums)
+    moments, trusted = np.zeros((2, 3, facets.MOMENTS)), np.arange(4) < np.full((3, 1), 2)
+    pixels = facets.Pixels(first=(0, 0), places=places, grey=seen, weights=weights)
+    ground = facets.GreyFacets(values=values, ratio=2, means=means, trusted=trusted)
+    facets.add_heights(pixels, ground, 8.0, 2.0, moments, residuals, factors, sums)
     system, (right, noise) = np.zeros((7, 3, 4)), np.zeros((2, 3, 4))
-    facets_height.made_heights(moments, system, right, noise)
+    facets.height_equations(moments, system, right, noise)
     misfit = (A @ values.reshape(-1)).reshape(14, 16) - seen
     used = weights > 0
     assert np.abs(residuals - misfit)[used].max() < 1e-3 and np.isnan(residuals[3, 4])
@@ -176,7 +167,7 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
     assert 0 < sums[2] == told.sum() < used.sum()
     assert sums[1] == pytest.approx((factors * (misfit / 8) ** 2)[told].sum(), rel=1e-4)
     whole, squares = np.zeros((2, 2, 3)), np.zeros((2, 3))
-    facets_height.add_sensitivities(places, weights, ground, np.float32(2.0) * values, whole)
+    facets.add_sensitivities(places, weights, ground, np.float32(2.0) * values, whole)
     N, b = np.zeros((12, 12)), np.zeros(12)
     step = np.array([(1e-4, 0), (-1e-4, 0), (0, 1e-4), (0, -1e-4)])
     for (u, v, ku, kv), p, m in zip(places.reshape(-1, 4).astype(float), weights.reshape(-1), misfit.reshape(-1)):
@@ -208,7 +199,7 @@ def dense(system, curve):
     """Normal equations as a full matrix."""
     _, rows, columns = system.shape
     N = np.zeros((rows, columns, rows, columns))
-    for k, (dj, di) in enumerate(facets_height.OFFSETS):
+    for k, (dj, di) in enumerate(facets.HEIGHT_OFFSETS):
         for j in range(rows - dj):
             for i in range(max(0, -di), columns - max(0, di)):
                 N[j, i, j + dj, i + di] += system[k, j, i]
@@ -238,20 +229,20 @@ def test_heights_and_variances_are_those_of_the_full_matrix() -> None:
     rng, system, curve = height_system(9, 12)
     right, out = rng.normal(size=(9, 12)), np.zeros((9, 12))
     inverse = np.linalg.inv(dense(system, curve))
-    facets_solve.add_curvatures(curve, system)
-    assert facets_solve.solve_heights(system, right, 200, 1e-12, out) < 200
+    facets.add_curvatures(curve, system)
+    assert facets.solve_heights(system, right, 200, 1e-12, out) < 200
     assert np.abs(out.reshape(-1) - inverse @ right.reshape(-1)).max() < 1e-10
-    facets_solve.variances(system, 12, 2, out)
+    facets.variances(system, 12, 2, out)
     assert np.abs(out.reshape(-1) - np.diag(inverse)).max() < 1e-12
 
 
 def test_variances_of_parts_are_those_of_the_whole_where_pixels_determine_the_heights() -> None:
     size = (30, 34) if COMPILED else (12, 14)
     _, system, curve = height_system(*size)
-    facets_solve.add_curvatures(curve, system)
+    facets.add_curvatures(curve, system)
     parts, whole = np.empty(size), np.empty(size)
-    facets_solve.variances(system, 10, 8, parts)
-    facets_solve.variances(system, 40, 0, whole)
+    facets.variances(system, 10, 8, parts)
+    facets.variances(system, 40, 0, whole)
     assert np.abs(parts / whole - 1).max() < 0.01
 
 
@@ -279,7 +270,7 @@ def test_radiometry_gets_the_equations_of_the_pixels() -> None:
     A = np.hstack([nodes, nodes * surface.reshape(-1, 1)])[weights.reshape(-1) > 0]
     p, g = (values.reshape(-1)[weights.reshape(-1) > 0].astype(float) for values in (weights, raw))
     system, right = np.zeros((24, 24)), np.zeros(24)
-    facets_radiometry.add_radiometry(places, raw, weights, surface, shape, lattice, system, right)
+    facet_transfer.add_radiometry(places, raw, weights, surface, shape, lattice, system, right)
     assert np.abs(system - A.T @ (p[:, None] * A)).max() < 1e-5 * np.abs(system).max()
     assert np.abs(right - A.T @ (p * g)).max() < 1e-5 * np.abs(right).max()
 
@@ -289,26 +280,26 @@ def test_radiometry_is_solved_as_a_full_matrix() -> None:
     A = rng.normal(size=(40, 20))
     N, right = A.T @ A, rng.normal(size=20)
     want = np.linalg.solve(N, right)
-    facets_radiometry.solve_radiometry(N, right)
+    facet_transfer.solve_radiometry(N, right)
     assert np.abs(right - want).max() < 1e-9 * np.abs(want).max()
 
 
 def test_what_facets_miss_of_a_wave_is_the_one_beside_it() -> None:
     """Waves of three facets as cubic splines have them, 7 % of which is another wave."""
     length, phase = 3.0, 0.4
-    at = np.arange(30.0) - facets_sums.PAD
+    at = np.arange(30.0) - facets.PAD
     values = (120 + 20 * np.cos(2 * np.pi * at / length + phase) + np.zeros((28, 1))).astype(np.float32)
     places = np.zeros((40, 50, 4), np.float32)
     places[..., :2] = np.random.default_rng(0).uniform(1.5, 10, (40, 50, 2))
     seen = np.empty(places.shape[:2], np.float32)
-    facets_grey.sample_pixels(values, 2, places, np.ones_like(seen), seen)
+    facets.sample_pixels(values, 2, places, np.ones_like(seen), seen)
     size = 20 * np.sinc(1 / length) ** 4
     wave = 120 + size * np.cos(2 * np.pi * 2 * places[..., 0] / length + phase)
     missed = np.zeros_like(seen)
-    facets_fine.add_missed(values, 2, places, np.ones_like(seen), shares(), missed)
+    facets.add_spline_residual(values, 2, places, np.ones_like(seen), shares(), missed)
     assert np.abs(seen - wave).max() > 0.06 * size and np.abs(seen - missed - wave).max() < 0.01 * size
     missed[:] = 0
-    facets_fine.add_missed(np.full_like(values, 120), 2, places, np.ones_like(seen), shares(), missed)
+    facets.add_spline_residual(np.full_like(values, 120), 2, places, np.ones_like(seen), shares(), missed)
     assert np.abs(missed).max() < 1e-3
 
 

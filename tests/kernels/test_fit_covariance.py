@@ -7,9 +7,8 @@ import pytest
 from collocation_twin import collocation, covariance, distances
 from numpy.typing import NDArray
 
-from photoplan.kernels.collocation import EXPONENTIAL, GAUSSIAN, MATERN
-from photoplan.kernels.fit_covariance import block_score
 from photoplan.kernels.jit import COMPILED
+from photoplan.kernels.prediction import EXPONENTIAL, GAUSSIAN, MATERN, block_score
 from photoplan.terrain.covariance import minimise
 
 NOISE = 2e-4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.kernels import flow
+from photoplan.kernels import terrain as kernels
 from photoplan.kernels.jit import COMPILED
 
 SIZE = 40 if COMPILED else 14
@@ -21,9 +21,9 @@ def terrain(seed):
 def flooded(z):
     filled = np.empty(z.shape, np.float32)
     order, origin = np.empty(z.size, np.int32), np.full(z.size, -1, np.int32)
-    count = flow.flood(z, filled, order, origin)
+    count = kernels.flood(z, filled, order, origin)
     receiver = np.empty(z.size, np.int32)
-    flow.steepest(filled, origin, receiver)
+    kernels.steepest(filled, origin, receiver)
     return filled, order[:count], receiver
 
 
@@ -65,9 +65,9 @@ def test_every_way_leads_out_and_no_water_is_lost(seed):
     for split in (False, True):
         sums = np.where(np.isnan(z), 0.0, 1.0).ravel()
         if split:
-            flow.accumulate_split(filled, order, receiver, sums)
+            kernels.accumulate_split(filled, order, receiver, sums)
         else:
-            flow.accumulate(order, receiver, sums)
+            kernels.accumulate(order, receiver, sums)
         assert sums[receiver == -1].sum() == pytest.approx(len(order), rel=1e-12)
         assert sums[~np.isnan(z.ravel())].min() >= 1
 
@@ -77,10 +77,10 @@ def test_steepest_neighbour_counts_the_diagonal_as_longer():
     z[1, 1] = 5
     z[0, 0], z[1, 0] = 5 - 1.3, 5 - 1.0
     receiver = np.empty(9, np.int32)
-    flow.steepest(z, np.full(9, -1, np.int32), receiver)
+    kernels.steepest(z, np.full(9, -1, np.int32), receiver)
     assert receiver[4] == 3
     z[0, 0] = 5 - 1.5
-    flow.steepest(z, np.full(9, -1, np.int32), receiver)
+    kernels.steepest(z, np.full(9, -1, np.int32), receiver)
     assert receiver[4] == 0
 
 
@@ -92,8 +92,8 @@ def test_split_flow_follows_the_angle_of_a_plane(angle):
     z = (10 - 0.3 * (np.cos(a) * col - np.sin(a) * row)).astype(np.float32)
     sums = np.zeros(9)
     sums[4] = 1
-    flow.accumulate_split(z, np.array([4], np.int32), np.full(9, -1, np.int32), sums)
-    shares = {d: sums[(1 + flow.ROW[d]) * 3 + 1 + flow.COLUMN[d]] for d in range(8)}
+    kernels.accumulate_split(z, np.array([4], np.int32), np.full(9, -1, np.int32), sums)
+    shares = {d: sums[(1 + kernels.ROW[d]) * 3 + 1 + kernels.COLUMN[d]] for d in range(8)}
     d, part = angle // 45, angle % 45 / 45
     assert shares[d] == pytest.approx(1 - part, abs=1e-5)
     assert shares[(d + 1) % 8] == pytest.approx(part, abs=1e-5)

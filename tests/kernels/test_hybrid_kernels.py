@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.kernels.hybrid import sample_hybrid, scan_faces
-from photoplan.kernels.sample_grid import sample_lattice
+from photoplan.kernels.terrain import sample_hybrid, sample_lattice, scan_faces
 
 FRAME = (100.0, 200.0, 0.5)
 

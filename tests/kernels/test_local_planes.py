@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.kernels.local_breaks import borders, differences, hang_together
-from photoplan.kernels.local_planes import fit_planes, local_scales, part_across
+from photoplan.kernels.local_planes import (
+    component_borders,
+    connected_components,
+    fit_planes,
+    local_scales,
+    neighbour_differences,
+    separate_across_lines,
+)
 
 
 def test_planes_do_without_the_point_itself_and_without_outliers() -> None:
@@ -27,7 +33,7 @@ def test_planes_do_without_the_point_itself_and_without_outliers() -> None:
 def test_neighbours_beyond_a_line_are_none() -> None:
     xyz = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [2, 5, 0]], float)
     near = np.array([[1, 2, 3]] * 4, np.int32)
-    part_across(xyz, near, np.array([0]), np.array([[1.0, -1, 1, 2]]), np.array([0]), np.array([0, 1]))
+    separate_across_lines(xyz, near, np.array([0]), np.array([[1.0, -1, 1, 2]]), np.array([0]), np.array([0, 1]))
     assert near[0].tolist() == [-1, 2, 3] and near[1].tolist() == [1, 2, 3]
 
 
@@ -48,9 +54,9 @@ def test_a_raised_group_hangs_together_and_its_border_breaks() -> None:
     xyz[4:7, 2] += 5
     near = np.column_stack([np.arange(10) - 1, (np.arange(10) + 2) % 11 - 1]).astype(np.int32)
     off, middle, label, border = np.empty((10, 2)), np.empty(10), np.empty(10, np.int64), np.empty((10, 6))
-    differences(xyz, near, np.tile([0.5, 0.0], (10, 1)), off, middle)
+    neighbour_differences(xyz, near, np.tile([0.5, 0.0], (10, 1)), off, middle)
     assert np.isnan(off[0, 0]) and off[4].tolist() == [5, 0] and middle[5] == 0
-    hang_together(near, off, np.ones(10), 2.0, label)
+    connected_components(near, off, np.ones(10), 2.0, label)
     assert label.tolist() == [0] * 4 + [4] * 3 + [7] * 3
-    borders(near, off, np.ones(10), 2.0, label, border)
+    component_borders(near, off, np.ones(10), 2.0, label, border)
     assert border[4].tolist() == [4, 4, 0, 20, 0, 20] and border[0].tolist() == [2, 0, 2, 0, 10, 10]

@@ -9,8 +9,8 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_flow
 
+from photoplan.kernels.graph_cut import SINK, minimum_cut
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.max_flow import SINK, least_cut
 
 STEP = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
@@ -47,5 +47,5 @@ def test_cut_costs_what_the_largest_flow_of_scipy_is(most: int) -> None:
             table[at, at + down * width + right] = edges[way][at]
         table[n, :n], table[:n, n + 1] = np.maximum(ends, 0), np.maximum(-ends, 0)
         tree = np.zeros(n, np.int8)
-        least_cut(edges.copy(), ends.copy(), width, tree)
+        minimum_cut(edges.copy(), ends.copy(), width, tree)
         assert cut_cost(edges, ends, tree == SINK, width) == maximum_flow(csr_array(table), n, n + 1).flow_value

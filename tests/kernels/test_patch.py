@@ -7,10 +7,8 @@ import pytest
 from collocation_twin import collocation, stacked
 from numpy.typing import NDArray
 
-from photoplan.kernels import patch_test
-from photoplan.kernels.collocation import EXPONENTIAL, GAUSSIAN, MATERN
-from photoplan.kernels.patch import predict
-from photoplan.kernels.patch_system import usable
+from photoplan.kernels import prediction
+from photoplan.kernels.prediction import EXPONENTIAL, GAUSSIAN, MATERN, predict, usable_data
 
 # The variance is small, so that the weak prior of the trend's slope (in 1/m²) does not matter.
 VARIANCE, LENGTH, GAP = 1e-4, 3.0, 2.0
@@ -128,7 +126,7 @@ def test_bad_data_and_repeated_data_do_not_count() -> None:
     spoiled[7, 2], marked[7] = 99.0, -1.0
     ids = np.concatenate([np.arange(40), [3, 3, -1, 12]])[None]
     without = np.delete(np.arange(40), 7)
-    np.testing.assert_array_equal(usable(ids[0], marked), without)
+    np.testing.assert_array_equal(usable_data(ids[0], marked), without)
     got = predicted(spoiled, marked, ONE, ids, TARGETS)
     np.testing.assert_array_equal(got, predicted(xyz, noise, ONE, without[None], TARGETS))
 
@@ -204,7 +202,7 @@ class TestLeaveOneOut:
         xyz, noise, differences, variances = truth
         result = np.full((24, 3), np.nan)
         own, own_start = np.arange(5, 24), np.array([0, 19])
-        failed = patch_test.test_points(
+        failed = prediction.test_points(
             xyz, noise, np.arange(24)[None], ONE, own, own_start, *stacked([self.ROAD]), np.array([MODEL]), result
         )
         assert failed == 0 and np.isnan(result[:5]).all()
@@ -219,9 +217,9 @@ class TestLeaveOneOut:
         without, spoiled = np.full((28, 3), np.nan), np.full((30, 3), np.nan)
         kept = np.arange(28)
         args = (kept, np.array([0, 28]), *none, model)
-        patch_test.test_points(xyz[kept], noise[kept], kept[None], ONE, *args, without)
+        prediction.test_points(xyz[kept], noise[kept], kept[None], ONE, *args, without)
         xyz[28:, 2] += 50.0
-        patch_test.test_points(xyz, noise, np.arange(30)[None], ONE, *args, spoiled)
+        prediction.test_points(xyz, noise, np.arange(30)[None], ONE, *args, spoiled)
         np.testing.assert_allclose(spoiled[:28], without, rtol=1e-4, atol=1e-6)
 
     def test_residuals_are_those_of_the_filtered_surface(self) -> None:
@@ -231,7 +229,7 @@ class TestLeaveOneOut:
         result = np.full((40, 3), np.nan)
         none = stacked([])
         args = (np.arange(40), np.array([0, 40]), *none, np.array([MODEL]), result)
-        assert patch_test.test_points(xyz, noise, np.arange(40)[None], ONE, *args) == 0
+        assert prediction.test_points(xyz, noise, np.arange(40)[None], ONE, *args) == 0
         surface = predicted(xyz, noise, ONE, np.arange(40)[None], xyz[:, :2].copy())
         assert np.abs(result[:, 2]).max() < 4
         # Residual against the filtered surface = redundancy · difference from the prediction.
@@ -243,7 +241,7 @@ class TestLeaveOneOut:
         result = np.empty((1, 2))
         worse = (MATERN, 25 * VARIANCE, LENGTH / 6, GAP)
         models = np.array([[MODEL, worse]])
-        patch_test.score_models(xyz, noise, np.arange(24)[None], ONE, 20, *stacked([self.ROAD]), models, result)
+        prediction.score_models(xyz, noise, np.arange(24)[None], ONE, 20, *stacked([self.ROAD]), models, result)
         away = ((xyz[:20, :2] - 5.0) ** 2).sum(axis=1) / (1.5 * ONE[0, 2]) ** 2
         expected = (np.exp(-away / 2) * (differences**2 / variances + np.log(variances))[:20]).sum()
         assert result[0, 0] == pytest.approx(expected, rel=5e-3)
@@ -255,5 +253,5 @@ class TestLeaveOneOut:
         model = np.array([[GAUSSIAN, np.nan, LENGTH, GAP]])
         none = stacked([])
         args = (np.arange(4), np.array([0, 4]), *none, model, result)
-        assert patch_test.test_points(xyz, np.zeros(4), np.arange(4)[None], ONE, *args) == 1
+        assert prediction.test_points(xyz, np.zeros(4), np.arange(4)[None], ONE, *args) == 1
         assert np.isnan(result).all()

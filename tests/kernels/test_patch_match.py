@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.patch_match import (
+from photoplan.kernels.matching import (
     CONVERGED,
     CORRELATION,
     LEFT,

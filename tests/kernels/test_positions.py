@@ -7,7 +7,7 @@ import pytest
 from kernel_reference import Mapping
 
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.position import RUN, positions
+from photoplan.kernels.positions import RUN, positions
 
 SIDE = 700 if COMPILED else 24
 

@@ -10,8 +10,7 @@ from tools.hybrid_models import line, model
 from photoplan.errors import UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.pyramid import pyramid_of
-from photoplan.kernels.raycast import MISS, SURFACE, WALL
+from photoplan.kernels.rays import MISS, SURFACE, WALL, pyramid_of
 from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.shifted import ShiftedSurface

@@ -12,7 +12,7 @@ from tools.kinds import FEW, NAMES, OTHERS, few_of
 from tools.thinned import some
 
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.pack import pack
+from photoplan.kernels.raster import interleave
 from photoplan.kernels.rectify import rectify_tile
 
 #: Those that are compiled with floats, which show what rounding to grey values hides.
@@ -290,7 +290,7 @@ def test_arrays_of_other_layout_are_accepted():
 def test_pack(bands, masked):
     source = noise((bands, 5, 37), "uint16")
     valid = np.random.default_rng(0).random((5, 37)) < 0.5 if masked else None
-    packed = pack(source, valid)
+    packed = interleave(source, valid)
     lanes = 1 if bands == 1 else 4
     assert packed.shape == (-(-bands // lanes), 5, 37, lanes)
     planes = packed.transpose(0, 3, 1, 2).reshape(-1, 5, 37)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photoplan.kernels.sample_grid import sample_lattice, sample_points
+from photoplan.kernels.terrain import sample_lattice, sample_points
 
 
 def bilinear(grid, x, y):

@@ -6,8 +6,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from photoplan.kernels.semi_global import choose, scatter, sum_paths
-from photoplan.kernels.sweep import HALF_COLUMNS, HALF_ROWS, add_costs, describe, sample_plane
+from photoplan.kernels.matching import (
+    HALF_COLUMNS,
+    HALF_ROWS,
+    add_plane_costs,
+    census_transform,
+    cost_scatter,
+    least_cost_steps,
+    sample_plane,
+    sum_paths,
+)
 
 
 def runs(rng: np.random.Generator, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -51,7 +59,7 @@ def test_the_cheapest_step_and_how_far_the_next_one_is() -> None:
     total = np.concatenate([valley, k]).astype(np.float32)
     first, low = np.array([0, 12, 24]), np.array([[100, 100]])
     steps, margin = np.empty((1, 2)), np.empty((1, 2))
-    choose(total, first, low, 2, steps, margin)
+    least_cost_steps(total, first, low, 2, steps, margin)
     assert abs(steps[0, 0] - 104.2) < 1e-4 and abs(margin[0, 0] - (1.5 - 0.04)) < 1e-4
     assert steps[0, 1] == 100 and margin[0, 1] == 0  # the first one of a run is no minimum
 
@@ -62,12 +70,12 @@ def test_other_choices_scatter_as_probable_as_they_are() -> None:
     total[2], total[8] = 3.0, 5.0
     out = np.empty((1, 1))
     first, low, best = np.array([0, 11]), np.array([[10]]), np.array([[12.0]])
-    scatter(total, first, low, best, 1.0, 0.01, best - 2, best + 2, out)
+    cost_scatter(total, first, low, best, 1.0, 0.01, best - 2, best + 2, out)
     p = np.exp(-2.0)
     assert abs(out[0, 0] - 36 * p / (1 + p)) < 1e-6
-    scatter(total, first, low, best, 1.0, 0.01, best - 2, best + 6, out)
+    cost_scatter(total, first, low, best, 1.0, 0.01, best - 2, best + 6, out)
     assert out[0, 0] < 1e-6  # a finer level chooses from both
-    scatter(total, first, low, best, 0.4, 0.01, best - 2, best + 2, out)
+    cost_scatter(total, first, low, best, 0.4, 0.01, best - 2, best + 2, out)
     assert out[0, 0] == 0  # five units
 
 
@@ -85,7 +93,7 @@ def test_cells_of_a_plane_and_what_is_brighter_around_them() -> None:
     assert np.isnan(grey[0, 0])
     noise = np.random.default_rng(1).normal(0, 1, (16, 33)).astype(np.float32)
     bits, ok = np.zeros((16, 33), np.uint64), np.zeros((16, 33), bool)
-    describe(noise, wanted, bits, ok)
+    census_transform(noise, wanted, bits, ok)
     around = noise[5 - HALF_ROWS : 6 + HALF_ROWS, 9 - HALF_COLUMNS : 10 + HALF_COLUMNS]
     assert int(bits[5, 9]) == int("".join("01"[int(v)] for v in (around > noise[5, 9]).reshape(-1)), 2)
     assert ok[HALF_ROWS:-HALF_ROWS, HALF_COLUMNS:-HALF_COLUMNS].all() and ok.sum() == (16 - 6) * (33 - 8)
@@ -100,9 +108,9 @@ def test_the_cost_is_that_of_the_better_half_of_the_pairs() -> None:
     low[0, 0] = 6
     first = np.concatenate([[0], np.cumsum(np.full(9, 2))]).astype(np.int64)
     cost = np.full(18, 9.0, np.float32)
-    add_costs(census, known, pairs, 5, low, low + 2, 4, 1, 0.5, first, cost)
+    add_plane_costs(census, known, pairs, 5, low, low + 2, 4, 1, 0.5, first, cost)
     assert (cost[:2] == 9).all() and (cost[2::2] == 9).all() and np.allclose(cost[3::2], 0.5)
-    add_costs(census, known, pairs[:1], 5, low, low + 2, 4, 1, 0.5, first, cost)
+    add_plane_costs(census, known, pairs[:1], 5, low, low + 2, 4, 1, 0.5, first, cost)
     assert np.allclose(cost[3::2], 0.0)
-    add_costs(census, known & False, pairs, 5, low, low + 2, 4, 1, 0.25, first, cost)
+    add_plane_costs(census, known & False, pairs, 5, low, low + 2, 4, 1, 0.25, first, cost)
     assert np.allclose(cost[3::2], 0.25)

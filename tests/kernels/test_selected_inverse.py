@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from photoplan.kernels.selected_inverse import aligned, fill_pattern, selected_inverse
+from photoplan.kernels.sparse_inverse import align_factor, fill_pattern, selected_inverse
 
 
 def sparse_positive(n: int, seed: int) -> np.ndarray:
@@ -33,7 +33,7 @@ def test_selected_inverse_equals_the_dense_one_on_its_pattern(seed: int) -> None
     assert dense[np.abs(np.tril(L, -1)) > 1e-12].all(), "the pattern holds all of L"
     assert dense.sum() < 40 * 39 / 2, "and is no full triangle"
     factor = sparse.csc_matrix(np.where(np.abs(L) > 1e-14, L, 0.0))
-    values = aligned(
+    values = align_factor(
         pointer, rows, factor.indptr.astype(np.int64), factor.indices.astype(np.int64), factor.data.astype(float)
     )
     diagonal, off = selected_inverse(pointer, rows, values, D)

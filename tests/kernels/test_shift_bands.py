@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from photoplan.kernels.shift_bands import limits_of, no_mask, shift_band
+from photoplan.kernels.raster import empty_mask, pixel_range, shift_band
 from photoplan.kernels.weights import KERNELS
 
 
@@ -12,7 +12,13 @@ def shifted(source, moved, name="lanczos3", valid=None, offset=(0, 0)):
     out, good = np.empty((h, w), source.dtype), np.ones((h, w), bool)
     coefficients = np.array(KERNELS[name].coefficients)
     shift_band(
-        source, no_mask() if valid is None else valid, offset, moved, (coefficients, limits_of(source.dtype)), out, good
+        source,
+        empty_mask() if valid is None else valid,
+        offset,
+        moved,
+        (coefficients, pixel_range(source.dtype)),
+        out,
+        good,
     )
     return out, good
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from photoplan.kernels.sides import clip_lines, sides_of
+from photoplan.kernels.prediction import clip_lines, sides_of
 
 BENT = np.array([[0.0, 0.0], [4.0, 1.0], [7.0, 0.5], [10.0, 3.0]])
 

@@ -9,8 +9,8 @@ import pytest
 from tools.thinned import some
 
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.pyramid import pyramid_of
-from photoplan.kernels.visibility import sight_rows
+from photoplan.kernels.rays import pyramid_of
+from photoplan.kernels.visibility import least_visible_heights
 
 SIZE = 41 if COMPILED else 15
 
@@ -18,7 +18,7 @@ SIZE = 41 if COMPILED else 15
 def sight(heights, eye, target_height=0.0, radius=np.inf, stop=False):
     out = np.empty(heights.shape, np.float32)
     heights = np.ascontiguousarray(heights, np.float32)
-    sight_rows(heights, pyramid_of(heights), (*eye, radius), (0, heights.shape[0]), target_height, stop, out)
+    least_visible_heights(heights, pyramid_of(heights), (*eye, radius), (0, heights.shape[0]), target_height, stop, out)
     return out
 
 

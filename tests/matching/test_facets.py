@@ -7,7 +7,7 @@ import pytest
 from tools.thinned import some
 
 from photoplan.geometry.grid import Window
-from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
+from photoplan.kernels.facets import add_curvatures, solve_heights, variances
 from photoplan.matching.facets.means import away_from_border
 from photoplan.matching.facets.observe import Roughness, Smoother, curvatures
 from photoplan.matching.facets.pyramid import FILTERS, Pyramid, halved

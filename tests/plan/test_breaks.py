@@ -9,7 +9,7 @@ from tools.pinhole import vertical
 
 from photoplan.cameras.base import project
 from photoplan.geometry.grid import Breaks, MapGrid, Window
-from photoplan.kernels.position import positions
+from photoplan.kernels.positions import positions
 from photoplan.plan.anchors import AnchorRule, Anchors, compile_anchors
 from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget

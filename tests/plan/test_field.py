@@ -18,7 +18,7 @@ from photoplan.cameras.lenses import Brown, Fisheye, Lens, NoLens, RadialTable, 
 from photoplan.engine.execute import ArrayReader, Source, render
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.kernels.position import positions
+from photoplan.kernels.positions import positions
 from photoplan.plan.anchors import AnchorRule, Anchors, compile_anchors, field_grid
 from photoplan.plan.footprint import Tile
 from photoplan.plan.ground import TileGround

@@ -11,7 +11,7 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Brown
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.kernels.position import positions
+from photoplan.kernels.positions import positions
 from photoplan.plan.anchors import AnchorRule, compile_anchors, field_grid
 from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget

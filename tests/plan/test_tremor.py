@@ -10,7 +10,7 @@ from photoplan.cameras.base import project
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.camera.line import read_line
-from photoplan.kernels.position import positions
+from photoplan.kernels.positions import positions
 from photoplan.plan.anchors import AnchorRule, Anchors, compile_anchors
 from photoplan.plan.ground import TileGround
 from photoplan.plan.sources import sight_lines

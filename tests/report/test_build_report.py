@@ -10,7 +10,7 @@ import pytest
 from tools.sketched import drawn
 
 from photoplan.errors import ResourceError
-from photoplan.kernels.collocation import correlation
+from photoplan.kernels.prediction import correlation
 from photoplan.products.dtm.build import BuildReport
 from photoplan.report import dtm as dtm_covariance
 from photoplan.report import dtm as samples

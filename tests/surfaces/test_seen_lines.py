@@ -11,7 +11,7 @@ from tools.function_surface import raster_surface
 
 from photoplan.cameras.curvature import EarthBend
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.strokes import draw_strokes
+from photoplan.kernels.raster import draw_lines
 from photoplan.surfaces.seen import Lines, LinesOfSight, SeenLines, SeenSurface
 from photoplan.targets.view import FrameBundle, Panorama, ViewTarget
 
@@ -126,7 +126,7 @@ def test_a_line_has_its_width_at_any_angle(width: float) -> None:
             way = 60 * np.array([np.cos(angle), np.sin(angle)])
             ends = np.concatenate([np.subtract((50 + shift, 50), way), np.add((50 + shift, 50), way)])
             cover = np.zeros((101, 101), np.float32)
-            draw_strokes(ends[None], width, cover)
+            draw_lines(ends[None], width, cover)
             # What is covered of the middle, by the length of the line in it.
             along = (np.stack(np.mgrid[:101, :101][::-1], axis=-1) - (50 + shift, 50)) @ (way / 60)
             inner = np.clip(30.5 - np.abs(along), 0, 1)

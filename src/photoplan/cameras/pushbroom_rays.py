@@ -15,7 +15,7 @@ from photoplan.cameras.base import Camera, Vantage
 from photoplan.errors import InputError
 from photoplan.geometry.local import BodyGround, NearGround
 from photoplan.geometry.pose import Course, continuous, cubic_convolution, rotations
-from photoplan.kernels.straight import seen_straight
+from photoplan.kernels.linear_pushbroom import project_linear_pushbroom
 
 _Floats = NDArray[np.float64]
 #: Lines by which tables may end before the image, since large times are rounded.
@@ -380,7 +380,7 @@ class StraightFlight:
         """Positions (n, 2) of points (n, 3) in the axes of the body; NaN behind the camera. Rows may be any."""
         d, out = np.ascontiguousarray((P - self.place) @ self.R), np.empty((len(P), 2))
         coefficients = np.ascontiguousarray(self.look.coefficients)
-        seen_straight(d, self.speed @ self.R, (coefficients, *self.look.span, sum(self.look.ends) / 2), out)
+        project_linear_pushbroom(d, self.speed @ self.R, (coefficients, *self.look.span, sum(self.look.ends) / 2), out)
         out[:, 1] += self.middle
         return out
 

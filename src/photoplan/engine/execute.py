@@ -14,7 +14,7 @@ from photoplan.cameras.base import Part, Projection
 from photoplan.engine.run import Made, Output
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import FullSize, Pixels, Window, reduced
-from photoplan.kernels.position import ALL_MINE
+from photoplan.kernels.positions import ALL_MINE
 from photoplan.kernels.rectify import rectify_tile
 from photoplan.plan.accuracy import DepthErrors, SourceErrors, radial_counts, tile_accuracy
 from photoplan.plan.footprint import Tile

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.codec import storable
 from photoplan.errors import UsageError
-from photoplan.kernels.reduce import reduce_means
+from photoplan.kernels.raster import reduce_means
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.io.gdal import gdal_settings, warnings_of_gdal
-from photoplan.kernels.pack import fill_block
+from photoplan.kernels.raster import fill_block
 
 COMPRESSIONS = ("none", "deflate", "zstd", "lzw", "jpeg")
 PRODUCT_TYPES = ("uint8", "uint16", "int16", "float32", "float64")

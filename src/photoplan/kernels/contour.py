@@ -58,7 +58,7 @@ def count_segments(
 
 
 @inner
-def _cut(ranks: NDArray[np.int64], a: int, b: int, c: int, at: int, pieces: NDArray[np.int64]) -> int:
+def _cut_triangle(ranks: NDArray[np.int64], a: int, b: int, c: int, at: int, pieces: NDArray[np.int64]) -> int:
     """Pieces of one counter-clockwise triangle, higher ground on their right; returns the next free row."""
     ra, rb, rc = ranks[a], ranks[b], ranks[c]
     for k in range(min(min(ra, rb), rc) + 1, max(max(ra, rb), rc) + 1):
@@ -116,14 +116,14 @@ def fill_segments(
             continue
         centre = posts + mesh
         for a, b in ((nw, sw), (sw, se), (se, ne), (ne, nw)):
-            at = _cut(ranks, a, b, centre, at, pieces)
+            at = _cut_triangle(ranks, a, b, centre, at, pieces)
     for i in range(triangles.shape[0]):
-        at = _cut(ranks, triangles[i, 0], triangles[i, 1], triangles[i, 2], at, pieces)
+        at = _cut_triangle(ranks, triangles[i, 0], triangles[i, 1], triangles[i, 2], at, pieces)
     return at
 
 
 @inner
-def _root(z0: float, z1: float, bend: float, level: float) -> float:
+def _edge_root(z0: float, z1: float, bend: float, level: float) -> float:
     """Where z0 + (z1 − z0) s − bend s (1 − s) reaches a level between its ends: the only such s from 0 to 1."""
     b, c = z1 - z0 - bend, z0 - level
     q = -0.5 * (b + (1.0 if b >= 0.0 else -1.0) * np.sqrt(max(b * b - 4.0 * bend * c, 0.0)))
@@ -133,7 +133,7 @@ def _root(z0: float, z1: float, bend: float, level: float) -> float:
 
 
 @inner
-def _range(slope: float, bend: float, band: float, at: float) -> tuple[Any, Any]:
+def _tolerance_range(slope: float, bend: float, band: float, at: float) -> tuple[Any, Any]:
     """The stretch of an edge round `at` in which the height is within the band of that there.
 
     It is connected, so that stretches of two levels, which have no height in common, lie in the order of the levels.
@@ -186,10 +186,10 @@ def cross_edges(
         za, zb = xyz[a, 2], xyz[b, 2]
         apart = min(APART, 0.25 * abs(zb - za))
         inside = min(max(level, min(za, zb) + apart), max(za, zb) - apart)
-        at = min(max(_root(za, zb, bend, inside), 0.0), 1.0)
+        at = min(max(_edge_root(za, zb, bend, inside), 0.0), 1.0)
         low, high = at, at
         if band > 0.0 and not fixed[i]:
-            low, high = _range(zb - za - bend + 2.0 * bend * at, bend, band, at)
+            low, high = _tolerance_range(zb - za - bend + 2.0 * bend * at, bend, band, at)
             low = min(max(low, min(MARGIN, 0.5 * at)), at)
             high = max(min(high, 1.0 - min(MARGIN, 0.5 * (1.0 - at))), at)
         for k in range(2):
@@ -295,13 +295,13 @@ def smooth_line(places: NDArray[np.float64], closed: bool, passes: int) -> None:
 
 
 @inner
-def _between(rx: float, ry: float, lx: float, ly: float, dx: float, dy: float) -> Any:
+def _is_between(rx: float, ry: float, lx: float, ly: float, dx: float, dy: float) -> Any:
     """Whether a direction lies between a right and a left one, which are less than half a turn apart."""
     return _cross(rx, ry, dx, dy) >= 0.0 and _cross(dx, dy, lx, ly) >= 0.0
 
 
 @inner
-def _reach(places: NDArray[np.float64], start: int, closed: bool) -> int:
+def _furthest_vertex(places: NDArray[np.float64], start: int, closed: bool) -> int:
     """The furthest vertex that a straight line from `start` reaches through the ranges of all between."""
     n = places.shape[0]
     last = n if closed else n - 1
@@ -311,7 +311,7 @@ def _reach(places: NDArray[np.float64], start: int, closed: bool) -> int:
     for i in range(start + 1, last + 1):
         k = i % n
         first = i == start + 1
-        if not first and _between(rx, ry, lx, ly, places[k, 0] - px, places[k, 1] - py):
+        if not first and _is_between(rx, ry, lx, ly, places[k, 0] - px, places[k, 1] - py):
             best = i
         ax, ay, bx, by = places[k, 2] - px, places[k, 3] - py, places[k, 4] - px, places[k, 5] - py
         if _cross(ax, ay, bx, by) < 0.0:
@@ -322,8 +322,8 @@ def _reach(places: NDArray[np.float64], start: int, closed: bool) -> int:
         if first:
             rx, ry, lx, ly = ax, ay, bx, by
             continue
-        right, left = _between(rx, ry, lx, ly, ax, ay), _between(rx, ry, lx, ly, bx, by)
-        if not ((right or _between(ax, ay, bx, by, rx, ry)) and (left or _between(ax, ay, bx, by, lx, ly))):
+        right, left = _is_between(rx, ry, lx, ly, ax, ay), _is_between(rx, ry, lx, ly, bx, by)
+        if not ((right or _is_between(ax, ay, bx, by, rx, ry)) and (left or _is_between(ax, ay, bx, by, lx, ly))):
             break
         if right:
             rx, ry = ax, ay
@@ -359,7 +359,7 @@ def thin_line(places: NDArray[np.float64], closed: bool, keep: NDArray[np.bool_]
     while at < last:
         keep[at] = True
         count += 1
-        at = _reach(places, at, closed)
+        at = _furthest_vertex(places, at, closed)
     if not closed:
         keep[n - 1] = True
         count += 1

@@ -1,4 +1,4 @@
-"""How every kernel is compiled: without the GIL, serial, kept on disk."""
+"""Compilation of the numba kernels: options, and the cache of compiled code on the disk."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 from numba import config, njit, typeof
 
 from photoplan.errors import PhotoplanWarning
-from photoplan.kernels.numba_parts import INNER_OPTIONS, KERNEL_OPTIONS, MAKER_OPTIONS, is_cached, keep
+from photoplan.kernels.numba_internals import INNER_OPTIONS, KERNEL_OPTIONS, MAKER_OPTIONS, enable_cache, is_cached
 
 COMPILED: bool = not config.DISABLE_JIT
 """False when `NUMBA_DISABLE_JIT=1`: everything then runs as plain Python, slowly, with the same results."""
@@ -33,7 +33,7 @@ def kernel(function: Callable[..., Any]) -> Any:
         return function
     dispatcher = njit(**_OPTIONS, **KERNEL_OPTIONS)(function)
     try:
-        keep(dispatcher)
+        enable_cache(dispatcher)
     except RuntimeError:  # neither the package's folder nor the user's can be written
         folder = _temporary_folder()
         if folder is None:
@@ -42,7 +42,7 @@ def kernel(function: Callable[..., Any]) -> Any:
         # For the kernels after this one, and for processes that this one starts.
         config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = folder
         warnings.warn(_ELSEWHERE.format(folder), PhotoplanWarning, stacklevel=2)
-        keep(dispatcher)
+        enable_cache(dispatcher)
     return dispatcher
 
 

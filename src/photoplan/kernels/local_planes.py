@@ -1,4 +1,4 @@
-"""What each point's neighbours say of its height by a robust plane, without a covariance function or a noise."""
+"""Local planes: robust fits to the neighbours of points, and the discontinuities between them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
+
+# Robust planes through the neighbours of points, without a covariance function or a stated noise.
+
 
 # Fewer neighbours determine no plane that could do without one of them.
 _FEWEST = 6
@@ -144,7 +147,7 @@ def local_scales(
 
 
 @kernel
-def part_across(
+def separate_across_lines(
     xyz: NDArray[Any], near: NDArray[Any], some: NDArray[Any], ends: NDArray[Any], of: NDArray[Any], start: NDArray[Any]
 ) -> None:
     """Replace neighbours of some points that lie beyond a line by −1.
@@ -167,13 +170,13 @@ def part_across(
             if j < 0:
                 continue
             for s in of[start[t] : start[t + 1]]:
-                if _cross(xyz[i], xyz[j], ends[s]):
+                if _segments_cross(xyz[i], xyz[j], ends[s]):
                     near[i, c] = -1
                     break
 
 
 @inner
-def _cross(p: NDArray[Any], q: NDArray[Any], e: NDArray[Any]) -> bool:
+def _segments_cross(p: NDArray[Any], q: NDArray[Any], e: NDArray[Any]) -> bool:
     """Whether the way from p to q crosses the piece from e[0], e[1] to e[2], e[3]."""
     dx, dy, ex, ey = q[0] - p[0], q[1] - p[1], e[2] - e[0], e[3] - e[1]
     a = dx * (e[1] - p[1]) - dy * (e[0] - p[0])
@@ -181,3 +184,98 @@ def _cross(p: NDArray[Any], q: NDArray[Any], e: NDArray[Any]) -> bool:
     f = ex * (p[1] - e[1]) - ey * (p[0] - e[0])
     g = ex * (q[1] - e[1]) - ey * (q[0] - e[0])
     return a * b <= 0.0 and f * g < 0.0
+
+
+# Discontinuities: height differences between neighbours, connected components, and their borders.
+
+
+@kernel
+def neighbour_differences(
+    xyz: NDArray[Any], near: NDArray[Any], slopes: NDArray[Any], result: NDArray[Any], middle: NDArray[Any]
+) -> None:
+    """Heights of points less those of their neighbours, the slope of the ground taken away.
+
+    Parameters
+    ----------
+    xyz : ndarray, shape (≥ p, 3)
+    near : ndarray, shape (p, k), int
+        Neighbours; −1: none.
+    slopes : ndarray, shape (p, 2)
+        Of the ground around each point, towards x and y.
+    result, middle : ndarrays, shapes (p, k), (p,)
+        Receive the differences, NaN where there is no neighbour, and the median of their absolute values.
+    """
+    r = np.empty(near.shape[1])
+    for i in range(len(near)):
+        m = 0
+        for c in range(near.shape[1]):
+            j = near[i, c]
+            result[i, c] = np.nan
+            if j >= 0:
+                dx, dy = xyz[i, 0] - xyz[j, 0], xyz[i, 1] - xyz[j, 1]
+                fall = 0.5 * ((slopes[i, 0] + slopes[j, 0]) * dx + (slopes[i, 1] + slopes[j, 1]) * dy)
+                result[i, c] = xyz[i, 2] - xyz[j, 2] - fall
+                r[m] = abs(result[i, c])
+                m += 1
+        middle[i] = np.median(r[:m]) if m > 0 else np.nan
+
+
+@inner
+def _root(label: NDArray[Any], i: int) -> int:
+    while label[i] != i:
+        label[i] = label[label[i]]
+        i = label[i]
+    return i
+
+
+@kernel
+def connected_components(
+    near: NDArray[Any], difference: NDArray[Any], scale: NDArray[Any], hold: float, label: NDArray[Any]
+) -> None:
+    """Number every point by the group that it hangs together with: label[i], shape (p,), names one of its points.
+
+    Neighbours do whose difference is below `hold` times the larger of their scales.
+    """
+    for i in range(len(label)):
+        label[i] = i
+    for i in range(len(label)):
+        for c in range(near.shape[1]):
+            j = near[i, c]
+            if j >= 0 and abs(difference[i, c]) < hold * max(scale[i], scale[j]):
+                a, b = _root(label, i), _root(label, j)
+                if a != b:
+                    label[max(a, b)] = min(a, b)
+    for i in range(len(label)):
+        label[i] = _root(label, i)
+
+
+@kernel
+def component_borders(
+    near: NDArray[Any],
+    difference: NDArray[Any],
+    scale: NDArray[Any],
+    hold: float,
+    label: NDArray[Any],
+    result: NDArray[Any],
+) -> None:
+    """What lies between each group and the points around it.
+
+    result, shape (p, 6), receives at the number of each group: edges across its border, those along which it lies
+    higher and lower than `hold` scales, the sums of these differences in scales, and of all, absolute.
+    """
+    result[:] = 0.0
+    for i in range(len(label)):
+        for c in range(near.shape[1]):
+            j = near[i, c]
+            if j < 0 or label[i] == label[j]:
+                continue
+            size = difference[i, c] / max(scale[i], scale[j])
+            for group, value in ((label[i], size), (label[j], -size)):
+                result[group, 0] += 1.0
+                result[group, 5] += abs(difference[i, c])
+                if value > hold:
+                    result[group, 1] += 1.0
+                    result[group, 3] += value
+                elif value < -hold:
+                    result[group, 2] += 1.0
+                    result[group, 4] -= value

@@ -1,4 +1,4 @@
-"""One tile resampled from one source window: the only entry to the resampling kernels.
+"""Rectification of one tile from one source window: the only entry to the resampling kernels.
 
 Validity, one rule: a tap outside the image, or invalid in the source's mask, carries no weight, and the rest is
 renormalised. A pixel is valid if its height is finite, it lies in a rectangle of the anchors, its position lies within
@@ -14,17 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.apart import apart_runs
-from photoplan.kernels.area import average_runs
-from photoplan.kernels.border import border_runs
-from photoplan.kernels.footprint import average_along_runs, footprint_runs
-from photoplan.kernels.gather import gather_runs
+from photoplan.kernels.footprint import STRETCH_CHECK, average_along_runs, footprint_runs, largest_scales, stretch_runs
 from photoplan.kernels.jit import is_ready
-from photoplan.kernels.pack import as_bytes, pack, solid_patches
-from photoplan.kernels.place import empty_block, place_runs
-from photoplan.kernels.position import ALL_MINE, RUN, Owned, tile_runs
-from photoplan.kernels.rows import CELL, row_cells
-from photoplan.kernels.scale import LOOK_CLOSER, largest_scales, stretch_runs
+from photoplan.kernels.positions import ALL_MINE, CELL, RUN, Owned, find_taps, line_offset_cells, tap_block, tile_runs
+from photoplan.kernels.raster import interleave, mask_bytes, valid_patches
+from photoplan.kernels.resample import average_runs, border_runs, gather_runs, line_scan_runs
 from photoplan.kernels.weights import KERNELS, weight_table
 
 AnchorArrays = tuple[NDArray[Any], ...]
@@ -80,7 +74,7 @@ def rectify_tile(
     relief : ndarray, shape (rows, cols), float32
         Height of every pixel, metres; NaN where there is no surface.
     source : ndarray, shape (bands, height, width)
-        uint8, uint16, int16 or float32. Or what `pack` made of it, (groups, height, width, lanes), for several tiles.
+        uint8, uint16, int16 or float32; or interleaved for several tiles, (groups, height, width, lanes).
     valid : ndarray, shape (height, width), or None
         Bool or uint8, 0 = invalid. NaN pixels of float data must be marked here.
     border : (x_min, y_min, x_max, y_max) or None
@@ -107,7 +101,7 @@ def rectify_tile(
     widened along image x and y (see `weights.stretch`), except for "nearest", which keeps grey values. With `tilt` it
     is widened by the width of what a pixel covers, and repeated along its length, see `photoplan.kernels.footprint`.
     """
-    packed = source if source.ndim == 4 else pack(source, valid)
+    packed = source if source.ndim == 4 else interleave(source, valid)
     height, width = packed.shape[1:3]
     target, target_valid = _plain(out, out.dtype), _plain(out_valid, bool)
     if owned is ALL_MINE:
@@ -115,12 +109,12 @@ def rectify_tile(
         target_valid[...] = False
     arrays = tuple(_plain(np.asarray(array), dtype) for array, dtype in zip(anchors, _ANCHOR_TYPES))
     if arrays[5].shape[2] == 5:
-        arrays = (*arrays[:5], row_cells(arrays[5]))
+        arrays = (*arrays[:5], line_offset_cells(arrays[5]))
     if packed.size and len(arrays[0]):
         mask = solid = np.empty((0, 0), np.uint8)
         if valid is not None:
-            mask = _plain(as_bytes(valid), np.uint8)
-            solid = solid_patches(mask, KERNELS[kernel].taps)
+            mask = _plain(mask_bytes(valid), np.uint8)
+            solid = valid_patches(mask, KERNELS[kernel].taps)
         edges = (-0.5, -0.5, width - 0.5, height - 0.5) if border is None else tuple(float(edge) for edge in border)
         image = (_plain(packed, packed.dtype), mask, solid, edges)
         place = (int(offset[0]), int(offset[1]))
@@ -154,13 +148,13 @@ def _resample(
     coarse = np.zeros(len(rects), bool)
     if name != "nearest":
         stretch = frame[4] if field.size else 1.0
-        coarse = ~(stretch * largest_scales(rects, box_start, corners) <= LOOK_CLOSER) | (ground[1].size > 0)
+        coarse = ~(stretch * largest_scales(rects, box_start, corners) <= STRETCH_CHECK) | (ground[1].size > 0)
     for averaging in (False, True):
         chosen = np.flatnonzero(coarse == averaging)
         if not len(chosen):
             continue
         runs = tile_runs(rects, chosen, offset, ground[0].shape, owned)
-        block = empty_block(min(BLOCK, len(runs)))
+        block = tap_block(min(BLOCK, len(runs)))
         for start in range(0, len(runs), BLOCK):
             _block(anchors, runs[start : start + BLOCK], ground, image, name, offset, (block, averaging), result)
 
@@ -183,7 +177,7 @@ def _block(
     taps = KERNELS[name].taps
     relief, tilt = ground
     by_rows = anchors[5].shape[2] == CELL
-    doubtful = place_runs(anchors, runs, relief, offset, (taps, width, height, solid, edges), block, result[1])
+    doubtful = find_taps(anchors, runs, relief, offset, (taps, width, height, solid, edges), block, result[1])
     averaged = 0
     scales = np.empty((0, 2, RUN), np.float32)
     if averaging:
@@ -194,7 +188,7 @@ def _block(
             averaged = stretch_runs(anchors, runs, relief, offset, block, scales)
     if by_rows:
         rule = (coefficients, taps, weight_table(name), limits)
-        apart_runs((packed, mask, solid), anchors, runs, (relief, offset), block, scales, rule, tags, result)
+        line_scan_runs((packed, mask, solid), anchors, runs, (relief, offset), block, scales, rule, tags, result)
         return
     gather_runs(packed, runs, offset, block, coefficients, tags, result[0])
     if doubtful:
@@ -214,4 +208,4 @@ def is_compiled(dtype: Any, bands: int, kernel: str) -> bool:
     lanes = 1 if bands == 1 else 4
     coefficients, tags, _ = _rule(kernel, np.dtype(dtype), lanes)
     source, out = np.empty((1, 1, 1, lanes), dtype), np.empty((bands, 1, 1), dtype)
-    return is_ready(gather_runs, (source, np.empty((0, 5), np.int32), (0, 0), empty_block(0), coefficients, tags, out))
+    return is_ready(gather_runs, (source, np.empty((0, 5), np.int32), (0, 0), tap_block(0), coefficients, tags, out))

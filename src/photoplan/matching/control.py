@@ -14,7 +14,7 @@ from photoplan.adjustment.least_squares import MEDIAN_2D, cauchy, huber, solve
 from photoplan.cameras.base import CentralCamera, project
 from photoplan.geometry.grid import Window
 from photoplan.geometry.pose import skew, small_rotations
-from photoplan.kernels.patch_match import (
+from photoplan.kernels.matching import (
     CONVERGED,
     CORRELATION,
     RESULTS,

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from photoplan.adjustment.least_squares import MEDIAN_2D
 from photoplan.codec import storable
 from photoplan.events import Map
-from photoplan.kernels.patch_match import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
+from photoplan.kernels.matching import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
 from photoplan.matching.features import Grey, Tracks, patches_at
 
 #: Neighbours whose features tell how two images are turned and scaled against each other at a place.

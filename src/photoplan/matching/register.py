@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.adjustment.least_squares import huber, solve, spread
 from photoplan.codec import storable
 from photoplan.geometry.grid import Placement, Window
-from photoplan.kernels.correlation import correlate
-from photoplan.kernels.patch_match import sample_spline, spline_coefficients
+from photoplan.kernels.matching import correlate, sample_spline, spline_coefficients
 from photoplan.matching.features import Grey, patches_at
 from photoplan.matching.refine import RefineSettings, disc, match_between
 from photoplan.plain import pick

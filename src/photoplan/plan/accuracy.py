@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.cameras.base import Projection, project
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.kernels.spread import FIGURES, between_nodes, spread_out
+from photoplan.kernels.anchors import FIGURES, ground_errors, interpolate_trilinear
 from photoplan.kernels.weights import KERNELS
 from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
@@ -156,7 +156,7 @@ class SourceErrors:
 
 
 def figures_at(errors: SourceErrors, target: Target, uvh: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Figures of places (..., 3) that `photoplan.kernels.spread.spread_out` takes, strictly."""
+    """Figures of places (..., 3) that `photoplan.kernels.anchors.ground_errors` takes, strictly."""
     here = target.to_ground(uvh)
     metre = np.linalg.norm(target.to_ground(uvh + np.array([1.0, 0, 0])) - here, axis=-1)
     size = np.stack(np.broadcast_arrays(1.0, 1.0, metre), axis=-1)
@@ -206,7 +206,7 @@ def tile_accuracy(
         if mine.any():
             figures = _figures(sources[int(number) - 1], target, window, np.where(mine, depth, np.float32(np.nan)))
             part = np.empty((6, int(mine.sum())), np.float32)
-            spread_out(figures[mine], slope[mine], sigma[mine], part)
+            ground_errors(figures[mine], slope[mine], sigma[mine], part)
             out[:, mine] = part
     return out
 
@@ -238,7 +238,7 @@ def _figures(errors: SourceErrors, target: Target, window: Window, depth: NDArra
             break
         counts = np.where(rough, np.minimum(2 * counts - 1, (most + 1) // 2), counts)
     figures = np.empty((*depth.shape, FIGURES))
-    between_nodes(np.ascontiguousarray(nodes), low, high, depth, figures)
+    interpolate_trilinear(np.ascontiguousarray(nodes), low, high, depth, figures)
     # Beside the border of what the source shows a node may lie beyond it.
     lost = np.isfinite(depth) & np.isnan(figures).any(axis=-1)
     if lost.any():

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import ImageField, Projection, Tremor, project, tremor_of
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Breaks, Window, level_size
-from photoplan.kernels.boxes import blocks_in_image, judge_boxes
+from photoplan.kernels.anchors import blocks_in_image, interpolation_errors
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.ground import CORNERS, MIDDLE, SQUARE, Boxes, TileGround
 from photoplan.plan.jitter import TremorTable, tremor_table
@@ -463,7 +463,7 @@ def compile_anchors(
             strict = _strict(projection, ground, boxes)
             np.maximum.at(errors, boxes.rect, bend_errors(breaks, lattice[:, CORNERS], strict))
         keep, behind = np.zeros((2, len(errors)), bool)
-        judge_boxes(lattice, boxes.rect, image.bounds, float(rule.radius), errors, keep, behind)
+        interpolation_errors(lattice, boxes.rect, image.bounds, float(rule.radius), errors, keep, behind)
         errors[behind] = np.inf
         split_u, split_v, thin = _verdict(errors, boxes, image.tolerance, behind)
         again = split_u | split_v | thin

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
-from photoplan.kernels.boxes import find_owned
-from photoplan.kernels.extent import height_ranges
+from photoplan.kernels.anchors import owned_bounds
+from photoplan.kernels.terrain import height_ranges
 from photoplan.targets.base import Target
 
 #: Side of the squares with heights of their own from which it is found what a tile needs of a source, pixels.
@@ -95,7 +95,7 @@ class TileGround:
         place[np.add(sources, 1)] = np.arange(len(sources))
         squares = np.zeros((len(sources), *self.ranges.shape[1:]), bool)
         parts = np.tile(np.array([*reversed(owner.shape), 0, 0]), (len(sources), 1))
-        find_owned(owner, place, SQUARE, squares, parts)
+        owned_bounds(owner, place, SQUARE, squares, parts)
         nothing = np.array([np.inf, -np.inf])[:, None, None]
         return np.where(squares[:, None], self.ranges, nothing), parts
 

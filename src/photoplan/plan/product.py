@@ -12,7 +12,7 @@ from photoplan.cameras.base import Part, Projection, parts_of
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.footprint import depth_tilt, footprint_levels
-from photoplan.kernels.position import tile_runs
+from photoplan.kernels.positions import tile_runs
 from photoplan.plan.anchors import FINEST, AnchorRule, Anchors, compile_anchors
 from photoplan.plan.footprint import Tile, Tiles
 from photoplan.plan.ground import TileGround

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Projection, project, steady
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.kernels.choose import add_penalties, between_nodes
-from photoplan.kernels.pyramid import pyramid_of
-from photoplan.kernels.visibility import BEYOND, HIDDEN, SEEN, find_behind, find_hidden, quiet_blocks
+from photoplan.kernels.anchors import interpolate_positions, source_costs
+from photoplan.kernels.rays import pyramid_of
+from photoplan.kernels.visibility import BEYOND, HIDDEN, SEEN, find_behind, find_hidden, free_blocks
 from photoplan.plan.ground import TileGround
 from photoplan.plan.options import Weights
 from photoplan.surfaces.base import Lattice, Surface, Terrain
@@ -156,7 +156,7 @@ class _OverTerrain:
         around = every & Window(near.col - m, near.row - m, near.width + 2 * m, near.height + 2 * m)
         heights = lattice.read(around)
         # Where the raster ends before the lines do, no part of it is quiet.
-        quiet = quiet_blocks(heights, _flattest(lines, lattice) if around == every else 0.0, top)
+        quiet = free_blocks(heights, _flattest(lines, lattice) if around == every else 0.0, top)
         found = np.zeros(relief.shape, np.uint8)
         if quiet.all():
             return found
@@ -440,7 +440,9 @@ class BestImage:
         shape, (width, height) = ground.relief.shape, camera.size
         xy, near, values = np.empty((*shape, 2)), np.empty(shape), np.empty((4, *shape), np.float32)
         nodes, levels, corner = self._nodes(camera, ground)
-        between_nodes(ground.relief, nodes, levels, corner, _SPACING, (float(width), float(height)), xy, near, values)
+        interpolate_positions(
+            ground.relief, nodes, levels, corner, _SPACING, (float(width), float(height)), xy, near, values
+        )
         rim = _RIM * min(camera.size)
         if camera.field is not None:
             # The field moves positions a little; only where that decides, or where the border counts, it is asked.
@@ -451,7 +453,7 @@ class BestImage:
         sloped = 0.5 * float(self.weights.coarseness), _FLATTEST, _STEEPEST
         mine = np.zeros((0, 0), np.uint16) if drawn is None else np.ascontiguousarray(drawn)
         ahead = float(self.ranks[row]) if self.ranks else 0.0, row + 1, _DRAWN
-        add_penalties(near, values, slope, mine, border, sloped, ahead)
+        source_costs(near, values, slope, mine, border, sloped, ahead)
         return values[0], values[1]
 
     def _nodes(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Pixels, Window
-from photoplan.kernels.shift_bands import limits_of, no_mask, shift_band
+from photoplan.kernels.raster import empty_mask, pixel_range, shift_band
 from photoplan.kernels.weights import KERNELS
 from photoplan.quality.colour import ChromaticModel
 
@@ -71,7 +71,7 @@ class AlignStep:
         good = np.ones((window.height, window.width), bool) if valid is None else valid[inside].copy()
         x = np.arange(window.col, window.stop[0], dtype=np.float64)[None, :]
         y = np.arange(window.row, window.stop[1], dtype=np.float64)[:, None]
-        mask = no_mask() if valid is None else np.ascontiguousarray(valid)
+        mask = empty_mask() if valid is None else np.ascontiguousarray(valid)
         for each in self.model.bands:
             if not each.terms:
                 continue
@@ -80,7 +80,7 @@ class AlignStep:
             _keep_inside(moved, (x, y), self.model.size)
             coefficients = np.array(KERNELS[self.kernel].coefficients)
             band = np.require(pixels[each.band - 1], None, ("C", "A"))
-            shift_band(band, mask, offset, moved, (coefficients, limits_of(pixels.dtype)), out[each.band - 1], good)
+            shift_band(band, mask, offset, moved, (coefficients, pixel_range(pixels.dtype)), out[each.band - 1], good)
         return out, None if good.all() else good
 
 

@@ -15,7 +15,7 @@ from photoplan.geometry.grid import MapGrid, Window, level_size
 from photoplan.io.project.model import Project
 from photoplan.io.raster import RasterReader, stated_classes
 from photoplan.io.raster_info import placement_of
-from photoplan.kernels.sample_grid import sample_points
+from photoplan.kernels.terrain import sample_points
 from photoplan.plan.footprint import FAR
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import Ground, ground_of

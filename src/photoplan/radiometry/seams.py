@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from photoplan.kernels.max_flow import SINK, least_cut
-from photoplan.kernels.seams import differences, expansion, sum_of
+from photoplan.kernels.graph_cut import SINK, expansion_graph, minimum_cut, seam_differences, seam_energy
 from photoplan.radiometry.shown import ArrayStore, SeamLayer, quads
 
 _Floats = NDArray[np.float32]
@@ -107,18 +106,18 @@ class SeamPart:
         top, left, height, width = box = self._box(image)
         room, ends = np.zeros((4, (height + 2) * (width + 2)), np.int32), np.zeros((height + 2) * (width + 2), np.int32)
         shown = self._boxes, self._first, self._layers
-        if not expansion(labels, free, self._weight, image, *shown, self._costs, self._step, room, ends):
+        if not expansion_graph(labels, free, self._weight, image, *shown, self._costs, self._step, room, ends):
             return None
         tree = np.zeros(len(ends), np.int8)
-        least_cut(room, ends, width + 2, tree)
+        minimum_cut(room, ends, width + 2, tree)
         at = np.s_[top : top + height, left : left + width]
         taken = tree.reshape(height + 2, width + 2)[1:-1, 1:-1] == SINK
         if not taken.any():
             return None
         kept = labels[at].copy()
-        before = sum_of(labels, self._weight, box, *shown, self._costs)
+        before = seam_energy(labels, self._weight, box, *shown, self._costs)
         labels[at][taken] = image + 1
-        if sum_of(labels, self._weight, box, *shown, self._costs) >= before - self._step:
+        if seam_energy(labels, self._weight, box, *shown, self._costs) >= before - self._step:
             labels[at] = kept
             return None
         rows, cols = (np.flatnonzero(taken.any(axis=axis)) for axis in (1, 0))
@@ -128,14 +127,14 @@ class SeamPart:
         """The sum that is made least."""
         whole = 0, 0, *self._weight.shape
         shown = self._boxes, self._first, self._layers
-        return float(sum_of(self._own(labels), self._weight, whole, *shown, self._costs))
+        return float(seam_energy(self._own(labels), self._weight, whole, *shown, self._costs))
 
     def difference(self, labels: _Labels, box: _Box) -> tuple[float, int]:
         """Sum and number of differences at seams from pixels of a box of the map."""
         (row, col), (height, width) = self._corner, self._weight.shape
         mine = self._own(labels[row : row + height, col : col + width])
         at = box[0] - row, box[1] - col, box[2], box[3]
-        total, count = differences(mine, at, self._boxes, self._first, self._layers)
+        total, count = seam_differences(mine, at, self._boxes, self._first, self._layers)
         return float(total), int(count)
 
     def _near(self, box: _Box) -> _Mask:

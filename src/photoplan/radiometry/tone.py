@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.kernels.tone import tone_pixels
+from photoplan.kernels.raster import tone_pixels
 
 _Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from photoplan.errors import PhotoplanWarning, UsageError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.grid import MapGrid
-from photoplan.kernels.sides import sides_of
+from photoplan.kernels.prediction import sides_of
 from photoplan.products.dtm.build import BuildReport
 from photoplan.products.dtm.lines import ContourFacts, Profile, Profiles
 from photoplan.report.drawing import (

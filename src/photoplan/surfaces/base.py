@@ -14,10 +14,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.profiles import LEFT, Columns, Fan, Shown, begin_columns, follow_columns
-from photoplan.kernels.pyramid import Pyramid, pyramid_of
-from photoplan.kernels.raycast import ABOVE, ASK, BELOW, MISS, NONE, OVER, Faces
-from photoplan.kernels.raywalk import begin_lines, end_lines, follow_part, next_part
+from photoplan.kernels.rays import (
+    ABOVE,
+    ASK,
+    BELOW,
+    LEFT,
+    MISS,
+    NONE,
+    OVER,
+    Columns,
+    Faces,
+    Pyramid,
+    ShownGround,
+    VerticalPlanes,
+    begin_lines,
+    end_lines,
+    follow_columns,
+    follow_unit,
+    next_unit,
+    pyramid_of,
+    set_column_slopes,
+)
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
@@ -43,7 +60,7 @@ class Hits:
     along: NDArray[np.float64]
     """Piece of the path plus part of it, 0 to k − 1, shape (n,); NaN where a ray meets no ground."""
     result: NDArray[np.int64]
-    """`kernels.raycast.MISS`, `SURFACE` or `WALL`, shape (n,)."""
+    """`kernels.rays.MISS`, `SURFACE` or `WALL`, shape (n,)."""
     below: NDArray[np.bool_]
     """True where a ray that met nothing ended below the ground: it started there, or went there through a hole."""
     normal: NDArray[np.float64]
@@ -217,7 +234,7 @@ def _carry_back(hits: Hits, there: NDArray[np.int64], carry: Carry) -> None:
 
 
 class Walk(Protocol):
-    """Rays that are followed from part to part: lines of `kernels.raywalk`, each in one part at a time."""
+    """Rays that are followed from part to part: lines of `kernels.rays`, each in one part at a time."""
 
     def next(
         self,
@@ -226,7 +243,7 @@ class Walk(Protocol):
         which: NDArray[np.int64],
         places: NDArray[np.int64],
     ) -> None:
-        """Fill in the part that each of some rays has to be followed over next: see `kernels.raywalk.next_part`."""
+        """Fill in the part that each of some rays has to be followed over next: see `kernels.rays.next_unit`."""
         ...
 
     def over(self, part: TerrainPart, group: NDArray[np.int64]) -> None:
@@ -240,7 +257,7 @@ class Walk(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """One piece of all rays, as far as the first hit: see `kernels.raywalk`."""
+    """One piece of all rays, as far as the first hit: see `kernels.rays`."""
 
     parts: TerrainParts
     lines: NDArray[np.float64]
@@ -255,11 +272,11 @@ class _Rays:
         which: NDArray[np.int64],
         places: NDArray[np.int64],
     ) -> None:
-        next_part(*ranges, first, self.rays, self.states, which, places)
+        next_unit(*ranges, first, self.rays, self.states, which, places)
 
     def over(self, part: TerrainPart, group: NDArray[np.int64]) -> None:
         hits, states = self.hits, self.states
-        asks = follow_part(part.posts, part.pyramid, part.faces, (*part.corner, *part.mesh, part.datum),
+        asks = follow_unit(part.posts, part.pyramid, part.faces, (*part.corner, *part.mesh, part.datum),
                            self.lines, self.rays, states, hits.result, hits.normal, group)  # fmt: skip
         if asks:
             asking = group[hits.result[group] == ASK]
@@ -487,11 +504,11 @@ class LevelParts:
 
 @dataclass(frozen=True, eq=False)
 class _Columns:
-    """The rays of all columns: see `kernels.profiles`."""
+    """The rays of all columns: see `kernels.rays`."""
 
-    fan: Fan
+    fan: VerticalPlanes
     columns: Columns
-    shown: Shown
+    shown: ShownGround
 
     def next(
         self,
@@ -503,7 +520,7 @@ class _Columns:
         low, high = ranges
         # Only a mesh tells whether a ray is below the ground: a part may begin with a hole.
         low = np.where(low == np.inf, low, -np.inf)
-        next_part(low, high, first, self.columns[1], np.full(len(self.fan[3]), OVER), which, places)
+        next_unit(low, high, first, self.columns[1], np.full(len(self.fan[3]), OVER), which, places)
 
     def over(self, part: TerrainPart, group: NDArray[np.int64]) -> None:
         frame = (*part.corner, *part.mesh, part.datum)
@@ -521,11 +538,11 @@ def follow_fan(
     rows: tuple[int, int],
     bend: float,
     cache: Cache,
-) -> Shown:
+) -> ShownGround:
     """First hits of the rays of a picture, column by column."""
     n, height = len(ends), len(rise[0])
     XYZ, normal, towards = np.full((3, height, n, 3), np.nan)
-    shown: Shown = XYZ, normal, towards, np.full((height, n), np.nan), np.full((height, n), -1)
+    shown: ShownGround = XYZ, normal, towards, np.full((height, n), np.nan), np.full((height, n), -1)
     shown[4][: rows[0]] = shown[4][rows[1] :] = LEFT
     paths = np.empty((n, 2, 3))
     paths[:, 0], paths[:, 1, :2], paths[:, 1, 2] = center, ends, center[2]
@@ -535,10 +552,10 @@ def follow_fan(
     if not box[0] <= box[2]:
         return shown
     metres = np.linalg.norm(ends - center[:2], axis=1)
-    fan: Fan = (float(center[2]), bend, *rise, rows[0], spans * metres[:, None])
+    fan: VerticalPlanes = (float(center[2]), bend, *rise, rows[0], spans * metres[:, None])
     columns: Columns = lines, rays, np.full(n, rows[1] - 1)
     which = np.flatnonzero(spans[:, 1] >= 0)
-    begin_columns(fan, columns, which)
+    set_column_slopes(fan, columns, which)
     over_parts(parts, box, which, _Columns(fan, columns, shown), cache)
     return shown
 

@@ -11,9 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.extent import height_ranges
-from photoplan.kernels.hybrid import add_between, add_between_on_lattice, sample_hybrid, scan_faces
-from photoplan.kernels.sample_grid import sample_lattice
+from photoplan.kernels.terrain import (
+    add_representation_error,
+    add_representation_error_on_lattice,
+    height_ranges,
+    sample_hybrid,
+    sample_lattice,
+    scan_faces,
+)
 from photoplan.surfaces.base import (
     NO_FACES,
     Hits,
@@ -224,7 +229,7 @@ def _unit_values(unit: Unit, XY: NDArray[np.float64], layer: Layer) -> NDArray[n
     sample_hybrid(np.ascontiguousarray(posts), *_plain(faces, layer, datum), frame, xy, result)
     if layer == "sigmas":
         between = unit.representation
-        add_between(between.terms, between.power, *_plain(faces, layer, datum), frame, xy, result)
+        add_representation_error(between.terms, between.power, *_plain(faces, layer, datum), frame, xy, result)
     result += datum
     return result
 
@@ -243,7 +248,7 @@ def _unit_lattice(
     if layer == "sigmas":
         between, faces = unit.representation, unit.faces or _no_faces(unit.meshes)
         plain = _plain(faces, layer, datum)
-        add_between_on_lattice(between.terms, between.power, *plain, frame, (x0, step, y0, step), part)
+        add_representation_error_on_lattice(between.terms, between.power, *plain, frame, (x0, step, y0, step), part)
     np.add(part, datum, out=result, casting="unsafe")
 
 

@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.kernels.sample_grid import sample_lattice
+from photoplan.kernels.terrain import sample_lattice
 from photoplan.surfaces.units import LineElement, MeshFaces, Unit, UnitLayout
 
 #: A vertex nearer than this to a grid line or post, in meshes, is moved onto it.

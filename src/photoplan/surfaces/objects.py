@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.raycast import SURFACE
-from photoplan.kernels.triangles import Cells, count_in_cells, fill_cells, first_faces, highest
+from photoplan.kernels.rays import SURFACE
+from photoplan.kernels.visibility import Cells, count_in_cells, fill_cells, first_hits, highest_triangles
 from photoplan.surfaces.base import Hits, Lattice, Surface, Terrain, chords
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
@@ -81,7 +81,7 @@ class Faces:
         XY = np.asarray(XY, float)
         out, faces = np.empty(XY.shape[:-1]), np.empty(XY.shape[:-1], np.int64)
         local = np.ascontiguousarray((XY - self._corner[:2]).reshape(-1, 2))
-        highest(self._local, self._cells, local, out.reshape(-1), faces.reshape(-1))
+        highest_triangles(self._local, self._cells, local, out.reshape(-1), faces.reshape(-1))
         return out, faces
 
     def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
@@ -122,7 +122,7 @@ class Faces:
             todo = np.flatnonzero(face < 0)
             start, step = fine[todo, piece], fine[todo, piece + 1] - fine[todo, piece]
             t, which = np.empty(len(todo)), np.empty(len(todo), np.int64)
-            first_faces(self._local, self._cells, np.concatenate([start - self._corner, step], axis=1), t, which)
+            first_hits(self._local, self._cells, np.concatenate([start - self._corner, step], axis=1), t, which)
             met = which >= 0
             face[todo[met]], along[todo[met]] = which[met], (piece + t[met]) * (given.shape[1] - 1) / pieces
             XYZ[todo[met]] = start[met] + t[met, None] * step[met]

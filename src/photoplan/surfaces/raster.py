@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import nearest_turn
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.extent import height_ranges
-from photoplan.kernels.profiles import Shown
-from photoplan.kernels.sample_grid import sample_lattice, sample_points
+from photoplan.kernels.rays import ShownGround
+from photoplan.kernels.terrain import height_ranges, sample_lattice, sample_points
 from photoplan.surfaces.base import (
     Cache,
     Hits,
@@ -338,7 +337,7 @@ class RasterSurface:
         rise: tuple[NDArray[np.float64], NDArray[np.float64]],
         rows: tuple[int, int],
         bend: float,
-    ) -> Shown | None:
+    ) -> ShownGround | None:
         """What the rays of a picture whose columns are vertical planes meet; see `follow_fan`. None: the grid lies in
         another CRS."""
         if self.to_grid_crs is not None:

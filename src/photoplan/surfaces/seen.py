@@ -13,7 +13,7 @@ from photoplan.cameras.base import CentralCamera
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.geometry.pose import dot
-from photoplan.kernels.profiles import LEFT
+from photoplan.kernels.rays import LEFT
 from photoplan.surfaces.base import Hits, Terrain
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.targets.base import Target

@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 
 from photoplan.adjustment.least_squares import solve, spread
 from photoplan.codec import storable
-from photoplan.kernels.fit_covariance import block_score, score
-from photoplan.kernels.sides import sides_of
+from photoplan.kernels.prediction import block_score, sides_of, total_score
 from photoplan.terrain.observations import Observations
 from photoplan.terrain.settings import FAMILIES, BuildSettings
 
@@ -217,7 +216,7 @@ def minimise(
 ) -> tuple[NDArray[np.float64], float]:
     """Return the logarithms of variance, length and noise that predict best, and their score.
 
-    Blocks (k, …) and `prior` are those of `photoplan.kernels.fit_covariance.score`; equal bounds hold a parameter.
+    Blocks (k, …) and `prior` are those of `photoplan.kernels.prediction.total_score`; equal bounds hold a parameter.
     """
     # A simplex of the free parameters only: one with a corner too many in a plane collapses onto a line.
     free = np.flatnonzero(prior[3] > prior[2])
@@ -225,7 +224,7 @@ def minimise(
     def at(logs: NDArray[np.float64]) -> float:
         every = first.copy()
         every[free] = logs
-        return float(score(d2, sides, b, noise, prior, every, family))
+        return float(total_score(d2, sides, b, noise, prior, every, family))
 
     if not len(free):
         return first, at(first[free])

@@ -11,10 +11,15 @@ from scipy.spatial import cKDTree
 
 from photoplan.adjustment.least_squares import MEDIAN_1D, geman_mcclure, huber
 from photoplan.events import SILENT, Events, Map
-from photoplan.kernels.local_breaks import borders, differences, hang_together
-from photoplan.kernels.local_planes import fit_planes, local_scales, part_across
-from photoplan.kernels.patch import MOST_MISFIT
-from photoplan.kernels.patch_test import score_models, test_points
+from photoplan.kernels.local_planes import (
+    component_borders,
+    connected_components,
+    fit_planes,
+    local_scales,
+    neighbour_differences,
+    separate_across_lines,
+)
+from photoplan.kernels.prediction import MOST_MISFIT, score_models, test_points
 from photoplan.surfaces.units import UnitLayout
 from photoplan.terrain.calibration import NONE, SigmaFactor
 from photoplan.terrain.covariance import LADDER, Covariance, Neighbours, estimate_all, estimate_unit, ladder, near_lines
@@ -101,7 +106,7 @@ def _part(seen: Observations, near: NDArray[np.int32], chunk: int = 50_000) -> N
         found = tree.query_ball_point(xy[some], reach)
         sizes = np.array([len(f) for f in found], np.int64)
         of = np.concatenate([np.empty(0, np.int64), *(np.asarray(f, np.int64) for f in found)])
-        part_across(seen.xyz, near, some, ends, of, np.concatenate([[0], np.cumsum(sizes)]))
+        separate_across_lines(seen.xyz, near, some, ends, of, np.concatenate([[0], np.cumsum(sizes)]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,12 +261,12 @@ def _broken(
     """Groups that break off from the slopes (p, 2) around all points."""
     p = seen.points
     off, middle = np.empty(near.shape), np.empty(p)
-    differences(seen.xyz, near, slopes, off, middle)
+    neighbour_differences(seen.xyz, near, slopes, off, middle)
     scale = np.median(np.nan_to_num(middle)[wide], axis=1)[at] / MEDIAN_1D
     scale = np.maximum(scale, finest(seen))
     label, border = np.empty(p, np.int64), np.empty((p, 6))
-    hang_together(near, off, scale, _HOLD, label)
-    borders(near, off, scale, _HOLD, label, border)
+    connected_components(near, off, scale, _HOLD, label)
+    component_borders(near, off, scale, _HOLD, label, border)
     edges = np.maximum(border[:, 0], 1.0)
     upper = border[:, 1] >= border[:, 2]
     broken = np.where(upper, border[:, 1], border[:, 2])
@@ -295,7 +300,7 @@ def _surrounded(
     return bool(np.diff(np.append(angle, angle[0] + 2 * np.pi)).max() < _OPEN)
 
 
-#: A patch reaches this many half sides from the middle of its leaf (see the weights in `photoplan.kernels.patch`).
+#: A patch reaches this many half sides from the middle of its leaf (see the weights in `photoplan.kernels.prediction`).
 REACH = 1.5
 #: Rounds of looking for gross errors; each finds at most one in a patch.
 _ROUNDS_FIT = 12

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.codec import storable
 from photoplan.errors import InputError, UsageError
-from photoplan.kernels import flow as kernels
+from photoplan.kernels import terrain as kernels
 
 FlowMethod = Literal["d8", "dinf"]
 #: Bytes of one cell while it is computed.
@@ -90,7 +90,7 @@ def flow_of(
     length, longest = np.full(heights.size, np.nan, np.float32), np.where(missing, np.nan, 0).astype(np.float32).ravel()
     kernels.downstream(order, receiver, columns, stops, length)
     kernels.upstream_length(order, receiver, columns, longest)
-    kernels.label(order, receiver, labels)
+    kernels.label_upstream(order, receiver, labels)
     labels[missing.ravel()] = -1
     direction = np.empty(shape, np.int8)
     kernels.directions(receiver, direction)

@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinat
 from scipy.spatial import cKDTree
 
 from photoplan.events import Map
-from photoplan.kernels.patch import predict
+from photoplan.kernels.prediction import predict
 from photoplan.surfaces.units import LineElement, Unit, between_data
 from photoplan.terrain.calibration import HeldOut, Surroundings, calibrate, joined, signal_share
 from photoplan.terrain.covariance import Neighbours

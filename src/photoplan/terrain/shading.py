@@ -16,7 +16,7 @@ from scipy.ndimage import uniform_filter1d
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.gradient import gradients, illumination
+from photoplan.kernels.terrain import gradients, illumination
 from photoplan.surfaces.base import Surface, Terrain
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.targets.map import MapTarget

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.events import Map
 from photoplan.geometry.local import MEAN_RADIUS
-from photoplan.kernels.pyramid import pyramid_of
-from photoplan.kernels.visibility import sight_rows
+from photoplan.kernels.rays import pyramid_of
+from photoplan.kernels.visibility import least_visible_heights
 
 #: Rows that one task of a thread computes.
 ROWS = 32
@@ -100,7 +100,7 @@ def needed_heights(
 
     def part(first: int) -> NDArray[np.float32]:
         rows_here = (first, min(first + ROWS, rows))
-        sight_rows(relative, pyramid, eye, rows_here, float(settings.target_height), only_whether, out)
+        least_visible_heights(relative, pyramid, eye, rows_here, float(settings.target_height), only_whether, out)
         return out[slice(*rows_here)]
 
     for number, found in enumerate(run(part, range(0, rows, ROWS))):

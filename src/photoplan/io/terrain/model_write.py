@@ -46,7 +46,7 @@ from photoplan.io.terrain.model import (
     unit_of,
 )
 from photoplan.io.vector_layer import write_vector
-from photoplan.kernels.sample_grid import sample_lattice
+from photoplan.kernels.terrain import sample_lattice
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
 HEIGHTS_NODATA = -9999.0

@@ -2,7 +2,7 @@
 
 Unknown heights, grey values, radiometric parameters and variances are improved in turn: grey values by conjugate
 gradients, the others given them; heights by normal equations from which the grey values are eliminated
-(`kernels.facets_height`). Where they have converged, the sum of squares of all is least.
+(`kernels.facets`). Where they have converged, the sum of squares of all is least.
 """
 
 from __future__ import annotations
@@ -15,12 +15,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.events import tell
-from photoplan.kernels.facets_fine import add_missed
-from photoplan.kernels.facets_grey import add_errors, sample_grey, sample_pixels, solve_grey
-from photoplan.kernels.facets_height import MOMENTS, GreyFacets, Pixels, add_heights, add_means, made_heights
-from photoplan.kernels.facets_signs import signs_at
-from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
-from photoplan.kernels.facets_sums import OFFSETS, PAD, add_grey, count_pixels, sort_pixels
+from photoplan.kernels.facets import (
+    GREY_ENTRIES,
+    MOMENTS,
+    PAD,
+    GreyFacets,
+    Pixels,
+    add_curvatures,
+    add_grey,
+    add_heights,
+    add_means,
+    add_random_errors,
+    add_spline_residual,
+    count_pixels,
+    height_equations,
+    rademacher,
+    sample_grey,
+    sample_pixels,
+    solve_grey,
+    solve_heights,
+    sort_pixels,
+    variances,
+)
 from photoplan.matching.facets.grey import GreyTexture, shares
 from photoplan.matching.facets.means import away_from_border, corners, smoothed
 from photoplan.matching.facets.observe import (
@@ -208,7 +224,7 @@ class FacetBlock:
         """Signs for every curvature: of a place always the same, so that neighbouring blocks learn the same."""
         left, top = np.rint(np.array([self.facets.left, -self.facets.top]) / self.facets.pitch).astype(int).tolist()
         out = np.empty((3, *self.facets.shape))
-        signs_at(left, top, out)
+        rademacher(left, top, out)
         return out
 
     def _equations(self, stiffer: float = 1.0) -> _Doubles:
@@ -257,7 +273,7 @@ class FacetBlock:
         ]
         if self.coarse and len(self.values):
             for sight, g, w in zip(self.sights, grey, weights):
-                add_missed(self.values, self.facets.ratio, sight.places, w, shares(), g)
+                add_spline_residual(self.values, self.facets.ratio, sight.places, w, shares(), g)
         return grey, weights
 
     def _start(self, grey: Sequence[_Floats], weights: Sequence[_Floats]) -> None:
@@ -282,7 +298,7 @@ class FacetBlock:
             part = slice(row, row + _ROWS)
             for sight, g, w in zip(self.sights, grey, weights):
                 sort_pixels(sight.places[part], g[part], w[part], ratio, ends, pixels)
-        system = np.zeros((shape[0], OFFSETS, shape[1]), np.float32)
+        system = np.zeros((shape[0], GREY_ENTRIES, shape[1]), np.float32)
         right, density = np.zeros((2, *shape), np.float32)
         add_grey(pixels, ends, system, right, density)
         del pixels, ends, counts
@@ -291,7 +307,7 @@ class FacetBlock:
             right[:] = 0.0
             for n, (sight, w) in enumerate(zip(self.sights, weights)):
                 # Of each image others.
-                add_errors(sight.places, (sight.first[0] + (n << 20), sight.first[1]), w, ratio, right)
+                add_random_errors(sight.places, (sight.first[0] + (n << 20), sight.first[1]), w, ratio, right)
             errors = _solved_exactly(system, right, density, np.zeros(shape, np.float32), *_FULLY)
         return density, errors
 
@@ -329,7 +345,7 @@ class FacetBlock:
             pixels = Pixels(first=sight.first, places=sight.places, grey=g, weights=w)
             add_heights(pixels, ground, self.sigmas[n], _LIMIT, moments, self.residuals[n], self._factors[n], found[n])
         self.system, (right, self.noise) = np.zeros((7, rows, columns)), np.zeros((2, rows, columns))
-        made_heights(moments, self.system, right, self.noise)
+        height_equations(moments, self.system, right, self.noise)
         self.counted = counted
         used = sum(float(np.count_nonzero(w)) for w in weights)
         self._weigh(found, int((self.density > 0).sum()) * float(found[:, 2].sum()) / max(used, 1.0))

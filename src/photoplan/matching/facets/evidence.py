@@ -18,7 +18,7 @@ from scipy.ndimage import maximum_filter
 from scipy.optimize import nnls
 
 from photoplan.cameras.base import project, tremor_of
-from photoplan.kernels.facets_evidence import agreement, unhidden
+from photoplan.kernels.facet_transfer import image_agreement, visible_posts
 from photoplan.matching.facets.block import FacetBlock
 from photoplan.matching.facets.judged import edge_variances
 from photoplan.matching.facets.means import means_around
@@ -84,7 +84,7 @@ def visible(block: FacetBlock) -> NDArray[np.bool_]:
             du = -(J[..., 1, 1] * J[..., 0, 2] - J[..., 0, 1] * J[..., 1, 2]) / determinant
             dv = -(J[..., 0, 0] * J[..., 1, 2] - J[..., 1, 0] * J[..., 0, 2]) / determinant
         ways = np.nan_to_num(np.stack([du, -dv], axis=-1) / facets.pitch)
-        unhidden(heights, ways, float(heights.max()), 1.0 / block.scale, seen)
+        visible_posts(heights, ways, float(heights.max()), 1.0 / block.scale, seen)
         seen &= inside
     return out
 
@@ -124,8 +124,8 @@ def evidence(
         found = np.full((2, 2, rows, columns), np.nan, np.float32)
         z = (heights + k * step - bottom) / rise
         for (a, b), turned, some in zip(found, (slopes, levels), (wanted, wanted & sloping)):
-            agreement(raws, lattice, float(_SPACING), z, turned / rise, facets.ratio, _HALF, gains, noise, own, some, a,
-                      b)  # fmt: skip
+            image_agreement(raws, lattice, float(_SPACING), z, turned / rise, facets.ratio, _HALF, gains, noise, own,
+                            some, a, b)  # fmt: skip
         better = sloping & ~(found[0, 0] <= found[1, 0])
         return tuple(np.where(better, found[1, e], found[0, e]).astype(float) for e in (0, 1))
 

@@ -9,8 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.facets_grey import sample_grey
-from photoplan.kernels.facets_height import GreyFacets, add_sensitivities
+from photoplan.kernels.facets import GreyFacets, add_sensitivities, sample_grey
 from photoplan.matching.facets.means import means_around
 from photoplan.matching.facets.observe import Sight
 

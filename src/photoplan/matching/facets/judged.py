@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.geometry.grid import Window
-from photoplan.kernels.facets_grey import sample_grey
-from photoplan.kernels.facets_residuals import add_residuals, sample_slopes
+from photoplan.kernels.facets import add_residuals, sample_grey, sample_slopes
 from photoplan.matching.facets.block import FacetBlock
 from photoplan.matching.facets.means import means_around, smoothed
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from photoplan.kernels.box_means import box_means
+from photoplan.kernels.matching import box_means
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]

@@ -12,9 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Camera, project, tremor_of
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.facets_pull import pull
-from photoplan.kernels.facets_radiometry import add_radiometry, solve_radiometry, transferred
-from photoplan.kernels.facets_transfer import CELL, bends, steepness, transfer
+from photoplan.kernels.facet_transfer import (
+    CELL,
+    add_radiometry,
+    facet_curvatures,
+    solve_radiometry,
+    steepness,
+    to_surface_grey,
+    transfer,
+)
+from photoplan.kernels.facets import curvature_gradient
 from photoplan.matching.facets.means import means_around
 from photoplan.matching.facets.pyramid import Pyramid
 
@@ -117,16 +124,16 @@ class Relief:
     heights: _Doubles
     """At the posts, shape (rows, columns), metres."""
     bent: _Doubles
-    """See `facets_transfer.bends`."""
+    """See `facet_transfer.facet_curvatures`."""
     steep: _Doubles
-    """See `facets_transfer.steepness`."""
+    """See `facet_transfer.steepness`."""
 
     @classmethod
     def of(cls, heights: _Doubles) -> Relief:
         """From heights at the posts."""
         rows, columns = heights.shape
         bent, steep = np.empty((2, rows, columns)), np.empty((-(-(rows - 1) // CELL), -(-(columns - 1) // CELL)))
-        bends(heights, bent)
+        facet_curvatures(heights, bent)
         steepness(heights, steep)
         return cls(heights, bent, steep)
 
@@ -138,7 +145,7 @@ class Sight:
     raw: _Floats
     """Grey values, shape (h, w); NaN where there are none."""
     ways: _Doubles
-    """Rays of every so many pixels, see `facets_transfer.transfer`; (m, n, 8)."""
+    """Rays of every so many pixels, see `facet_transfer.transfer`; (m, n, 8)."""
     steps: tuple[int, int]
     """How many pixels to the right and down."""
     level: float
@@ -146,7 +153,7 @@ class Sight:
     first: tuple[int, int]
     """Column and row of the first pixel."""
     places: _Floats = field(default_factory=lambda: np.empty((0, 0, 4), np.float32))
-    """Where the pixels lie on the surface, see `facets_transfer.transfer`."""
+    """Where the pixels lie on the surface, see `facet_transfer.transfer`."""
     on: _Doubles | None = None
     """Heights of the surface that they were carried to."""
 
@@ -292,7 +299,7 @@ class Transfer:
     def apply(self, sight: Sight, facets: Facets) -> _Floats:
         """Grey values of a view's pixels in the system of the surface, shape (h, w); NaN off the surface."""
         out = np.empty(sight.raw.shape, np.float32)
-        transferred(sight.places, sight.raw, self.offsets, self.gains, self._lattice(facets), out)
+        to_surface_grey(sight.places, sight.raw, self.offsets, self.gains, self._lattice(facets), out)
         return out
 
     def improved(self, sight: Sight, facets: Facets, weights: _Floats, surface: _Floats, contrast: float) -> Transfer:
@@ -431,7 +438,7 @@ class Roughness:
     def gradient(self, heights: _Doubles) -> _Doubles:
         """Half the gradient of the weighted sum of their squares, shape (rows, columns)."""
         out = np.empty(heights.shape)
-        pull(self.weights, heights, out)
+        curvature_gradient(self.weights, heights, out)
         return out
 
     def around(self, heights: _Doubles) -> Roughness:

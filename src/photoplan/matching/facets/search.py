@@ -18,8 +18,17 @@ from scipy import ndimage
 from photoplan.cameras.base import project
 from photoplan.events import stretch, tell
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.kernels.semi_global import choose, scatter, sum_paths
-from photoplan.kernels.sweep import HALF_COLUMNS, HALF_ROWS, MOST_PAIRS, add_costs, describe, sample_plane
+from photoplan.kernels.matching import (
+    HALF_COLUMNS,
+    HALF_ROWS,
+    MOST_PAIRS,
+    add_plane_costs,
+    census_transform,
+    cost_scatter,
+    least_cost_steps,
+    sample_plane,
+    sum_paths,
+)
 from photoplan.matching.facets.observe import Facets, View, facets_of, levels_done, pixels_between
 
 _Doubles = NDArray[np.float64]
@@ -223,20 +232,20 @@ def _level(
         around = ndimage.maximum_filter(cells, (2 * HALF_ROWS + 1, 2 * HALF_COLUMNS + 1))
         for n, (_, _, raw) in enumerate(seen):
             sample_plane(raw, (1 - part) * ats[n][0] + part * ats[n][1], _LATTICE, around, grey)
-            describe(grey, cells, census[n], known[n])
-        add_costs(census, known, pairs, k, low, high, m, half, np.nan, first, cost)
+            census_transform(grey, cells, census[n], known[n])
+        add_plane_costs(census, known, pairs, k, low, high, m, half, np.nan, first, cost)
     contrast, usual = _contrast(cost, first)
     # Heights at which no two images see a post may be right as well: others have to be better than chance.
     cost[np.isnan(cost)] = usual - _SURE * contrast
     path, total = np.empty_like(cost), np.zeros_like(cost)
     sum_paths(cost, first, low, np.float32(_SMALL * contrast), np.float32(_LARGE * contrast), path, total)
     steps, margin, variance = np.empty((3, rows, columns))
-    choose(total, first, low, _APART, steps, margin)
+    least_cost_steps(total, first, low, _APART, steps, margin)
     whole = _PATHS * contrast
     nearby = _around(steps, margin >= _SURE * whole)
     # What finer levels search is not yet chosen from.
     kept = (nearby[0] - _AROUND / 2, nearby[1] + _AROUND / 2) if level else (steps - _APART, steps + _APART)
-    scatter(total, first, low, steps, _PROBABLE * whole, _FAINT, *kept, variance)
+    cost_scatter(total, first, low, steps, _PROBABLE * whole, _FAINT, *kept, variance)
     heights = planes.heights(steps, level)
     step = _STEP * 2**level * planes.pixels(heights)
     return Searched(facets=facets, heights=heights, margin=margin / whole, variance=variance * step**2, ends=nearby)

@@ -17,8 +17,16 @@ from photoplan.cameras.base import Camera
 from photoplan.cameras.lenses import Brown, OpenCV
 from photoplan.errors import DatumDefect, GeometryError
 from photoplan.geometry.pose import rotation_vector, skew
-from photoplan.kernels.quadratic_forms import SparseRows, gathered, point_variances, row_variances
-from photoplan.kernels.selected_inverse import SelectedInverse, aligned, fill_pattern, selected_inverse
+from photoplan.kernels.sparse_inverse import (
+    SelectedInverse,
+    SparseRows,
+    align_factor,
+    dense_inverse,
+    fill_pattern,
+    point_variances,
+    row_variances,
+    selected_inverse,
+)
 from photoplan.orientation.bundle.model import (
     BORESIGHT,
     COMMON,
@@ -541,7 +549,7 @@ class Inverse:
         pattern = _pattern(reduced, order)
         pointer, rows = fill_pattern(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64))
         L = factor.L.tocsc()
-        values = aligned(pointer, rows, L.indptr.astype(np.int64), L.indices.astype(np.int64), L.data)
+        values = align_factor(pointer, rows, L.indptr.astype(np.int64), L.indices.astype(np.int64), L.data)
         diagonal, lower = selected_inverse(pointer, rows, values, factor.U.diagonal())
         self._Q = SelectedInverse(pointer=pointer, rows=rows, diagonal=diagonal, lower=lower, order=order)
         self._reduced = reduced
@@ -549,7 +557,7 @@ class Inverse:
     def block(self, columns: NDArray[np.int64]) -> _Floats:
         """Cofactors of unknowns that occur together in an equation (or belong to one image), shape (m, m)."""
         scale = self._reduced.scale[columns]
-        dense = gathered(self._Q, columns)
+        dense = dense_inverse(self._Q, columns)
         return np.asarray(dense * scale[:, None] * scale[None, :])
 
     def variances(self) -> tuple[_Floats, _Floats]:

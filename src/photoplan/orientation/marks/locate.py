@@ -13,7 +13,7 @@ from scipy import ndimage
 from photoplan.adjustment.least_squares import Fit, solve
 from photoplan.cameras.fiducials import MarkExample, MarkPart, MarkPattern
 from photoplan.errors import InputError
-from photoplan.kernels.correlation import correlate, sample_template
+from photoplan.kernels.matching import correlate, sample_template
 from photoplan.orientation.marks.template import Template, draw
 
 _PIXEL = 1 / 12

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from photoplan.cameras.fiducials import MarkExample, MarkPart, MarkPattern
 from photoplan.errors import InputError
-from photoplan.kernels.coverage import cover
+from photoplan.kernels.raster import polygon_coverage
 
 _LARGEST = 4096
 """Side of a template in pixels beyond which the scale must be wrong."""
@@ -44,7 +44,7 @@ class Template:
 def coverage(outline: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
     """Share of each pixel's area that a polygon covers, exact."""
     total = np.empty((shape[0], shape[1] + 1))
-    cover(np.asarray(outline, np.float64) + 0.5, total)
+    polygon_coverage(np.asarray(outline, np.float64) + 0.5, total)
     return np.clip(np.abs(total[:, :-1]), 0.0, 1.0)
 
 

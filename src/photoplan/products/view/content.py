@@ -22,7 +22,7 @@ from photoplan.geometry.crs import crs_label, crs_step, same_crs
 from photoplan.geometry.grid import Window, level_size
 from photoplan.io.raster import RasterReader, stated_classes
 from photoplan.io.raster_info import placement_of
-from photoplan.kernels.strokes import draw_strokes
+from photoplan.kernels.raster import draw_lines
 from photoplan.plain import xml_quoted, xml_text
 from photoplan.plan.anchors import AnchorRule
 from photoplan.plan.footprint import Tile, Tiles
@@ -379,7 +379,7 @@ class Overlay:
             near = ((high >= corner[:2] - reach) & (low <= stop - 1 + reach)).all(axis=1)
             if near.any():
                 cover = np.zeros((window.height, window.width), np.float32)
-                draw_strokes(segments[near] - corner, style.width, cover)
+                draw_lines(segments[near] - corner, style.width, cover)
                 _blend(picture, cover, style.colour)
         for label in self.labels:
             cover = np.pad(label.letters.cover, _MARGIN)

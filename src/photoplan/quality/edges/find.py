@@ -15,7 +15,7 @@ from photoplan.adjustment.least_squares import MEDIAN_1D, huber, spread
 from photoplan.adjustment.statistics import chance_chi_square
 from photoplan.errors import InputError
 from photoplan.findings import with_sigma
-from photoplan.kernels.edge_chains import grow, ridge
+from photoplan.kernels.raster import gradient_ridge, join_chains
 
 Array = NDArray[np.float64]
 
@@ -114,7 +114,7 @@ def find_lines(
         return [], Counter()
     gx, gy, least = _gradient(grey, valid)
     offset = np.empty(grey.shape, np.float32)
-    if not least > 0.0 or ridge(gx, gy, least, offset) == 0:
+    if not least > 0.0 or gradient_ridge(gx, gy, least, offset) == 0:
         return [], Counter()
     row, col = np.nonzero(np.isfinite(offset))
     u = np.stack([gx[row, col], gy[row, col]], 1).astype(float)
@@ -124,7 +124,7 @@ def find_lines(
     index = np.full(grey.shape, -1, np.int32)
     index[row, col] = np.arange(len(row), dtype=np.int32)
     label = np.empty(len(row), np.int32)
-    chains = int(grow(index, np.stack([row, col], 1).astype(np.int32), u, cos(_TURN), label))
+    chains = int(join_chains(index, np.stack([row, col], 1).astype(np.int32), u, cos(_TURN), label))
     steep = np.abs(u[:, 0]) >= np.abs(u[:, 1])
     part = offset[row, col].astype(float)
     points: Array = np.stack([col + np.where(steep, part, 0.0), row + np.where(steep, 0.0, part)], 1)

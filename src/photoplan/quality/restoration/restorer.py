@@ -14,10 +14,17 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.kernels.convolve import CHUNK, EVEN_TAPS, GENERAL_TAPS, convolve_even, convolve_general, round_clipped
-from photoplan.kernels.extend import extend_oddly
 from photoplan.kernels.jit import is_ready
-from photoplan.kernels.shift_bands import limits_of
+from photoplan.kernels.raster import (
+    CHUNK,
+    EVEN_TAPS,
+    GENERAL_TAPS,
+    convolve_even,
+    convolve_general,
+    mirror_border,
+    pixel_range,
+    round_clipped,
+)
 from photoplan.quality.linearise import Linearisation
 
 #: Kernels wider than this are refused: they come from damaged files rather than from optics.
@@ -159,12 +166,12 @@ class Convolution:
             raise UsageError(f"a margin of {margin} pixels; the kernel reaches {(columns, rows)}")
         start = margin[1] - rows, LEFT + margin[0] - columns - self._zeros
         usable = _ALL if valid is None else valid
-        return self._code()(source, start, self._weights, self._tag, usable, limits_of(out.dtype), out)
+        return self._code()(source, start, self._weights, self._tag, usable, pixel_range(out.dtype), out)
 
     def is_compiled(self, out: np.dtype[Any]) -> bool:
         """Whether the code for results of a type is compiled already, here or on the disk."""
         source, result = np.zeros((1, 1), np.float32), np.zeros((1, 1), out)
-        arguments = (source, (0, 0), self._weights, self._tag, _ALL, limits_of(out), result)
+        arguments = (source, (0, 0), self._weights, self._tag, _ALL, pixel_range(out), result)
         return bool(is_ready(self._code(), arguments))
 
     def _code(self) -> Any:
@@ -197,7 +204,7 @@ class Margin:
     """How far filters reach beyond a pixel, and what they find there.
 
     Pixels beyond the image and invalid ones are one case: q gets ``2 v(p) - v(2 p - q)`` from the nearest valid pixel p
-    (`photoplan.kernels.extend`). Constants and linear ramps go on, so there is nothing for a filter to sharpen: across
+    (`photoplan.kernels.raster`). Constants and linear ramps go on, so there is nothing for a filter to sharpen: across
     a straight edge an even filter leaves the outermost pixel as it is (times its sum), noise included. Only pixels that
     a filter of this reach can need are looked at, hence the result is that of any other tile.
     """
@@ -251,7 +258,7 @@ class Margin:
             wanted = self._near(valid, at, wide) & ~known
             place = (wide.row - at.row, wide.col - at.col, LEFT)
             light = np.ascontiguousarray(pixels, np.float32)
-            extend_oddly(light, np.ascontiguousarray(valid), wanted, _offsets(self.columns, self.rows), place, out)
+            mirror_border(light, np.ascontiguousarray(valid), wanted, _offsets(self.columns, self.rows), place, out)
         elif common.size < wide.size:
             _beyond_edges(pixels, at, wide, to, body)
         return out
@@ -475,7 +482,7 @@ def _store(grey: NDArray[np.float32], mask: NDArray[np.bool_] | None, values: ND
         values[:] = grey
         return 0, 0
     usable = np.empty((0, 0), bool) if mask is None else mask
-    below, above = round_clipped(grey, usable, limits_of(values.dtype), values)
+    below, above = round_clipped(grey, usable, pixel_range(values.dtype), values)
     return int(below), int(above)
 
 
