@@ -76,7 +76,7 @@ def test_rows_that_have_been_shifted_give_the_pixels_of_those_that_have_not(
         given = (valid, moved(valid, shifts, 0)) if holes else (None, None)
         rest, still = resampled(kernel, source, given[0], anchors(scale, None))
         shaken, seen = resampled(kernel, moved(source, shifts, 0), given[1], anchors(scale, shifts.astype(float)))
-        # Where weights of rows are missing they are balanced about the place, see `line_scan_runs`: another rule beside a hole.
+        # Where weights of rows are missing they are balanced about the place, see `line_scan_runs`: another rule
         reach = KERNELS[kernel].taps
         near = np.zeros((24, 24), bool)
         if holes:

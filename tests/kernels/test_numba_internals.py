@@ -79,7 +79,7 @@ def test_only_versions_that_were_tried_are_leaned_on(version, usable):
 def test_the_version_here_was_tried():
     if os.environ.get("PHOTOPLAN_PLAIN_KERNELS") or os.environ.get("NUMBA_DISABLE_JIT"):
         pytest.skip("plain loops are asked for")
-    assert numba_internals.USABLE, "try the tests with PHOTOPLAN_PLAIN_KERNELS unset and a wider `numba_internals.TRIED`"
+    assert numba_internals.USABLE, "try the tests with a wider `numba_internals.TRIED`"
     assert resample.gather is numba_internals.gather
 
 
