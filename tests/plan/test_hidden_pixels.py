@@ -176,7 +176,7 @@ def test_blocks_that_are_not_looked_at_hide_nothing(monkeypatch: pytest.MonkeyPa
                 skipped += int(quiet.sum())
                 return np.zeros_like(quiet)
 
-            patch.setattr(visibility, "quiet_blocks", nowhere)
+            patch.setattr(visibility, "free_blocks", nowhere)
             np.testing.assert_array_equal(quick, hidden_pixels(camera, ground, surface))
     assert skipped > 300
 
