@@ -168,7 +168,7 @@ def test_blocks_that_are_not_looked_at_hide_nothing(monkeypatch: pytest.MonkeyPa
         camera, ground = Pinhole(pose, 500, (1200, 900)), tile(surface, target().window)
         quick = hidden_pixels(camera, ground, surface)
         with monkeypatch.context() as patch:
-            real = visibility.quiet_blocks
+            real = visibility.free_blocks
 
             def nowhere(*args):  # type: ignore[no-untyped-def]
                 nonlocal skipped
