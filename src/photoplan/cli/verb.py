@@ -1,4 +1,4 @@
-"""Click commands made from requests: options from the fields, the run, and what is printed."""
+"""Click commands made from requests: options, defaults that the project states, the run, and what is printed."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class VerbCommand(click.Command):
         return ctx.invoke(self.callback, request=request, as_json=as_json, quiet=quiet)
 
     def _stated(self, ctx: click.Context) -> tuple[str, dict[str, Any]]:
-        """Return where the project states options of the command, ``[defaults.VERB]``, and these.
+        """Return where the project states options of the command, ``[defaults.COMMAND]``, and these.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Reading and writing project files."""
+"""Reading and writing project files, and defaults of options that they state (``[defaults.COMMAND]``)."""
 
 from __future__ import annotations
 
