@@ -213,8 +213,8 @@ def crs_option(of: str = "terrain files that state none") -> Any:
 OVERWRITE: Any = opt("Replace files that exist.", False, section="run")
 PROJECT: Any = arg("Project file, or the folder that holds `project.toml`.", project=True)
 IMAGES: Any = opt("Images or patterns; may be repeated [all].", (), listed=True, metavar="NAME,…", section="input")
-PICTURE: Any = opt("Write a picture of the result.", True, flag="no-picture", section="result",
-                   off="Write no picture of the result.")  # fmt: skip
+PICTURE: Any = opt("Write a drawing of the result.", True, flag="no-picture", section="result",
+                   off="Write no drawing of the result.")  # fmt: skip
 REPORT_FORMAT: Any = opt("Format of the report.", "html", section="result")
 DRY_RUN: Any = opt("Print what would be done, and stop.", False, section="run")
 _EXECUTORS = "threads, processes, or the address of a Dask scheduler, tcp://host:port."

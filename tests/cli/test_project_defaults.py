@@ -112,7 +112,7 @@ def test_a_schema_states_what_the_field_is_and_the_help_what_the_flag_does(
 ) -> None:
     fields = json.loads(Here(capsys)("schema", "tie").out)["properties"]
     assert fields["refine"]["description"] == "Refine the places of features by least-squares matching."
-    assert "Take features as they are" in Here(capsys)("tie", "--help").out
+    assert "Leave out least-squares matching" in Here(capsys)("tie", "--help").out
     assert not [name for name, each in fields.items() if "Write no" in each["description"]]
 
 

@@ -30,6 +30,7 @@ def photoplan() -> None:
 
     The usual order is: init → (fiducials → tie → adjust) → check → ortho. Results are printed on stdout, messages
     and progress on stderr.
+
     Exit codes: 0 done, 1 failed, 2 wrong use, 3 bad input, 4 finished, but tiles or images failed, 5 out of disk or
     memory, 130 interrupted.
     """

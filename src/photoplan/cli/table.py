@@ -35,23 +35,23 @@ _PROJECT: dict[str, Verb] = {
         """Write DIR/project.toml from images, camera, orientation and terrain.
 
         Prints the path of the project file on stdout. Height systems must be stated by the files or declared. Without
-        --orientation the images are to be oriented (tie, resect, adjust), and --crs is needed.
+        --orientation, the images must be oriented afterwards (tie, resect, adjust), and --crs is required.
         """,
         "requests.project:InitRequest",
         "products.init:init_project",
     ),
     "check": Verb(
         "Validate a project and print what to expect of it.",
-        """Open every input of PROJECT and print, image by image, what it promises.
+        """Open every input of PROJECT and print what to expect of each image.
 
-        Ends with exit code 3 if orientations are implausible or another reading fits better, which is named, and with 4
-        if files of some images cannot be used.
+        Ends with exit code 3 if orientations are implausible or another angle convention fits better, which is named,
+        and with 4 if files of some images cannot be used.
         """,
         "requests.project:CheckRequest",
         "products.check:check",
     ),
     "budget": Verb(
-        "What limits the accuracy of products, cause by cause.",
+        "List what limits the accuracy of products.",
         """Standard deviations of position on level ground, cause by cause, in the middle, at an edge and in a corner.
 
         For the images of PROJECT, or for a vertical image by numbers: --camera-constant and --height.
@@ -61,8 +61,8 @@ _PROJECT: dict[str, Verb] = {
         {"picture": "report.budget:draw_picture"},
     ),
     "info": Verb(
-        "Show what a raster, project, plan or run record holds.",
-        """Show what FILE holds: any file that a command takes or makes, or a folder of images.""",
+        "Show the content of a raster, project, plan or run record.",
+        """Show the content of FILE: any file that a command reads or writes, or a folder of images.""",
         "requests.project:DescribeRequest",
         "products.describe:describe_file",
         {"picture": "report.restore:draw_filter"},
@@ -80,7 +80,7 @@ _PROJECT: dict[str, Verb] = {
         {"report": "report.project:project_page"},
     ),
     "schema": Verb(
-        "Options of a command as JSON Schema.",
+        "Print the options of a command as JSON Schema.",
         """Print the options of the command VERB (two words for commands of a group) as JSON Schema; without VERB all
         commands with their groups.
 
@@ -93,7 +93,7 @@ _PROJECT: dict[str, Verb] = {
 
 _ORIENT: dict[str, Verb] = {
     "convert": Verb(
-        "Orientations from one file format to another.",
+        "Convert orientations from one file format to another.",
         """Write ORIENTATION, an orientation file or a project, in another format.
 
         What the other format cannot hold is reported on stderr. A lens that it cannot hold is refused unless
@@ -104,7 +104,7 @@ _ORIENT: dict[str, Verb] = {
     ),
     "fiducials": Verb(
         "Find the fiducial marks of film scans.",
-        """Find the fiducial marks of scanned film photos, without approximate values.
+        """Find the fiducial marks of film scans, without approximate values.
 
         IMAGE… are scans, with --camera FILE; or one project file, whose film images are measured and which receives the
         marks. An image that fails does not stop the others; they are listed at the end (exit code 4).
@@ -114,7 +114,7 @@ _ORIENT: dict[str, Verb] = {
         {"pictures/": "report.fiducials:draw_marks"},
     ),
     "interior": Verb(
-        "Interior orientation of film scans from their marks.",
+        "Compute the interior orientation of film scans.",
         """Residuals, sigma0, scales, shear and film shrinkage of the scans in PROJECT.
 
         An image whose marks are missing, exchanged, mirrored or wrong does not stop the others; they are listed at the
@@ -211,7 +211,7 @@ _ORTHO: dict[str, Verb] = {
         figures_first=True,
     ),
     "balance": Verb(
-        "Even colours: tables by which images agree where they overlap.",
+        "Find tables that make overlapping images agree in colour.",
         """Find tables by which the images of PROJECT agree in colour where they overlap.
 
         Each image gets a file with a table for every band, and an entry `balance` in PROJECT: `ortho` and `mosaic`
@@ -236,8 +236,8 @@ _ORTHO: dict[str, Verb] = {
         "Take the light on slopes, and haze, out of an orthophoto.",
         """Take the light on slopes, and haze, out of PICTURE, an orthophoto.
 
-        Parameters are estimated from the picture and printed with standard deviations. If terrain casts its shadow on a
-        slope, or a slope turns away from the sun, it is not corrected.
+        Parameters are estimated from the orthophoto and printed with standard deviations. Slopes in the shadow of
+        terrain, and slopes that turn away from the sun, are not corrected.
         """,
         "requests.ortho:IlluminationRequest",
         "products.illumination:correct_illumination",
@@ -268,7 +268,7 @@ _TERRAIN: dict[str, Verb] = {
         {"report": "report.dtm:build_report"},
     ),
     "info": Verb(
-        "Show what a model holds.",
+        "Show the content of a model.",
         "Show the figures of MODEL: units, lines, accuracy, gross errors. A raster is shown as by `photoplan info`.",
         "requests.terrain:InfoRequest",
         "products.describe:describe_terrain",
@@ -285,7 +285,7 @@ _TERRAIN: dict[str, Verb] = {
         record="refine",
     ),
     "sample": Verb(
-        "Heights and their standard deviations at points.",
+        "Write heights and their standard deviations at points.",
         """Write the height of MODEL and its standard deviation at each of POINTS, a table: its columns, `height` and
         `sigma`.
 
@@ -296,7 +296,7 @@ _TERRAIN: dict[str, Verb] = {
         record="sample",
     ),
     "profile": Verb(
-        "Heights along lines.",
+        "Write heights along lines.",
         """Write profiles of MODEL over LINES: a vector file of lines, or a table of points along them, in the model's
         CRS.
 
@@ -308,7 +308,7 @@ _TERRAIN: dict[str, Verb] = {
         record="profile",
     ),
     "contours": Verb(
-        "Contour lines.",
+        "Trace contour lines.",
         """Trace contour lines on MODEL's own surface: they bend sharply at breaklines, end at borders and at walls.
 
         Columns: height, is_index, depression. Higher ground is on a line's right. A post exactly at a level counts as
@@ -320,7 +320,7 @@ _TERRAIN: dict[str, Verb] = {
         record="contours",
     ),
     "shade": Verb(
-        "Hillshade.",
+        "Make a hillshade.",
         """Make a hillshade: grey values 1 to 255, 0 where MODEL has no terrain.
 
         Slopes are those of the model's surface at each pixel, so breaklines stay sharp.
@@ -329,7 +329,7 @@ _TERRAIN: dict[str, Verb] = {
         "products.dtm.rasters:dtm_shade",
     ),
     "slope": Verb(
-        "Slope, slope classes or aspect.",
+        "Compute slope, slope classes or aspect.",
         """Compute the slope in degrees (float32), its classes (with a colour table), or the aspect.
 
         Places without terrain are NaN, or class 0.
@@ -338,13 +338,13 @@ _TERRAIN: dict[str, Verb] = {
         "products.dtm.rasters:dtm_slope",
     ),
     "tint": Verb(
-        "Height tints.",
+        "Colour a model by height.",
         "Colour MODEL by height: red, green, blue, with a mask where it has no terrain.",
         "requests.terrain:TintRequest",
         "products.dtm.rasters:dtm_tint",
     ),
     "volume": Verb(
-        "Cut and fill between two models.",
+        "Compute cut and fill between two models.",
         """Compute cut, fill and net volume from terrain A to terrain B, with their accuracy.
 
         Cut is where A lies above B. Where one of the models has no height nothing is counted; that area is printed.
@@ -353,7 +353,7 @@ _TERRAIN: dict[str, Verb] = {
         "products.dtm.analyses:dtm_volume",
     ),
     "visible": Verb(
-        "What can be seen from points.",
+        "Map what can be seen from points.",
         """Map what can be seen: 1 visible, 0 hidden, 255 no terrain; for several observers first how many see it.
 
         Places without terrain block nothing.
@@ -362,7 +362,7 @@ _TERRAIN: dict[str, Verb] = {
         "products.dtm.analyses:dtm_visible",
     ),
     "flow": Verb(
-        "Catchments and flow lengths.",
+        "Compute catchments and flow lengths.",
         """Compute upstream area, flow length, direction and catchment of every cell, in six bands of one raster.
 
         Pits are filled first; area and volume of the filling are printed.
@@ -371,7 +371,7 @@ _TERRAIN: dict[str, Verb] = {
         "products.dtm.analyses:dtm_flow",
     ),
     "export": Verb(
-        "GeoTIFF, TIN or XYZ of a model.",
+        "Write a model as GeoTIFF, TIN or XYZ.",
         """Write MODEL as a raster (.tif), a triangulation (.obj, .ply, .xml = LandXML) or points (.xyz, .csv).
 
         Triangulations hold walls as vertical triangles (LandXML cannot); points are the posts and the lines' vertices.
@@ -383,8 +383,8 @@ _TERRAIN: dict[str, Verb] = {
 
 _VIEW: dict[str, Verb] = {
     "picture": Verb(
-        "A picture of terrain, rasters or photos (this word may be left out).",
-        """Make a picture of SOURCE, a project or terrain model, from a standpoint or with an image's own camera.
+        "Render terrain, rasters or images (this word may be left out).",
+        """Render SOURCE, a project or terrain model, from a standpoint or with the camera of an image.
 
         The same command continues a run that was interrupted.
         """,
@@ -392,17 +392,17 @@ _VIEW: dict[str, Verb] = {
         "report.views:labelled_picture",
     ),
     "sequence": Verb(
-        "Pictures along a path, and a film of them.",
-        """Make pictures of SOURCE along a path: with --look-at towards one point, with --azimuth in one direction, else
+        "Render views along a path, and a film of them.",
+        """Render SOURCE along a path: with --look-at towards one point, with --azimuth in one direction, else
         ahead.
 
-        The same command continues a run that was interrupted; pictures that are there already are kept.
+        The same command continues a run that was interrupted; renderings that exist already are kept.
         """,
         "requests.view:SequenceRequest",
         "report.views:labelled_sequence",
     ),
     "matrix": Verb(
-        "The ground of every pixel as a raster.",
+        "Compute the ground of every pixel as a raster.",
         """Compute the ground of every pixel of a view: E, N, H, distance, angle of incidence, size of the pixel,
         surface, normal.
 
@@ -412,7 +412,7 @@ _VIEW: dict[str, Verb] = {
         "products.view.make:view_matrix",
     ),
     "pick": Verb(
-        "Pixels to ground, ground to pixels.",
+        "Convert pixels to ground points, and back.",
         """Find the ground of pixels of a view, and the pixels of ground points, with what is seen there.
 
         (0, 0) is the centre of the upper-left pixel.
@@ -421,14 +421,14 @@ _VIEW: dict[str, Verb] = {
         "products.view.measure:pick_points",
     ),
     "area": Verb(
-        "What of the map is seen, as a raster or a polygon.",
-        "Map the visible area, which the picture shows: 1 seen, 0 not seen, 255 no terrain.",
+        "Map the area that is seen, as a raster or a polygon.",
+        "Map the area that the rendering shows: 1 seen, 0 not seen, 255 no terrain.",
         "requests.view:AreaRequest",
         "products.view.measure:visible_area",
     ),
     "skyline": Verb(
-        "The border between ground and sky, as a table or on the map.",
-        """Find the skyline: in every column the highest ground that is seen, with its place in the picture and on the
+        "Trace the skyline, as a table or on the map.",
+        """Find the skyline: in every column the highest ground that is seen, with its place in the rendering and on the
         map.
 
         With a photograph it is compared with the edge of the sky there, and the camera may be turned until both agree.
@@ -440,7 +440,7 @@ _VIEW: dict[str, Verb] = {
 
 _MEASURE: dict[str, Verb] = {
     "monoplot": Verb(
-        "Image points to ground points on a terrain model.",
+        "Compute ground points of image points on a terrain model.",
         """Compute ground points of image points, with standard deviations.
 
         POINTS is a table with columns x, y (pixels; the middle of the upper-left one is 0, 0), or a vector file with
@@ -450,8 +450,8 @@ _MEASURE: dict[str, Verb] = {
         "products.monoplot:monoplot_file",
     ),
     "register": Verb(
-        "Compare two images to a small part of a pixel.",
-        """Find by how much SECOND lies beside FIRST, patch by patch, to a small part of a pixel.
+        "Measure the shift between two images, to a small part of a pixel.",
+        """Measure the shift of SECOND against FIRST, patch by patch, to a small part of a pixel.
 
         Both have the same pixels, or places on one map. Each vector, in pixels of FIRST, is the distance of the content
         of a patch from its expected place in SECOND, with its standard deviation.
@@ -492,7 +492,7 @@ _QUALITY: dict[str, Verb] = {
         one_by_one=True,
     ),
     "characterise": Verb(
-        "Know a camera from image series.",
+        "Characterise a camera from image series.",
         """Measure a camera in image series: noise, gain, linearity, dark signal, defects, light fall-off …
 
         SERIES is a TOML file that states which images are what (dark frames, flat frames, scenes …) and how they were
@@ -506,7 +506,7 @@ _QUALITY: dict[str, Verb] = {
         files="written",
     ),
     "sensor": Verb(
-        "Resolution, bandwidth and noise of a sensor.",
+        "Compute resolution, bandwidth and noise of a sensor.",
         "Print resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes.",
         "requests.quality:SensorRequest",
         "products.sensor:describe_sensor",
@@ -529,7 +529,7 @@ _QUALITY: dict[str, Verb] = {
 
 _ALONE: dict[str, Verb] = {
     "surface": Verb(
-        "Heights and grey values from all images at once.",
+        "Compute heights and grey values from all images at once.",
         """Compute heights and grey values from all images at once, each with its standard deviation.
 
         NAME.tif has the heights, NAME_sigma.tif their standard deviations, NAME_count.tif the images that see them,
@@ -564,35 +564,35 @@ GROUPS: dict[str, VerbGroup] = {
         words={"": ("images",), "-h": ("images", "-h"), "--help": ("images", "-h")},
     ),
     "terrain": VerbGroup(
-        "Terrain models: build, sample, contours, volumes …",
+        "Work with terrain models: build, sample, contours, volumes …",
         _TERRAIN,
         """Terrain models with breaklines.
 
-    A job goes: build → info → sample, contours … A MODEL is a file of `dtm build`, or a GeoTIFF of heights.
+    The usual order is build → info → sample, contours … A MODEL is a file of `dtm build`, or a GeoTIFF of heights.
     """,
         alone=False,
     ),
     "view": VerbGroup(
-        "Perspective views, with the ground of every pixel.",
+        "Render perspective views, with the ground of every pixel.",
         _VIEW,
         """Perspective views of a project or a terrain model: photoplan view FILE --from X Y --look-at X Y -o PICTURE.
 
     `photoplan view panorama` looks all around (picture --panorama cylinder; --panorama sphere comes after it).
 
-    Pictures can be measured: `matrix` gives the ground point of every pixel, `pick` that of single ones.
+    Renderings can be measured: `matrix` gives the ground point of every pixel, `pick` that of single ones.
     """,
         alone=False,
         words={"": ("picture",), "panorama": ("picture", "--panorama", "cylinder")},
     ),
     "measure": VerbGroup("Measure in images.", _MEASURE),
-    "quality": VerbGroup("Sharpness, noise and faults of images; filters.", _QUALITY),
+    "quality": VerbGroup("Measure sharpness, noise and faults of images; apply filters.", _QUALITY),
 }
 #: Commands and groups by the first word after `photoplan`.
 VERBS: dict[str, Verb | VerbGroup] = {
     **{name: verb for group in GROUPS.values() if group.alone for name, verb in group.verbs.items()},
     **_ALONE,
     **GROUPS,
-    "dtm": replace(GROUPS["terrain"], short="Other name of `terrain`."),
+    "dtm": replace(GROUPS["terrain"], short="Another name of `terrain`."),
 }
 del VERBS["images"]  # which is `ortho`
 #: Headings of the help, and what stands below each.
@@ -603,7 +603,7 @@ HEADINGS: dict[str, tuple[str, ...]] = {
     "Terrain, surfaces and views": ("terrain", "surface", "view"),
     "Measuring": tuple(_MEASURE),
     "Quality of images and cameras": tuple(_QUALITY),
-    "To begin with": ("demo",),
+    "First steps": ("demo",),
 }
 
 

@@ -11,9 +11,9 @@ from photoplan.request import DRY_RUN, ONE_WORKER, OVERWRITE, PICTURE, PROJECT, 
 class RegisterRequest(Request):
     """Options of the comparison of two images."""
 
-    first: Path = arg("Image whose pixels count.")
+    first: Path = arg("Image in whose pixels vectors are measured.")
     second: Path = arg("Image that is compared.")
-    output: Path = opt("Vectors to write; NAME.csv stands beside it.", metavar="GPKG", writes=True)
+    output: Path = opt("Vectors to write, with NAME.csv next to them.", metavar="GPKG", writes=True)
     radius: int = opt("Radius of a round patch, pixels, 4 to 50.", 10)
     spacing: int | None = opt("Distance of the patches, pixels [they touch].", None, metavar="PX")
     search: float = opt("Largest displacement in x and y, pixels, up to 30.", 3.0)

@@ -35,7 +35,7 @@ class ConvertRequest(Request):
                              section="input")  # fmt: skip
     form: TableFormat = TableFormat()
     camera: Path | None = opt("Cameras: TOML, YAML, JSON [the orientation's].", None, section="input")
-    crs: str | None = opt("CRS to write; declares that of a file that states none.", None, metavar="CRS",
+    crs: str | None = opt("CRS to write; also declares the CRS of a file that states none.", None, metavar="CRS",
                           section="result")  # fmt: skip
     camera_axes: Literal["up-back", "down-forward"] = opt(
         "Camera axes y and z of the file; down-forward as in computer vision.", "up-back", section="input"
@@ -50,10 +50,10 @@ class ConvertRequest(Request):
     matrix: Direction | None = opt("Direction of written rotation matrices (patb, inpho).", None, section="result")
     beyond_area: bool = BEYOND_AREA
     drop_lens: bool = opt("Write cameras without a lens that the format cannot hold.", False, section="result")
-    list_readings: bool = opt("Only list the readings of the file that fit measured points.", False)
+    list_readings: bool = opt("Only list the angle conventions of the file that fit measured points.", False)
     image_points: Path | None = opt("Measured image points for `list_readings`.", None, section="input")
-    control: Path | None = opt("Their ground points.", None, section="input")
-    dry_run: bool = opt("Print what would be written and what would be lost, and stop.", False, section="run")
+    control: Path | None = opt("Ground points of the measured image points.", None, section="input")
+    dry_run: bool = opt("Print what would be written and lost, and stop.", False, section="run")
     overwrite: bool = OVERWRITE
 
     def check(self) -> None:
@@ -87,11 +87,11 @@ class FiducialsRequest(Request):
         None,
         choices={"auto": None, "0": 0, "90": 90, "180": 180, "270": 270},
     )
-    mirrored: bool | None = opt("Left and right are exchanged in the scan.", None, choices=_AUTO)
-    negative: bool | None = opt("Dark and bright are exchanged against the description.", None, choices=_AUTO)
+    mirrored: bool | None = opt("The scan has left and right exchanged.", None, choices=_AUTO)
+    negative: bool | None = opt("The scan has dark and bright exchanged.", None, choices=_AUTO)
     band: int | None = opt("Band to use [luminance of the first three].", None, ge=1, metavar="N")
     least_correlation: float = opt("Smallest correlation of a mark.", 0.6, ge=0.3, le=0.99, metavar="R")
-    pictures: Path | None = opt("Write a picture of the marks of each image.", None, folder=True, metavar="FOLDER",
+    pictures: Path | None = opt("Write a drawing of the marks of each image.", None, folder=True, metavar="FOLDER",
                                 writes=True)  # fmt: skip
     dry_run: bool = _KEEP_PROJECT
     overwrite: bool = OVERWRITE
@@ -128,7 +128,7 @@ class InteriorRequest(Request):
     scan_resolution: str | None = opt("Resolution, such as 1200dpi or 21um [what the files state].", None,
                                       metavar="DPI|UM", section="input")  # fmt: skip
     report: Path | None = opt("Write figures and plots as a page, HTML or PDF.", None, metavar="FILE", writes=True)
-    plot: Path | None = opt("Write residual vectors as a picture.", None, metavar="PNG", writes=True)
+    plot: Path | None = opt("Write the residual vectors as a drawing.", None, metavar="PNG", writes=True)
     write: bool = opt("Make the model that of the cameras in the project file.", False, section="result")
     overwrite: bool = OVERWRITE
 
@@ -176,15 +176,18 @@ class TieRequest(Request):
         metavar="auto|all|FILE",
     )
     scale: float | None = opt("Scale of the images in which features are searched, e.g. 0.5 [by their size].", None)
-    features: int = opt("Features per image.", 4000)
+    features: int = opt("Number of features for each image.", 4000)
     levels: int = opt(
-        "Kinds of features that are tried while images stay unconnected: as stated, coarser, then more.", 4, ge=1, le=4
+        "Number of kinds of features that are tried while images stay unconnected: as stated, coarser, then more.",
+        4,
+        ge=1,
+        le=4,
     )
-    per_image: int = opt("Tie points that an image is to have.", 500)
+    per_image: int = opt("Number of tie points for each image.", 500)
     refine: bool = opt("Refine the places of features by least-squares matching.", True, flag="no-refine",
-                       off="Take features as they are, without least-squares matching.")  # fmt: skip
+                       off="Leave out least-squares matching of the features.")  # fmt: skip
     use_orientation: bool = opt("Use the positions and orientations that images have.", True, flag="ignore-orientation",
-                                off="Work as if no image had a position.")  # fmt: skip
+                                off="Ignore the stated orientations and positions.")  # fmt: skip
     output: Path | None = opt("Tie points to write [tie_points.csv by the project].", None, metavar="CSV", writes=True)
     picture: bool = PICTURE
     dry_run: bool = DRY_RUN
@@ -226,15 +229,15 @@ class ResectRequest(Request):
         "Standard deviations of control, horizontal and height, metres [the project's].", None, metavar="XY Z"
     )
     free: tuple[str, ...] = opt(
-        "Parameters of the camera that are unknowns, also k2, k3, p1, p2, b1, b2; for one image.",
+        "Camera parameters that are unknowns, from c, x0, y0, k1, k2, k3, p1, p2, b1, b2; for one image.",
         (),
         listed=True,
         metavar="c,x0,y0,k1",
     )
-    unknown_camera_constant: bool = opt("The camera constant is not even approximately known; for one image.", False)
+    unknown_camera_constant: bool = opt("Estimate the camera constant without an initial value; for one image.", False)
     critical: float = opt("Normalised residual from which a point is a gross error.", 4.0, ge=2, le=20)
     report: Path | None = opt(
-        "Write residuals with pictures as a page, HTML or PDF.", None, metavar="FILE", writes=True
+        "Write residuals with drawings as a page, HTML or PDF.", None, metavar="FILE", writes=True
     )
     dry_run: bool = _KEEP_PROJECT
     overwrite: bool = OVERWRITE
@@ -258,8 +261,8 @@ class AdjustRequest(Request):
         "Datum of the block: control and observed positions, or the orientations in PROJECT [as stated].", None
     )
     images: tuple[str, ...] = IMAGES
-    robust: bool = opt("Search gross errors.", True, flag="no-robust", off="Search no gross errors.")
-    critical: float = opt("Normalised residual of a gross error.", 4.0)
+    robust: bool = opt("Search gross errors.", True, flag="no-robust", off="Do not reject gross errors.")
+    critical: float = opt("Normalised residual from which an observation is a gross error.", 4.0)
     variance_components: bool = opt(
         "Weight groups of observations as their residuals show.",
         True,
@@ -267,7 +270,7 @@ class AdjustRequest(Request):
         off="Weight groups as stated, not as their residuals show.",
     )
     correlation: bool = opt("Take errors of neighbouring image points as correlated.", True, flag="no-correlation",
-                            off="Take errors of neighbouring image points as independent.")  # fmt: skip
+                            off="Treat errors of neighbouring image points as independent.")  # fmt: skip
     iterations: int = opt("Largest number of iterations of each solution.", 40, ge=1)
     output: Path | None = opt("Folder of the report [PROJECT/adjustment].", None, folder=True, metavar="FOLDER",
                               section="result")  # fmt: skip

@@ -35,7 +35,7 @@ MOST_FILLED = 32
 
 _WEIGHTS: Any = opt("Weights of slant, coarseness, border, occlusion, sharpness [1, 1, 1, 0.5, 0].", Weights(),
                     flag="score", listed=True, metavar="NAME=WEIGHT,…")  # fmt: skip
-_PREFER: Any = opt("Images that come first wherever they see the ground.", (), listed=True, metavar="NAME,…")
+_PREFER: Any = opt("Images that are preferred wherever they see the ground.", (), listed=True, metavar="NAME,…")
 _SOURCES: Any = opt("Write which image painted each pixel: NAME_sources.tif, NAME_seams.gpkg.", False, section="result")
 
 
@@ -53,15 +53,16 @@ def _one_of(what: str, names: Any) -> BeforeValidator:
 class Choice(Request):
     """Options by which a mosaic chooses among its images."""
 
-    name: str = opt("Base name of the product's files.", "mosaic", section="result")
+    name: str = opt("Base name of the output files.", "mosaic", section="result")
     weights: Weights = _WEIGHTS
     prefer: tuple[str, ...] = _PREFER
     seams: Path | None = opt(
         "Regions with their images, that come before the score: an edited NAME_seams.gpkg.", None, metavar="FILE",
         section="input"
     )  # fmt: skip
-    feather: float = opt("Width in which images pass into each other along seams, metres, if both see [0].", 0.0,
-                         metavar="W")  # fmt: skip
+    feather: float = opt(
+        "Width of the transition between images along seams, metres, where both see the ground [0].", 0.0, metavar="W"
+    )
     blend: Literal["mean", "multiband"] = opt(
         "All detail passes over the width, or fine detail at the seam and coarse over W.", "mean"
     )
@@ -91,7 +92,11 @@ class PixelOptions(Request):
     kernel: Annotated[Kernel, _one_of("kernel", Kernel)] = opt(
         "Resampling kernel: nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic].", "bicubic", metavar="NAME"
     )
-    tolerance: float = opt("Largest residual of the anchors; 0: every pixel strictly [0.02].", 0.02, metavar="PX")
+    tolerance: float = opt(
+        "Largest approximation error of the anchors, pixels; 0 if every pixel is computed strictly [0.02].",
+        0.02,
+        metavar="PX",
+    )
     hidden: Annotated[Hidden | None, _one_of("hidden", Hidden)] = opt(
         "Ground that no image sees: show, nodata, or mark (second raster) [show; mosaics, true orthophotos: nodata].",
         None, metavar="HOW"
@@ -100,7 +105,7 @@ class PixelOptions(Request):
         "Fill hidden holes up to PX wide and high, marked in NAME_sources.tif [0: they stay empty].", 0, ge=0,
         le=MOST_FILLED, metavar="PX"
     )  # fmt: skip
-    accuracy: bool = opt("Write a raster of standard deviations, and a picture.", False, section="result")
+    accuracy: bool = opt("Write a raster of standard deviations, and a preview.", False, section="result")
     compress: Annotated[Compression, _one_of("compression", Compression)] = opt(
         "Compression of the file: deflate, zstd, lzw, jpeg or none [deflate].", "deflate", metavar="NAME",
         section="result"
@@ -120,7 +125,7 @@ class SingleOptions(Request):
         "indirect: pixels are looked up in the image; direct: its pixels are carried to the ground [indirect].",
         "indirect", metavar="NAME"
     )  # fmt: skip
-    fill: int = opt("Fill gaps of the direct method from pixels this near.", 0, metavar="PX")
+    fill: int = opt("Distance from which gaps of the direct method are filled, pixels.", 0, metavar="PX")
     stack: str = opt("Show all orthophotos as bands of one raster, NAME.vrt [no].", "", metavar="NAME",
                      section="result")  # fmt: skip
 
@@ -194,15 +199,15 @@ class ProductRequest(PixelOptions):
     project: Path = PROJECT
     images: tuple[str, ...] = IMAGES
     output: Path | None = opt("Folder of the products [products by the project].", None, folder=True, section="result")
-    plan_file: Path | None = opt("Write the plan (GeoPackage) and stop.", None, flag="plan", writes=True,
+    plan_file: Path | None = opt("Write the plan (GeoPackage), and stop.", None, flag="plan", writes=True,
                                   section="run")  # fmt: skip
     show_quadtree: bool = opt("Show objects of a plan or dry run also as squares.", False, section="result")
     force: bool = opt(
         "Continue although an orientation has a FAULT, or the resolution is finer than a quarter of the GSD.", False,
         section="run"
     )  # fmt: skip
-    quicklook: bool = opt("Write a picture of the products.", True, flag="no-quicklook", section="result",
-                          off="Write no picture of the products.")  # fmt: skip
+    quicklook: bool = opt("Write a preview of the products.", True, flag="no-quicklook", section="result",
+                          off="Write no preview of the products.")  # fmt: skip
     dry_run: bool = opt("Compile the plan, print it, and stop.", False, section="run")
     workers: int = ONE_WORKER
     executor: str = EXECUTOR
@@ -255,13 +260,15 @@ class ObjectRequest(ProductRequest):
     sources: bool = _SOURCES
     objects: tuple[str, ...] = opt("Objects of the file, or patterns; may be repeated [all].", (), listed=True,
                                    metavar="NAME,…", section="input")  # fmt: skip
-    below: bool = opt("Make also what lies below each object: NAME_below.tif.", False, section="result")
+    below: bool = opt("Make also the ground below each object: NAME_below.tif.", False, section="result")
     layer: str | None = opt("Layer of the file, or type of CityJSON's objects.", None, section="input")
     crs: str | None = opt("CRS of a file that states none.", None, metavar="CRS", section="input")
-    height_system: str | None = opt("Height system of the file; same: that of the terrain.", None, metavar="NAME",
-                                    section="input")  # fmt: skip
-    offset: tuple[float, float, float] | None = opt("Metres that are added to all coordinates.", None, metavar="X Y Z",
-                                                    section="input")  # fmt: skip
+    height_system: str | None = opt(
+        "Height system of the file, or `same` as that of the terrain.", None, metavar="NAME", section="input"
+    )
+    offset: tuple[float, float, float] | None = opt(
+        "Offset that is added to all coordinates, metres.", None, metavar="X Y Z", section="input"
+    )
     sigma: tuple[float, float] | None = opt("Standard deviations of the file, metres.", None, metavar="XY Z",
                                             section="input")  # fmt: skip
 
@@ -276,8 +283,8 @@ class RunRequest(Request):
 
     plan: Path = arg("Plan, a GeoPackage.")
     output: Path | None = opt("Folder of the products [as planned].", None, folder=True, section="result")
-    quicklook: bool = opt("Write a picture of the products.", True, flag="no-quicklook", section="result",
-                          off="Write no picture of the products.")  # fmt: skip
+    quicklook: bool = opt("Write a preview of the products.", True, flag="no-quicklook", section="result",
+                          off="Write no preview of the products.")  # fmt: skip
     workers: int = ONE_WORKER
     executor: str = EXECUTOR
     memory: int | None = MEMORY
@@ -299,9 +306,9 @@ class SeamsRequest(Request):
     project: Path = PROJECT
     images: tuple[str, ...] = IMAGES
     resolution: float | None = opt(
-        "Pixels along whose edges seams run, metres [256 of them across an image].", None, gt=0, metavar="R"
+        "Size of the pixels along whose edges seams run, metres [256 across an image].", None, gt=0, metavar="R"
     )
-    keep: Path | None = opt("Regions with their images that stay as they are.", None, metavar="FILE", section="input")
+    keep: Path | None = opt("Regions whose images stay unchanged.", None, metavar="FILE", section="input")
     output: Path | None = opt("Regions to write [products/seams.gpkg by the project].", None, metavar="FILE",
                               writes=True)  # fmt: skip
     picture: bool = PICTURE
@@ -322,13 +329,16 @@ class BalanceRequest(Request):
 
     project: Path = PROJECT
     images: tuple[str, ...] = IMAGES
-    reference_image: str | None = opt("Image that stays as it is [mean and contrast of all stay].", None,
-                                      metavar="NAME")  # fmt: skip
-    reference: Path | None = opt("Raster on the map whose colours the images get.", None, metavar="FILE",
+    reference_image: str | None = opt(
+        "Name of the image that stays unchanged [mean and contrast of all images stay].", None, metavar="NAME"
+    )
+    reference: Path | None = opt("Raster on the map whose colours the images take.", None, metavar="FILE",
                                  section="input")  # fmt: skip
-    degree: int = opt("Degree of the trend over an image; 0: tables alone.", 2)
+    degree: int = opt("Degree of the trend over an image; 0 for tables alone.", 2)
     factor: bool = opt("Find one factor for each image and band from means, instead of tables.", False)
-    resolution: float | None = opt("Pixels that are compared, metres [by the images' size].", None, metavar="R")
+    resolution: float | None = opt(
+        "Size of the pixels that are compared, metres [by the images' size].", None, metavar="R"
+    )
     output: Path | None = opt("Folder of the tables [balance by the project].", None, metavar="FOLDER", folder=True,
                               section="result")  # fmt: skip
     picture: bool = PICTURE

@@ -70,10 +70,11 @@ class BudgetRequest(Request):
     images: tuple[str, ...] = IMAGES
     camera_constant: float | None = opt("Camera constant of a vertical image, without a project.", None, metavar="MM",
                                         section="input")  # fmt: skip
-    format: tuple[float, float] = opt("Width and height of its format [230 230].", (230.0, 230.0), metavar="MM MM",
-                                      section="input")  # fmt: skip
-    pixel: float = opt("Side of its pixels, µm [15].", 15.0, metavar="UM", section="input")
-    height: float | None = opt("Its flying height above ground.", None, metavar="M", section="input")
+    format: tuple[float, float] = opt(
+        "Width and height of the image format, mm [230 230].", (230.0, 230.0), metavar="MM MM", section="input"
+    )
+    pixel: float = opt("Side of a pixel, µm [15].", 15.0, metavar="UM", section="input")
+    height: float | None = opt("Flying height above ground.", None, metavar="M", section="input")
     sigma_terrain: float | None = opt("Standard deviation of heights, metres [the project's].", None, metavar="M",
                                       section="input")  # fmt: skip
     sigma_center: tuple[float, float, float] | None = opt(
@@ -84,9 +85,9 @@ class BudgetRequest(Request):
     )
     angle_unit: Literal["deg", "gon", "rad"] = opt("Unit of angles without a project [gon].", "gon", section="input")
     kernel: str = opt("Resampling kernel [bicubic].", "bicubic")
-    tolerance: float = opt("Largest residual of the anchors, pixels [0.02].", 0.02, metavar="PX")
+    tolerance: float = opt("Largest approximation error of the anchors, pixels [0.02].", 0.02, metavar="PX")
     tables: bool = opt("Print the tables and examples of Ecker 1991 instead.", False, section="result")
-    picture: Path | None = opt("Write a picture of contributions, and a map of the total.", None, metavar="PNG",
+    picture: Path | None = opt("Write a drawing of the contributions, and a map of the total.", None, metavar="PNG",
                                writes=True)  # fmt: skip
     overwrite: bool = OVERWRITE
 

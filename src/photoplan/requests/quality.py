@@ -90,10 +90,10 @@ class RestoreRequest(Request):
                                     metavar="linear|srgb|TABLE", section="input")  # fmt: skip
     dtype: str = opt("Type of the results: same, float32 or uint16.", "same", metavar="TYPE", section="result")
     chromatic: Annotated[Path | object | None, path_or("measure")] = opt(
-        "First bring the bands together: by a model, or as measured in each image.", None, metavar="FILE|measure",
+        "Align the bands first: by a model, or as measured in each image.", None, metavar="FILE|measure",
         section="input",
     )  # fmt: skip
-    fall_off: Path | None = opt("Before all else correct the light fall-off, by a model of `photoplan characterise`.",
+    fall_off: Path | None = opt("Correct the light fall-off first, by a model of `photoplan characterise`.",
                                 None, metavar="TOML", section="input")  # fmt: skip
     aperture: str | None = opt("Aperture of a scanner to undo: square or round, RATIO of aperture by step [1].", None,
                                metavar="SHAPE[:RATIO]")  # fmt: skip
@@ -113,7 +113,7 @@ class RestoreRequest(Request):
                                    metavar="TOML", writes=True)  # fmt: skip
     compress: str = opt("Compression: deflate, zstd, lzw, jpeg or none.", "deflate", section="result")
     report: Path | None = REPORT
-    quicklook: bool = opt("Write pictures.", True, flag="no-quicklook", section="result", off="Write no pictures.")
+    quicklook: bool = opt("Write previews.", True, flag="no-quicklook", section="result", off="Write no previews.")
     dry_run: bool = DRY_RUN
     workers: int = ONE_WORKER
     memory: int | None = MEMORY
@@ -176,18 +176,22 @@ class SimulateRequest(Request):
     )  # fmt: skip
     images: tuple[str, ...] = IMAGES
     texture: Path | None = opt("Raster of the ground's colours [a pattern].", None, metavar="FILE", section="input")
-    grain: float | None = opt("Finest wave of the pattern, metres [8 ground pixels].", None, gt=0, metavar="M")
-    truth: bool = opt("Write X, Y, Z and object of each pixel, too: NAME_truth.tif.", False, section="result")
-    resolution: float | None = opt("Ground pixel of a true orthophoto of the scene to write, too, metres [none].", None,
-                                   metavar="R", section="result")  # fmt: skip
+    grain: float | None = opt("Shortest wavelength of the pattern, metres [8 ground pixels].", None, gt=0, metavar="M")
+    truth: bool = opt("Write also X, Y, Z and object of each pixel: NAME_truth.tif.", False, section="result")
+    resolution: float | None = opt(
+        "Ground pixel of a true orthophoto of the scene that is also written, metres [none].",
+        None,
+        metavar="R",
+        section="result",
+    )
     bounds: tuple[float, float, float, float] | None = BOUNDS
     frames: int = opt("Number of images to form, in numbered files.", 1, ge=1, le=10_000)
-    seed: int | None = opt("Seed of all that is random [the model's, else 0].", None, ge=0, lt=2**62)
-    exposure: tuple[float, ...] = opt("Factor of light and time; once, or once for each frame [1].", (),
+    seed: int | None = opt("Seed of the random numbers [the model's, else 0].", None, ge=0, lt=2**62)
+    exposure: tuple[float, ...] = opt("Factor of the exposure, one or one for each frame [1].", (),
                                       metavar="FACTOR")  # fmt: skip
     size: tuple[int, int] | None = opt("Size of a pattern, pixels [512 512].", None, metavar="WIDTH HEIGHT")
     levels: tuple[float, float] | None = opt("Values of a pattern [0 1].", None, metavar="DARK BRIGHT")
-    phase: tuple[float, float] | None = opt("Pixels by which a pattern is moved from the middle [0 0].", None,
+    phase: tuple[float, float] | None = opt("Shift of a pattern from the middle, pixels [0 0].", None,
                                             metavar="X Y")  # fmt: skip
     oversampling: int | None = opt(
         "Cells of the scene along a side of a pixel [files 1, patterns 8, projects 2].", None, ge=1, le=64

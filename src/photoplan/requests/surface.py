@@ -22,7 +22,7 @@ class SurfaceSettings(Request):
     reach: float | None = opt("Largest error of the initial heights, metres [a tenth of the flying height].", None,
                               metavar="M")  # fmt: skip
     search: bool | None = opt(
-        "First search heights within the reach: strong relief [from a reach of 24 px of parallax on].", None
+        "Search for heights within the reach first, for strong relief [from a reach of 24 px of parallax on].", None
     )
     bands: tuple[int, ...] = opt("Bands whose mean is a grey value [all; of three luminance].", (),
                                  listed="numbers from 1 on are needed", metavar="N,…")  # fmt: skip
@@ -60,11 +60,12 @@ class SurfaceRequest(SurfaceSettings):
 
     project: Path = PROJECT
     images: tuple[str, ...] = IMAGES
-    report: Path | None = opt("Accuracy by classes, images and levels, with plots, HTML or PDF.", None, metavar="FILE",
-                              writes=True)  # fmt: skip
+    report: Path | None = opt(
+        "Report of the accuracy by classes, images and levels, HTML or PDF.", None, metavar="FILE", writes=True
+    )
     output: Path | None = opt("Folder of the files [products by the project].", None, folder=True, section="result")
-    quicklook: bool = opt("Write a picture of the surface.", True, flag="no-quicklook", section="result",
-                          off="Write no picture of the surface.")  # fmt: skip
+    quicklook: bool = opt("Write a preview of the surface.", True, flag="no-quicklook", section="result",
+                          off="Write no preview of the surface.")  # fmt: skip
     force: bool = opt(
         "Continue although orientations have a FAULT, or the images contradict the surface.", False, section="run"
     )

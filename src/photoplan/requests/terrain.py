@@ -38,16 +38,19 @@ class BuildRequest(Request):
     grid_width: float | None = opt("Grid width, metres [half the spacing; half of that at breaklines].", None, gt=0,
                                    metavar="M")  # fmt: skip
     adapt: float | None = opt(
-        "Widen the grid of a unit while its surface stays within this, metres; 0: never [a quarter of its standard "
-        "deviation].", None, ge=0, metavar="M",
-    )  # fmt: skip
+        "Widen the grid of a unit while its surface stays within this distance, metres; 0 for never "
+        "[a quarter of its standard deviation].",
+        None,
+        ge=0,
+        metavar="M",
+    )
     unit_meshes: int = opt("Number of meshes along the side of a unit: a power of two.", 64)
     filters: tuple[str, ...] = opt(
         "Standard deviation of measurement of mass, spot, breakline, formline, border or hole, metres [mass: "
         "estimated; others: a share of it].", (), flag="filter", metavar="CLASS=M",
     )  # fmt: skip
     covariance: str = opt("Covariance function: auto, gaussian, matern or exponential.", "auto")
-    gross: float = opt("Normalised residual of gross errors; 0: none is sought.", 5.0, ge=0)
+    gross: float = opt("Normalised residual from which a point is a gross error; 0 if none is rejected.", 5.0, ge=0)
     reach: float | None = opt("Half the width from which on gaps stay open, metres [10 spacings].", None, gt=0,
                               metavar="M")  # fmt: skip
     codes: Annotated[Path | object | None, path_or()] = opt(
@@ -76,7 +79,7 @@ class BuildRequest(Request):
     height_system: str | None = opt("Height system of files that state none: ellipsoidal or EPSG:nnnn.", None,
                                     section="input")  # fmt: skip
     beyond_area: bool = BEYOND_AREA
-    report: bool | None = opt("Write a page with plots beside the model [if matplotlib is there].", None,
+    report: bool | None = opt("Write a page with plots next to the model [if matplotlib is installed].", None,
                               section="result")  # fmt: skip
     report_format: Literal["html", "pdf"] = REPORT_FORMAT
     dry_run: bool = opt("Read, clean and plan; print it and stop.", False, section="run")
@@ -170,7 +173,7 @@ class ContourRequest(Request):
         "Distance of labels along a line, metres [60 text heights].", None, gt=0, section="result"
     )
     crs: str | None = crs_option()
-    preview: Path | None = opt("Write a small picture of the contours.", None, metavar="PNG", writes=True)
+    preview: Path | None = opt("Write a preview of the contours.", None, metavar="PNG", writes=True)
     overwrite: bool = OVERWRITE
 
 
@@ -182,7 +185,7 @@ class PictureRequest(Request):
     resolution: float | None = opt("Pixel size, metres [the model's mesh width].", None, gt=0, metavar="R")
     bounds: tuple[float, float, float, float] | None = BOUNDS
     crs: str | None = crs_option()
-    preview: Path | None = opt("Write a small picture.", None, metavar="PNG", writes=True)
+    preview: Path | None = opt("Write a preview.", None, metavar="PNG", writes=True)
     overwrite: bool = OVERWRITE
     workers: int | None = WORKERS
 
@@ -239,7 +242,7 @@ class VolumeRequest(Request):
     resolution: float | None = opt(
         "Cell size of the integration, metres [the finer mesh width, halved until settled].", None, gt=0
     )
-    tolerance: float = opt("Relative change at which cells are halved no more.", 1e-3)
+    tolerance: float = opt("Relative change of the volume below which cells are no longer halved.", 1e-3)
     sigma_a: float | None = opt("Standard deviation of A's heights, metres [the model's own].", None, ge=0)
     sigma_b: float | None = opt("Standard deviation of B's heights, metres [the model's own].", None, ge=0)
     correlation: float | None = opt("Correlation length of height errors, metres [each mesh width].", None)
@@ -279,7 +282,7 @@ class FlowRequest(Request):
     model: Path = _model()
     output: Path = opt("Raster to write.", metavar="TIF", writes=True)
     resolution: float | None = opt("Cell size, metres [mesh width].", None, gt=0)
-    outlets: Path | None = opt("Points whose catchments are wanted: table x, y, name, or vector file.", None,
+    outlets: Path | None = opt("Outlets whose catchments are computed: table x, y, name, or vector file.", None,
                                section="input")  # fmt: skip
     snap: float = opt("Move outlets to the largest flow within this distance, metres.", 0.0, ge=0)
     catchments: Path | None = opt("Write the catchments as polygons.", None, metavar="GPKG", writes=True)

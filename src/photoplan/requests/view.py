@@ -44,24 +44,28 @@ class CameraRequest(Request):
     """Distance by which the camera of an image is moved to the right along its rows, metres: an eye of a pair."""
     position: tuple[float, float] | None = opt("Standpoint.", None, flag="from", metavar="X Y")
     height: float = opt("Height of the eye above ground, metres [1.7].", 1.7)
-    altitude: float | None = opt("Height of the eye in the terrain's system instead.", None)
-    look_at: tuple[float, ...] | None = opt("Point of the ground in the middle of the picture.", None, nargs=2,
+    altitude: float | None = opt(
+        "Height of the eye in the height system of the terrain, instead of above ground.", None
+    )
+    look_at: tuple[float, ...] | None = opt("Ground point in the middle of the rendering.", None, nargs=2,
                                             metavar="X Y")  # fmt: skip
     look_at_height: float | None = opt("Height of that point, if it is not on the ground.", None)
-    azimuth: float | None = opt("Direction of view instead, degrees from grid north.", None)
-    pitch: float = opt("Angle of the view above the horizon, degrees, with an azimuth [0].", 0.0)
+    azimuth: float | None = opt("Direction of view, instead of a point, degrees from grid north.", None)
+    pitch: float = opt("Angle of view above the horizon, degrees, together with an azimuth [0].", 0.0)
     roll: float = opt("Angle of the camera about its axis, degrees clockwise [0].", 0.0)
     field_of_view: float | None = opt("Angle from left to right, degrees [60; panoramas 360].", None, flag="fov")
-    size: tuple[int, int] = opt("Size of the picture, pixels [1200 800].", (1200, 800), metavar="W H")
+    size: tuple[int, int] = opt("Size of the rendering, pixels [1200 800].", (1200, 800), metavar="W H")
     pixel_aspect: float = opt("Width of a pixel by its height [1].", 1.0)
-    panorama: Literal["cylinder", "sphere"] | None = opt("Panorama instead of a plane picture.", None)
+    panorama: Literal["cylinder", "sphere"] | None = opt("Kind of panorama, instead of a plane rendering.", None)
     curvature: Literal["none", "bend", "strict"] | None = opt(
         "The earth: flat, lowered by s²/2R, or strict [standpoints bend, images as the project has it].", None
     )
     refraction: float | None = opt("Coefficient of refraction k [0.13].", None)
     earth_radius: float | None = opt("Radius of the earth, metres [the ellipsoid's].", None)
-    exaggeration: float = opt("Factor of heights [1].", 1.0)
-    reference: float | None = opt("Height that it leaves [where the picture's middle meets ground].", None)
+    exaggeration: float = opt("Factor by which heights are multiplied [1].", 1.0)
+    reference: float | None = opt(
+        "Height that the exaggeration leaves unchanged [that of the ground in the middle].", None
+    )
 
     def check(self) -> None:
         """Refuse what does not go together, and what cannot be meant; a file of a camera is judged when it is read."""
@@ -247,7 +251,7 @@ def number_in(text: str, where: str, least: float, most: float) -> float:
 
 @dataclass(frozen=True)
 class PhotoRequest:
-    """A photograph that has the pixels of the picture."""
+    """A photograph that has the pixels of the rendering."""
 
     path: str
     how: str = "over"
@@ -281,22 +285,27 @@ class LookRequest(Request):
     """Options of how a view looks."""
 
     contents: tuple[ContentRequest, ...] = opt(
-        "shade, tint[:RAMP[:LOW:HIGH]], slope, photos, photo:NAME, or a raster on the map; may be repeated, later ones "
-        "over earlier ones, with @OPACITY, rasters of classes with @classes [tint, shade@0.8; of a project photos].",
+        "Content to show: `shade`, `tint[:RAMP[:LOW:HIGH]]`, `slope`, `photos`, `photo:NAME`, or a raster on the map. "
+        "May be repeated, later ones over earlier ones, with @OPACITY; rasters of classes with @classes "
+        "[`tint`, `shade@0.8`; for a project `photos`].",
         (ContentRequest("tint"), ContentRequest("shade", "", 0.8)), flag="content", metavar="WHAT"
     )  # fmt: skip
     sun: tuple[float, float] = opt("Direction of the sun from grid north, and its height, degrees [315 45].",
                                    (315.0, 45.0), metavar="AZIMUTH ALTITUDE")  # fmt: skip
-    shadows: bool = opt("Let terrain and objects cast shadows.", False)
+    shadows: bool = opt("Show the shadows of terrain and objects.", False)
     haze: float = opt("Coefficient of haze, per kilometre [0; 0.1 is much].", 0.0)
     haze_colour: Colour = _colour("Colour of the horizon in haze [200 210 222].", (200, 210, 222))
     sky: Colour = _colour("Colour of the sky [186 212 238].", (186, 212, 238))
     nodata: Colour = _colour("Colour of ground that no content shows [214 214 214].", (214, 214, 214))
-    water_colour: Colour = _colour("Colour of water that no raster or photo shows [112 150 184].", (112, 150, 184))
+    water_colour: Colour = _colour("Colour of water that no raster or image shows [112 150 184].", (112, 150, 184))
     samples: int = opt("Rays along each side of a pixel [2].", 2)
     kernel: str = opt("nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic].", "bicubic")
-    tolerance: float = opt("Largest error of places in rasters and photos; 0: every pixel strictly [0.02].", 0.02,
-                           nan=True, metavar="PX")  # fmt: skip
+    tolerance: float = opt(
+        "Largest error of positions in rasters and images, pixels; 0 if every pixel is computed strictly [0.02].",
+        0.02,
+        nan=True,
+        metavar="PX",
+    )
 
     def check(self) -> None:
         """Refuse what cannot be meant."""
@@ -360,10 +369,10 @@ class SightRequest(Request):
     farthest: float = opt("Largest distance that is seen, metres [all].", math.inf, infinite=True)
     bound: float = opt("Largest error of ground coordinates, metres [0.01].", 0.01)
     water: float | None = opt(
-        "Height of water that covers what is lower or has no height.", None, nan=True, metavar="H"
+        "Height of the water that covers lower ground and places without height.", None, nan=True, metavar="H"
     )
     crs: str | None = crs_option("a terrain model that does not state it")
-    force: bool = opt("Continue from below the ground, or where none is seen.", False, section="run")
+    force: bool = opt("Continue although the eye is below the ground, or no ground is seen.", False, section="run")
 
 
 class MatrixRequest(SightRequest):
@@ -386,8 +395,10 @@ class PictureOptions(SightRequest):
         "@colour=#d55e00,width=2,dash=6-3,label=name,height=yes,distance=yes,rank=field,drape=yes.", (), metavar="WHAT"
     )  # fmt: skip
     text_size: float = opt("Size of labels, pixels.", 13.0)
-    stereo: Literal["side-by-side", "anaglyph"] | None = opt("A pair: left and right, or red-cyan.", None)
-    base: float | None = opt("Distance of both eyes, metres [a thirtieth of that of the nearest ground].", None)
+    stereo: Literal["side-by-side", "anaglyph"] | None = opt("Kind of stereo pair: side by side, or red-cyan.", None)
+    base: float | None = opt(
+        "Distance between the eyes, metres [a thirtieth of the distance to the nearest ground].", None
+    )
     lettering: Any = None
     """Function that draws texts; None if points have no labels."""
     dry_run: bool = DRY_RUN
@@ -414,14 +425,20 @@ class PictureOptions(SightRequest):
 class ViewRequest(PictureOptions):
     """Options of a picture."""
 
-    matrix: Path | None = opt("Coordinate matrix of this view: only its content is made anew.", None, section="input")
-    output: Path | None = opt("Picture: PNG, JPEG or GeoTIFF; a dry run needs none.", None, metavar="PICTURE",
-                              writes=True)  # fmt: skip
+    matrix: Path | None = opt(
+        "Coordinate matrix of this view, of which only the content is rendered again.", None, section="input"
+    )
+    output: Path | None = opt(
+        "Rendering to write: PNG, JPEG or GeoTIFF; a dry run requires none.", None, metavar="PICTURE", writes=True
+    )
     photo: PhotoRequest | None = opt(
-        "A photograph with the pixels of the picture: over it, with an opacity (@0.3; 0.5), in @squares with it, or "
-        "@beside it.", None, metavar="FILE[@HOW]", section="input"
-    )  # fmt: skip
-    svg: Path | None = opt("Write lines and labels also as a layer over the picture.", None, writes=True)
+        "Photograph with the pixels of the rendering, shown over it with an opacity (@0.3; 0.5), in @squares with it, "
+        "or @beside it.",
+        None,
+        metavar="FILE[@HOW]",
+        section="input",
+    )
+    svg: Path | None = opt("Write lines and labels also as a layer over the rendering.", None, writes=True)
     kind: Literal["picture", "matrix"] = "picture"
 
     def check(self) -> None:
@@ -443,8 +460,8 @@ class SequenceRequest(PictureOptions):
                      metavar="FILE", section="input")  # fmt: skip
     layer: str | None = opt("Layer of the path's file.", None, section="input")
     step: float | None = opt("Distance of stations of a line, metres.", None)
-    video: Path | None = opt("Write a film of the pictures; needs ffmpeg.", None, metavar="MP4", writes=True)
-    rate: float = opt("Pictures of the film per second.", 25.0, section="result")
+    video: Path | None = opt("Write a film of the renderings; requires ffmpeg.", None, metavar="MP4", writes=True)
+    rate: float = opt("Renderings of the film per second.", 25.0, section="result")
     output: Path = opt("Folder for frame_00001.png and so on.", metavar="FOLDER", folder=True, section="result")
 
     def check(self) -> None:
@@ -473,7 +490,7 @@ class AreaRequest(MeasuringRequest):
     """Options of the visible area."""
 
     output: Path = opt("GeoTIFF, or GeoPackage of a polygon.", metavar="FILE", writes=True)
-    resolution: float | None = opt("Pixel of the map, metres [a thousandth].", None, gt=0)
+    resolution: float | None = opt("Pixel of the map, metres [a thousandth of its side].", None, gt=0)
     workers: int | None = WORKERS
     overwrite: bool = OVERWRITE
 
@@ -487,7 +504,7 @@ class PickRequest(MeasuringRequest):
                                                 metavar="X Y", section="input")  # fmt: skip
     file: Path | None = opt("Ground points: columns x, y and optionally z, name.", None, flag="points",
                             metavar="TABLE", section="input")  # fmt: skip
-    output: Path | None = opt("Write them as a table.", None, metavar="CSV", writes=True)
+    output: Path | None = opt("Table of the points to write.", None, metavar="CSV", writes=True)
     overwrite: bool = OVERWRITE
 
 
@@ -495,15 +512,19 @@ class SkylineRequest(MeasuringRequest):
     """Options of a skyline, and of a photograph that it is compared with."""
 
     output: Path = opt("CSV, or GeoPackage of points.", metavar="FILE", writes=True)
-    photo: Path | None = opt("Photograph with the pixels of the picture: the edge of its sky.", None, metavar="IMAGE",
-                             section="input")  # fmt: skip
-    border: int = opt("Pixels along the edges of the photograph that are no picture [0].", 0)
+    photo: Path | None = opt(
+        "Photograph with the pixels of the rendering, whose edge of the sky is compared.",
+        None,
+        metavar="IMAGE",
+        section="input",
+    )
+    border: int = opt("Width of the frame of the photograph that shows no scene, pixels [0].", 0)
     search: int | None = opt("Rows above and below the skyline to look for the edge [a tenth].", None)
     control: Path | None = opt("Points of the photograph: x, y, E, N, H, name.", None, metavar="TABLE",
                                section="input")  # fmt: skip
     picture: Path | None = opt("Write the photograph with both lines.", None, metavar="PNG", writes=True)
     refine: bool = opt("Turn the camera until both lines agree.", False)
-    focal: bool = opt("Alter also its camera constant.", False)
+    focal: bool = opt("Estimate also the camera constant.", False)
     refined: Path | None = opt("Write the camera that was found.", None, metavar="TOML", writes=True)
     overwrite: bool = OVERWRITE
 

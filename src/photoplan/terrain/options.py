@@ -12,7 +12,7 @@ class ContourOptions(Request):
 
     interval: float = opt("Height difference of neighbouring contours, metres.", gt=0, metavar="M")
     base: float = opt("Height that contours are counted from, metres.", 0.0)
-    index: int = opt("Every N-th contour is an index contour; 0: none.", 5, ge=0)
+    index: int = opt("Number of contours from one index contour to the next; 0 for none.", 5, ge=0)
     smooth: bool = opt("Smooth lines inside their band; they never cross.", False)
     simplify: bool = opt("Leave out vertices inside the band; lines never cross.", False)
     band: float = opt("Half width of the band, as a part of the interval.", 0.25, gt=0, lt=0.5)
