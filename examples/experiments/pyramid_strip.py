@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 from photoplan.kernels.matching import sample_spline, spline_coefficients
-from photoplan.matching.facets.pyramid import Pyramid
+from photoplan.matching.facets.observe import Pyramid
 from photoplan.matching.features import GreyImage
 from photoplan.matching.register import (
     FOUND,

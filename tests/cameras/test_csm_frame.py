@@ -18,8 +18,8 @@ from tools.command import inside
 from photoplan.cameras.base import project
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_step
-from photoplan.io.camera.csm import frame_of, is_frame, read_frame
 from photoplan.io.camera.line import read_line
+from photoplan.io.camera.satellite import frame_of, is_frame, read_frame
 from photoplan.plan.footprint import footprint
 from photoplan.surfaces.base import LevelSurface
 

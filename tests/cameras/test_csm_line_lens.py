@@ -14,8 +14,8 @@ from tools.body_axes import over_its_body
 from photoplan.cameras.base import project
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.errors import InputError
-from photoplan.io.camera.csm import Isd
 from photoplan.io.camera.line import look, read_csm
+from photoplan.io.camera.satellite import Isd
 
 #: Support data of the USGS's ale (public domain), every fortieth and thirty-second record of their tables.
 DATA = Path(__file__).parents[1] / "data/csm_line"

@@ -13,8 +13,8 @@ import pytest
 from photoplan.cameras.base import project
 from photoplan.errors import InputError
 from photoplan.geometry.crs import require_projected_metres
-from photoplan.io.camera.csm import frame_of
 from photoplan.io.camera.line import read_csm
+from photoplan.io.camera.satellite import frame_of
 from photoplan.plan.footprint import footprint
 from photoplan.surfaces.base import LevelSurface
 

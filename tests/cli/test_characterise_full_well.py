@@ -11,7 +11,7 @@ from tools.command import inside
 from tools.formed import form_image
 
 from photoplan.quality.formation.model import ImageModel
-from photoplan.quality.formation.parts import (
+from photoplan.quality.formation.optics import (
     DarkCurrentPart,
     DefectPart,
     Exposure,

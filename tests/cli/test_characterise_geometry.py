@@ -14,7 +14,7 @@ from tools.command import Here, Said
 
 from photoplan.geometry.grid import Window
 from photoplan.project.steps import read_fall_off
-from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off
+from photoplan.quality.camera.fall_off import FallOffModel, correct_fall_off
 
 SIZE = (160, 120)
 B4 = """name;stage_x;stage_y;x;y

@@ -9,7 +9,7 @@ from tools.orientation_blocks import CAMERA, GROUND, NAMES, block, our_pixels
 from tools.recorded import recorded
 
 from photoplan.geometry.pose import angles_from_rotation
-from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation, write_orientation
+from photoplan.io.formats import FORMATS, orientation_format, read_orientation, write_orientation
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import rasterio
 from tools.command import inside
 from tools.format_examples import block_of, frame
 
-from photoplan.io.orientation.file import orientation_format, write_orientation
+from photoplan.io.formats import orientation_format, write_orientation
 
 DXF = "0\nSECTION\n2\nENTITIES\n0\nPOINT\n8\nspot\n10\n1.0\n20\n2.0\n30\n3.0\n0\nENDSEC\n0\nEOF\n"
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"

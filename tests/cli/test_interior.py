@@ -166,7 +166,7 @@ def test_plot_and_report(photoplan: Here, tmp_path: Path) -> None:
 
 def test_vectors_are_drawn_to_one_round_scale() -> None:
     pytest.importorskip("matplotlib")
-    from photoplan.report.interior import vector_scale
+    from photoplan.report.orientation import vector_scale
 
     plane = np.array(list(FILM.marks.values()))
     for longest, want in ((56.0, 1000.0), (5.6, 10_000.0), (560.0, 100.0), (60.0, 700.0)):

@@ -11,8 +11,7 @@ import pytest
 from tools.command import Here
 
 from photoplan.findings import Chart, Estimate, Findings, Trace
-from photoplan.report.findings import findings_section
-from photoplan.report.page import ReportFile, page, section, table
+from photoplan.report.page import ReportFile, findings_section, page, section, table
 
 TEMPLATE = Path(__file__).resolve().parents[2] / "docs" / "templates" / "sensor-frame.toml"
 _STRING = re.compile(rb"\(((?:[^()\\]|\\.)*)\)", re.DOTALL)

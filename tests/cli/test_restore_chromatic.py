@@ -14,7 +14,7 @@ from tools.formed import form_image
 from photoplan.io.raster import write_whole_image
 from photoplan.products.chromatic import load_chromatic
 from photoplan.quality.formation.model import ImageModel
-from photoplan.quality.formation.parts import Gain, Lateral, Quantisation, Spread
+from photoplan.quality.formation.optics import Gain, Lateral, Quantisation, Spread
 from photoplan.quality.formation.scenes import PatternScene
 
 CAMERA = ImageModel(

@@ -19,7 +19,7 @@ SAID = "no picture: it needs matplotlib (pip install 'photoplan[report]')"
 def test_a_picture_that_is_left_out_is_told(
     photoplan: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
 ) -> None:
-    monkeypatch.setattr("photoplan.report.drawing.has_matplotlib", lambda: False)
+    monkeypatch.setattr("photoplan.report.page.has_matplotlib", lambda: False)
     images = [write(tmp_path / f"{name}.tif", (60, 50), **MAP) for name in "ab"]
     said = photoplan("register", *images, "-o", tmp_path / "v.gpkg", *options)
     assert said.code == 0, said.err

@@ -8,7 +8,7 @@ import pyramid_strip as strips
 import pytest
 
 from photoplan.kernels.jit import COMPILED
-from photoplan.matching.facets.pyramid import FILTERS
+from photoplan.matching.facets.observe import FILTERS
 
 pytestmark = pytest.mark.skipif(not COMPILED, reason="thousands of patches")
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "experiments" / "pyramid-strip.md"

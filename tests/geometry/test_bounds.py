@@ -9,7 +9,7 @@ import pytest
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import area_fault, odd_angles, odd_place
 from photoplan.geometry.grid import refuse_absurd
-from photoplan.io.orientation.file import read_orientation
+from photoplan.io.formats import read_orientation
 from photoplan.io.points import read_ground_points, read_observed_positions
 from photoplan.io.project.file import load_project
 

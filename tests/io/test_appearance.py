@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.io.camera.file import read_cameras
 from photoplan.io.files import decoded_text, looks_like, raster_driver
+from photoplan.io.formats import read_cameras
 
 KINDS = {
     "bundle.out": (b"# Bundle file v0.3\n1 0\n500 0 0\n", "Bundler's bundle.out"),

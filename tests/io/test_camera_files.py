@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.model import FilmEntry, FrameEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
+from photoplan.io.formats import read_cameras
 from photoplan.io.orientation.opensfm import resized
 
 

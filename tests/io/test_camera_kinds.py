@@ -37,9 +37,9 @@ ALLOWED = {
     "cameras/corrected.py": "a kind",
     "cameras/build.py": "registry of cameras that compute",
     "cameras/body_frame.py": "a kind in the axes of a body",
-    "io/camera/csm.py": "makes a kind of what files state",
+    "io/camera/satellite.py": "makes a kind of what files state",
     "io/camera/model.py": "kinds, and their registry",
-    "io/orientation/inpho.py": "reads a format that knows frames in millimetres alone",
+    "io/orientation/projects.py": "reads a format that knows frames in millimetres alone",
 }
 
 

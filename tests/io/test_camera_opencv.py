@@ -11,10 +11,9 @@ import pytest
 from tools.format_examples import assert_same_cameras, block_of, frame
 
 from photoplan.errors import InputError
-from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.opencv import render
+from photoplan.io.formats import read_cameras, read_orientation, write_orientation
 from photoplan.io.orientation.block import OrientationBlock
-from photoplan.io.orientation.file import read_orientation, write_orientation
 from photoplan.io.project.model import Image, interior_of, lens_of
 
 YAML = """%YAML:1.0

@@ -11,8 +11,8 @@ import pytest
 
 from photoplan.cameras.interior import Interior
 from photoplan.errors import InputError
-from photoplan.io.camera.file import distance_differences, read_cameras
 from photoplan.io.camera.model import FilmEntry
+from photoplan.io.formats import distance_differences, read_cameras
 from photoplan.io.project.model import lens_of
 
 TEMPLATE = Path(__file__).resolve().parents[2] / "docs" / "templates" / "usgs-camera.toml"

@@ -14,9 +14,9 @@ import rasterio.shutil
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io import product as product_module
+from photoplan.io.disk import CogOptions, write_cog
 from photoplan.io.product import ProductFile
 from photoplan.io.raster_info import TiffLayout, read_tiff_layout, read_tiff_layouts
-from photoplan.io.storage import CogOptions, write_cog
 
 GRID = MapGrid(0, 0, 1, 1500, 1100, "EPSG:32633")
 PLACE = GRID.placement

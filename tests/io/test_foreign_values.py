@@ -16,13 +16,11 @@ from tools.small_block import write_block
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs
-from photoplan.io.camera.file import read_cameras
 from photoplan.io.files import parse_json, whole_number
+from photoplan.io.formats import read_cameras, read_orientation_block
 from photoplan.io.objects import read_objects
-from photoplan.io.orientation.file import read_orientation_block
-from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.project.file import load_project
-from photoplan.io.vector_layer import read_columns, read_features
+from photoplan.io.vector_layer import PlanTables, read_columns, read_features, read_plan_tables, write_plan_tables
 
 
 @pytest.mark.parametrize(

@@ -20,10 +20,10 @@ from photoplan.geometry.grid import MapGrid
 from photoplan.io import disk
 from photoplan.io.disk import FileLock, open_own, read_own, received
 from photoplan.io.files import file_in
-from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.product import ProductFile
 from photoplan.io.store import ResultLog, TileLog, is_unfinished, scratch, together, write_atomically
 from photoplan.io.tables import split_line, write_table
+from photoplan.io.vector_layer import read_plan_tables
 from photoplan.report import page
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs links")

@@ -12,24 +12,13 @@ import numpy as np
 import pytest
 from pyproj import Proj, Transformer
 from scipy.spatial.transform import Rotation
-from tools.image_headers import (
-    ASCII,
-    MAIN,
-    OWN,
-    RATIONAL,
-    exif,
-    folder,
-    gps,
-    jpeg,
-    xmp,
-)
+from tools.image_headers import ASCII, MAIN, OWN, RATIONAL, exif, folder, gps, jpeg, xmp
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import topocentric_poses
 from photoplan.geometry.local import enu_poses
-from photoplan.io.image_metadata import read_image_metadata
-from photoplan.io.orientation.exif import read_folder, rotation_from_gimbal
-from photoplan.io.orientation.file import read_orientation, read_orientation_block
+from photoplan.io.formats import read_orientation, read_orientation_block
+from photoplan.io.image_metadata import read_folder, read_image_metadata, rotation_from_gimbal
 from photoplan.io.points import read_observed_positions
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from rasterio.transform import from_origin
 
 from photoplan.geometry.grid import Window
+from photoplan.io.raster import TerrainReader
 from photoplan.io.terrain import options as known_ranges
-from photoplan.io.terrain.reader import TerrainReader
 from photoplan.project.ground import open_terrain
 from photoplan.surfaces import raster as grid_ranges
 from photoplan.surfaces.base import Hits

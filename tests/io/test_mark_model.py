@@ -13,9 +13,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.errors import InputError
-from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.model import FilmEntry
-from photoplan.io.mark_model import Mark
+from photoplan.io.camera.model import FilmEntry, Mark
+from photoplan.io.formats import read_cameras
 from photoplan.io.project.file import camera_lines
 from photoplan.project.camera_marks import mark_pattern, mark_patterns
 

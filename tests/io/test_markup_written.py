@@ -95,8 +95,8 @@ WRITERS: dict[str, Callable[[Path], tuple[Path, list[str], list[str]]]] = {
     "products/view/content.py": svg,
     "io/product.py": stacked,
     "io/product.py: sheets": sheets,
-    "io/orientation/metashape.py": metashape,
-    "io/terrain/export.py": landxml,
+    "io/orientation/structure_from_motion.py": metashape,
+    "io/terrain/model_write.py": landxml,
 }
 
 

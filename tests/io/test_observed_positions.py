@@ -9,7 +9,7 @@ import pytest
 
 from photoplan.errors import InputError
 from photoplan.geometry.pose import rotation_from_angles
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.block import TableFormat
 from photoplan.io.points import read_observed_positions
 
 POSITIONS = "name,x,y,z\na.tif,1,2,3\nb.tif,4,5,6\n"

@@ -15,8 +15,8 @@ from tools.orientation_blocks import (
 )
 
 from photoplan.errors import InputError
-from photoplan.io.orientation.file import read_orientation, read_orientation_block, write_orientation
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.formats import read_orientation, read_orientation_block, write_orientation
+from photoplan.io.orientation.block import TableFormat
 
 FORMATS = {"bluh": "", "bingo": "ORIA "}
 #: What a user has to declare of each.

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tools.format_examples import assert_same, block_of, frame, pixels, round_trip
 
 from photoplan.errors import InputError
-from photoplan.io.orientation.file import orientation_format, read_orientation_block
+from photoplan.io.formats import orientation_format, read_orientation_block
 
 CAMERAS = """# Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]

@@ -8,9 +8,8 @@ from tools.orientation_blocks import CAMERA, CENTERS, GROUND, NAMES, block, our_
 
 from photoplan.errors import InputError
 from photoplan.io.camera.model import BrownLens, FilmEntry, FrameEntry
-from photoplan.io.orientation.block import without_lenses
-from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.formats import orientation_format, read_orientation_block, write_orientation
+from photoplan.io.orientation.block import TableFormat, without_lenses
 
 FROM_CAMERA = TableFormat(direction="camera-to-ground")
 TO_CAMERA = TableFormat(direction="ground-to-camera")

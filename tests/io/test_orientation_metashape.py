@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from tools.format_examples import assert_same, block_of, frame, pixels, round_trip, with_table
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.orientation.exif import rotation_from_gimbal
-from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
-from photoplan.io.orientation.metashape import read_cameras
+from photoplan.io.formats import orientation_format, read_orientation_block, write_orientation
+from photoplan.io.image_metadata import rotation_from_gimbal
+from photoplan.io.orientation.structure_from_motion import read_metashape_cameras
 
 LENS = {"f": 3705.5, "cx": 11.7, "cy": -27.7, "b1": 0.53, "b2": -0.31, "k1": -0.092, "k2": -0.076, "k3": 0.116}
 LENS |= {"k4": -0.076, "p1": -3.1e-4, "p2": 1.2e-4}
@@ -263,7 +263,7 @@ def test_losses_and_refusals_in_writing(tmp_path: Path) -> None:
 
 def test_cameras_alone(tmp_path: Path) -> None:
     (tmp_path / "cameras.xml").write_text(document(None))
-    camera: Any = read_cameras(tmp_path / "cameras.xml")["M3M (12.29mm)"]
+    camera: Any = read_metashape_cameras(tmp_path / "cameras.xml")["M3M (12.29mm)"]
     assert camera.pixels.focal == (3705.5, 3705.5)
     np.testing.assert_allclose(camera.pixels.point, (5279 / 2 + 11.7, 3955 / 2 - 27.7))
     assert (camera.lens.k4, camera.lens.b1) == (-0.076, 0.53 / 3705.5)
@@ -329,7 +329,7 @@ def test_equal_labels_are_told_apart(tmp_path: Path) -> None:
     block = read_orientation_block(path)
     assert [i.name for i in block.table.images] == ["100MEDIA/DJI_1", "101MEDIA/DJI_1"]
     assert [block.camera(i).lens.k1 for i in block.table.images] == [0.01, 0.02]
-    assert list(read_cameras(path)) == ["FC6310 (sensor 0)", "FC6310 (sensor 1)"]
+    assert list(read_metashape_cameras(path)) == ["FC6310 (sensor 0)", "FC6310 (sensor 1)"]
     # One sensor is used: its name is the same as in the file of cameras.
     path.write_text(labels())
     assert list(read_orientation_block(path).cameras) == ["FC6310 (sensor 0)"]

@@ -15,7 +15,7 @@ from tools.format_examples import assert_same, below, block_of, frame, pixels, r
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import topocentric_poses
-from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
+from photoplan.io.formats import orientation_format, read_orientation_block, write_orientation
 
 CAMERA = {"projection_type": "brown", "width": 2048, "height": 1536, "focal_x": 0.57, "focal_y": 0.571}
 CAMERA |= {"c_x": 0.003, "c_y": -0.002, "k1": -0.02, "k2": 0.01, "p1": 1e-3, "p2": -5e-4, "k3": 2e-3}

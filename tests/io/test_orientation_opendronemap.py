@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import topocentric_poses
-from photoplan.io.orientation.file import read_orientation, read_orientation_block, write_orientation
+from photoplan.io.formats import read_orientation, read_orientation_block, write_orientation
 
 ZONE = "EPSG:32616"
 UTM = Transformer.from_crs("EPSG:4326", ZONE, always_xy=True)

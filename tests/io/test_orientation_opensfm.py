@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
-from photoplan.io.orientation.file import read_orientation
+from photoplan.io.formats import read_orientation
 
 LLA = {"latitude": 46.84, "longitude": -91.99, "altitude": 150.0}
 

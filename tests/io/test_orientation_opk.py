@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tools.format_examples import assert_same, block_of, round_trip
 
 from photoplan.errors import InputError
-from photoplan.io.orientation.file import orientation_format, read_orientation_block
+from photoplan.io.formats import orientation_format, read_orientation_block
 
 HEADER = "# Cameras (2)\n# PhotoID, X, Y, Z, Omega, Phi, Kappa, r11, r12, r13, r21, r22, r23, r31, r32, r33\n"
 POSES = {
@@ -111,7 +111,7 @@ def test_round_trip(tmp_path: Path, crs: str | None) -> None:
 
 
 def test_the_written_matrix_takes_the_camera_to_the_ground(tmp_path: Path) -> None:
-    from photoplan.io.orientation.file import write_orientation
+    from photoplan.io.formats import write_orientation
 
     block = block_of({}, 1)
     write_orientation(block, tmp_path / "opk.txt", "opk")

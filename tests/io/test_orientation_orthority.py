@@ -16,8 +16,7 @@ import pytest
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.geometry.pose import Pose
-from photoplan.io.camera.file import read_cameras
-from photoplan.io.orientation.file import read_orientation
+from photoplan.io.formats import read_cameras, read_orientation
 from photoplan.io.project.model import Image, interior_of, lens_of
 
 EXTERIOR = "filename,x,y,z,omega,phi,kappa\nimg.tif,500003,5400007,1300,2.0,-3.0,30.0\n"

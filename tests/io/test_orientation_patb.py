@@ -8,13 +8,8 @@ import pytest
 from tools.orientation_blocks import CAMERA, block, our_pixels, pixels_of_matrix
 
 from photoplan.errors import InputError
-from photoplan.io.orientation.file import (
-    orientation_format,
-    read_orientation,
-    read_orientation_block,
-    write_orientation,
-)
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.formats import orientation_format, read_orientation, read_orientation_block, write_orientation
+from photoplan.io.orientation.block import TableFormat
 
 FROM_CAMERA = TableFormat(direction="camera-to-ground")
 TO_CAMERA = TableFormat(direction="ground-to-camera")

@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 from tools.format_examples import assert_same, block_of, frame, pixels, round_trip
 
 from photoplan.errors import InputError
-from photoplan.io.camera.file import read_cameras
+from photoplan.io.formats import orientation_format, read_cameras, read_orientation_block
 from photoplan.io.orientation.block import without_lenses
-from photoplan.io.orientation.file import orientation_format, read_orientation_block
 
 T, OPK, OFFSET = (332081.125, 3488911.75, 4093.5), (-2.9375, 3.0625, 119.8125), (331967.0, 3488533.0, 4096.0)
 F, C, SIZE = 7363.5185, (3686.3371875, 2439.0408125), (7360, 4912)

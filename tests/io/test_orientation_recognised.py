@@ -8,14 +8,8 @@ from pathlib import Path
 import pytest
 from tools.format_examples import assert_same, block_of, frame
 
-from photoplan.io.orientation.file import (
-    FORMATS,
-    choose_format,
-    orientation_format,
-    read_orientation_block,
-    write_orientation,
-)
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.formats import FORMATS, choose_format, orientation_format, read_orientation_block, write_orientation
+from photoplan.io.orientation.block import TableFormat
 
 
 @pytest.mark.parametrize("name", ["metashape", "opk", "pix4d", "opensfm", "odm", "colmap", "toml"])

@@ -5,10 +5,9 @@ import pytest
 from tools.orientation_blocks import CAMERA, block, our_pixels
 
 from photoplan.errors import InputError, UsageError
+from photoplan.io import formats as orientation_file
 from photoplan.io.camera.model import FilmEntry
-from photoplan.io.orientation import file as orientation_file
-from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, OrientationTable, OrientedImage
-from photoplan.io.orientation.file import (
+from photoplan.io.formats import (
     FORMATS,
     choose_format,
     orientation_format,
@@ -17,7 +16,13 @@ from photoplan.io.orientation.file import (
     write_orientation,
     written_formats,
 )
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.block import (
+    OrientationBlock,
+    OrientationFormat,
+    OrientationTable,
+    OrientedImage,
+    TableFormat,
+)
 
 MARKS = {str(k): xy for k, xy in enumerate([(-106.0, -106.0), (106.0, -106.0), (106.0, 106.0)])}
 

@@ -16,10 +16,10 @@ from tools.thinned import some
 
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.geometry.grid import MapGrid
+from photoplan.io.disk import BlockCoder, nodata_for
 from photoplan.io.product import ProductFacts, ProductFile
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import read_tiff_layouts
-from photoplan.io.storage import BlockCoder, nodata_for
 
 GRID = MapGrid(500_000.25, 5_200_000.5, 0.25, 600, 400, "EPSG:32633")
 PLACE = GRID.placement

@@ -12,8 +12,7 @@ import rasterio
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid
-from photoplan.io.product import ProductFile
-from photoplan.io.quicklook import write_overview, write_quicklook
+from photoplan.io.product import ProductFile, write_overview, write_quicklook
 
 
 def product(

@@ -16,7 +16,7 @@ from rasterio.enums import ColorInterp
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io import raster as raster_module
-from photoplan.io.gdal import close_handles, not_georeferenced
+from photoplan.io.disk import close_handles, not_georeferenced
 from photoplan.io.raster import DecodedPicture, RasterReader, decoded_picture, not_nodata
 from photoplan.io.raster_info import read_info
 

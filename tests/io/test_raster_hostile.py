@@ -18,9 +18,8 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io import raster as raster_pixels
 from photoplan.io.files import RasterLimits, check_plain_file
-from photoplan.io.raster import RasterReader
+from photoplan.io.raster import RasterReader, TerrainReader
 from photoplan.io.raster_info import read_info, read_tiff_layout
-from photoplan.io.terrain.reader import TerrainReader
 
 SIDE = 256
 ALL = Window(0, 0, SIDE, SIDE)

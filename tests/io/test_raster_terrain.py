@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.raster import BlockCache
-from photoplan.io.terrain.reader import TerrainReader
+from photoplan.io.raster import BlockCache, TerrainReader
 
 
 def grid(path: Path, heights: np.ndarray, **profile: Any) -> Path:

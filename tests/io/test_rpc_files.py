@@ -13,7 +13,7 @@ from tools.rpc_images import functions
 
 from photoplan.cameras.rpc import RationalFunctions
 from photoplan.errors import InputError
-from photoplan.io.camera.rpc import is_rpc, read_rpc, rpc_beside, rpc_in
+from photoplan.io.camera.satellite import is_rpc, read_rpc, rpc_beside, rpc_in
 from photoplan.io.raster_info import read_info
 from photoplan.products.describe import describe
 

@@ -16,7 +16,7 @@ from tools.small_block import write_image
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, crs_step, split_compound
 from photoplan.geometry.units import metric_system
-from photoplan.io.orientation.file import read_orientation
+from photoplan.io.formats import read_orientation
 from photoplan.io.points import read_gcp_list
 from photoplan.io.project.file import load_project
 from photoplan.io.terrain.files import read_measured

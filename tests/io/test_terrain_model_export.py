@@ -13,8 +13,8 @@ from tools.thinned import some
 
 from photoplan.errors import UsageError
 from photoplan.geometry.crs import canonical_crs, same_crs
-from photoplan.io.terrain.export import mesh_parts, replacing, write_points, write_tin
 from photoplan.io.terrain.files import read_measured
+from photoplan.io.terrain.model_write import mesh_parts, replacing, write_points, write_tin
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.mesh import build_faces
@@ -174,7 +174,7 @@ def test_points_are_each_post_once_and_the_lines(model: MemoryUnits, tmp_path: P
 
 def test_memory_is_that_of_two_rows_of_units() -> None:
     """A hundred rows of units: the table of shared vertices never holds more than two rows' edges."""
-    from photoplan.io.terrain import export as module
+    from photoplan.io.terrain import model_write as module
 
     layout = UnitLayout(0.0, 0.0, 8.0, 3, 100)
     source = MemoryUnits(layout, {(c, r): grid_unit(layout, c, r, 4) for c in range(3) for r in range(100)})

@@ -18,12 +18,12 @@ from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.grid import Window
 from photoplan.geometry.heights import check_height_system
 from photoplan.geometry.units import agreed_metres, known_metres, metric_heights, metric_system
-from photoplan.io.orientation.file import read_orientation
+from photoplan.io.formats import read_orientation
 from photoplan.io.points import read_gcp_list, read_ground_points, read_observed_positions
 from photoplan.io.project.file import load_project
+from photoplan.io.raster import TerrainReader
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import ReadOptions
-from photoplan.io.terrain.reader import TerrainReader
 from photoplan.io.vector_layer import read_features
 from photoplan.products.init import InitRequest, init_project
 from photoplan.project.ground import open_terrain

@@ -7,8 +7,8 @@ import pytest
 
 from photoplan.kernels import facet_transfer, facets
 from photoplan.kernels.jit import COMPILED
-from photoplan.matching.facets.grey import shares
-from photoplan.matching.facets.means import means_around
+from photoplan.matching.facets.block import shares
+from photoplan.matching.facets.observe import means_around
 
 
 def carried(low, high, posts, out, wall=np.inf) -> None:

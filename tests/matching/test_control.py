@@ -12,12 +12,12 @@ from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import NoLens
 from photoplan.geometry.pose import Pose, rotation_opk
-from photoplan.matching.control import (
+from photoplan.matching.register import (
     FoundPatch,
     OrthoPatch,
     agree,
     best_place,
-    correlate,
+    correlation_scores,
     find_patch,
     ground_covariances,
 )
@@ -33,7 +33,7 @@ def test_correlation_is_that_of_the_common_cells() -> None:
     patch, picture = rng.normal(size=(9, 9)), rng.normal(size=(16, 16))
     patch[rng.random((9, 9)) < 0.2] = np.nan
     picture[rng.random((16, 16)) < 0.1] = np.nan
-    found = correlate(patch, picture)
+    found = correlation_scores(patch, picture)
     for row, col in ((0, 0), (3, 5), (7, 7)):
         part = picture[row : row + 9, col : col + 9]
         both = np.isfinite(patch) & np.isfinite(part)
@@ -43,7 +43,7 @@ def test_correlation_is_that_of_the_common_cells() -> None:
 def test_correlation_of_cells_with_little_in_common_does_not_count() -> None:
     patch, picture = texture(9), texture(20)
     picture[:, :12] = np.nan
-    found = correlate(patch, picture)
+    found = correlation_scores(patch, picture)
     assert (found[:, :7] == -1).all() and (found[:, -1] > -1).all()
 
 

@@ -8,9 +8,15 @@ from tools.thinned import some
 
 from photoplan.geometry.grid import Window
 from photoplan.kernels.facets import add_curvatures, solve_heights, variances
-from photoplan.matching.facets.means import away_from_border
-from photoplan.matching.facets.observe import Roughness, Smoother, curvatures
-from photoplan.matching.facets.pyramid import FILTERS, Pyramid, halved
+from photoplan.matching.facets.observe import (
+    FILTERS,
+    Pyramid,
+    Roughness,
+    Smoother,
+    away_from_border,
+    curvatures,
+    halved,
+)
 from photoplan.matching.facets.reconstruct import facets_of
 
 

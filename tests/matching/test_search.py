@@ -10,10 +10,9 @@ from matching.test_facets import Pixels
 
 from photoplan.cameras.base import Vantage
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.matching.facets.judged import edge_variances, misfit_variances
-from photoplan.matching.facets.observe import View
-from photoplan.matching.facets.pyramid import Pyramid
-from photoplan.matching.facets.search import Planes, Search, search
+from photoplan.matching.facets.block import edge_variances, misfit_variances
+from photoplan.matching.facets.observe import Pyramid, View
+from photoplan.matching.facets.reconstruct import Planes, Search, search
 
 SIDE, TALL = 200, 30.0
 BLOCK = (slice(60, 120), slice(70, 140))

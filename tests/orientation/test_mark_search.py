@@ -13,7 +13,7 @@ from tools.thinned import some, thinned
 from photoplan.cameras.fiducials import MarkPart, MarkPattern
 from photoplan.errors import InputError
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
-from photoplan.orientation.marks.layout import TURNS, FiducialResult, MarkLayout, MarksNotFound, fit_placement
+from photoplan.orientation.marks.locate import TURNS, FiducialResult, MarkLayout, MarksNotFound, fit_placement
 
 PATTERN = ring_cross_pattern()
 LAYOUT = MarkLayout.of(CORNERS, dict.fromkeys(CORNERS, PATTERN))

@@ -15,8 +15,8 @@ from photoplan.cameras.lenses import Brown, NoLens
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import ANGLE_UNITS, ROTATION_ORDERS, Pose, angles_from_rotation, rotation_from_angles
-from photoplan.io.orientation.file import read_orientation
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.formats import read_orientation
+from photoplan.io.orientation.block import TableFormat
 from photoplan.io.points import read_ground_points, read_image_points
 from photoplan.orientation.conventions import (
     CAMERA_AXES,

@@ -20,9 +20,8 @@ from photoplan.cameras.base import project
 from photoplan.cameras.rpc import RationalFunctions, RpcCamera, fit_rpc
 from photoplan.geometry.crs import crs_step, nearest_turn, topocentric_poses, turn_of
 from photoplan.geometry.local import GeodeticGround, geocentric_of_geodetic, geocentric_poses, map_poses
-from photoplan.io.image_metadata import ImageMetadata
+from photoplan.io.image_metadata import ImageMetadata, map_positions
 from photoplan.io.orientation.block import OrientationTable, OrientedImage
-from photoplan.io.orientation.exif import map_positions
 from photoplan.products.init import placed
 from photoplan.project.ground import open_terrain
 

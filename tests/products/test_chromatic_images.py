@@ -24,7 +24,7 @@ from photoplan.project.align import AlignStep
 from photoplan.project.steps import SteppedReader
 from photoplan.quality.colour import BandModel, ChromaticModel
 from photoplan.quality.formation.model import ImageModel
-from photoplan.quality.formation.parts import Gain, Lateral, Quantisation, Spread
+from photoplan.quality.formation.optics import Gain, Lateral, Quantisation, Spread
 from photoplan.quality.formation.scenes import PatternScene
 
 LATERAL = (Lateral(1, (0.6, -0.4), 0.004, 0.0), Lateral(3, (-0.5, 0.2), -0.003, 0.0))

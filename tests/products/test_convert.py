@@ -10,8 +10,8 @@ from tools.orientation_blocks import ANGLES, CAMERA, CENTERS, GROUND, NAMES, blo
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.pose import angles_from_rotation, rotation_from_angles
 from photoplan.io.camera.model import FilmEntry
-from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation_block, write_orientation
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.formats import FORMATS, orientation_format, read_orientation_block, write_orientation
+from photoplan.io.orientation.block import TableFormat
 from photoplan.orientation.conventions import Reading
 from photoplan.plain import json_text, plain
 from photoplan.products.convert import ConvertRequest, convert_orientation, list_readings

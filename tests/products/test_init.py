@@ -21,7 +21,7 @@ from photoplan.errors import HeightSystemError, InputError, PhotoplanError, Usag
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.pose import rotation_opk
 from photoplan.io.camera.model import FilmEntry, FrameEntry
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.block import TableFormat
 from photoplan.io.project.file import load_project
 from photoplan.products.init import InitRequest, init_project, make_project
 

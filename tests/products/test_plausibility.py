@@ -13,11 +13,10 @@ import pytest
 from tools.thinned import some
 
 from photoplan.geometry.pose import angles_from_rotation, rotation_from_angles, rotation_opk
-from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.model import FrameEntry
-from photoplan.io.orientation.file import read_orientation
+from photoplan.io.formats import read_cameras, read_orientation
 from photoplan.io.project.model import Image, Orientation
-from photoplan.io.terrain.reader import TerrainReader
+from photoplan.io.raster import TerrainReader
 from photoplan.orientation.conventions import (
     DECLARED,
     Heights,

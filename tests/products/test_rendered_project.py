@@ -29,7 +29,7 @@ from photoplan.cameras.base import project
 from photoplan.io.project.file import load_project
 from photoplan.io.vector_layer import VectorLayer, write_geopackage
 from photoplan.project.rendered import DrapedTexture, ProjectScene
-from photoplan.quality.formation.rendered import RenderedScene, SolidTexture
+from photoplan.quality.formation.scenes import RenderedScene, SolidTexture
 from photoplan.surfaces.base import Hits, LevelSurface
 from photoplan.surfaces.objects import ObjectSurface
 

@@ -17,8 +17,7 @@ from photoplan.io.quality_files import FallOffEntry, TermEntry, fall_off_text
 from photoplan.products.characterise.fall_off import correction_text
 from photoplan.products.restore import RestoreReport, RestoreRequest, plan_restoration, restore_images
 from photoplan.project.steps import restoration_of
-from photoplan.quality.camera.fall_off import FallOffSettings, fit_fall_off
-from photoplan.quality.camera.fall_off_model import FallOffModel
+from photoplan.quality.camera.fall_off import FallOffModel, FallOffSettings, fit_fall_off
 from photoplan.quality.colour import BandModel, ChromaticModel
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter

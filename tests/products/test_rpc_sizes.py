@@ -15,7 +15,7 @@ from tools.rpc_files import as_text, tagged
 from tools.rpc_images import functions
 
 from photoplan.cameras.rpc import RationalFunctions
-from photoplan.io.camera.rpc import read_rpc, rpc_in
+from photoplan.io.camera.satellite import read_rpc, rpc_in
 from photoplan.products.describe import describe
 
 FULL = (600, 400)

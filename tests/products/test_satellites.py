@@ -20,7 +20,7 @@ from tools.rpc_images import CRS, camera, functions
 from photoplan.cameras.rpc import RationalFunctions, RpcCamera
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
-from photoplan.io.camera.rpc import read_rpc
+from photoplan.io.camera.satellite import read_rpc
 from photoplan.io.project.file import load_project
 from photoplan.io.vector_layer import VectorLayer, write_geopackage
 from photoplan.plan.anchors import AnchorRule, compile_anchors

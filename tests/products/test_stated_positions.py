@@ -13,8 +13,8 @@ from tools.small_block import BASE, CRS, NAMES, X0, Y0, Z0, Block, make_project
 from tools.stated_position import state_position
 
 from photoplan.errors import GeometryError
-from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.metashape import read as read_metashape
+from photoplan.io.orientation.block import TableFormat
+from photoplan.io.orientation.structure_from_motion import read_metashape
 from photoplan.io.project.file import load_project
 from photoplan.products.check import check_project
 from photoplan.products.convert import ConvertRequest, convert_orientation

@@ -17,7 +17,7 @@ from photoplan.cameras.base import project
 from photoplan.cameras.correctable import TrackPriors
 from photoplan.cameras.line_correction import PoseErrors, displaced, map_axes
 from photoplan.cameras.pushbroom import LineCamera
-from photoplan.io.camera.line_correction import read_pose_errors
+from photoplan.io.camera.line import read_pose_errors
 from photoplan.io.project.file import load_project
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.model import AdjustSettings

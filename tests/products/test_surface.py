@@ -37,7 +37,7 @@ from photoplan.products.surface.plan import (
 )
 from photoplan.products.surface.run import findings
 from photoplan.project.scene import ScenesAddress
-from photoplan.report import surface as report
+from photoplan.report import maps as report
 from photoplan.requests.surface import SurfaceSettings
 
 CLOUDS = (".las", ".laz", ".ply")

@@ -18,8 +18,7 @@ from photoplan.cameras.framed import FramedCamera
 from photoplan.geometry.frames import CylinderFrame
 from photoplan.geometry.pose import angles_from_rotation
 from photoplan.io.project.file import load_project
-from photoplan.matching.facets.observe import Facets, Relief, View, look
-from photoplan.matching.facets.pyramid import Pyramid
+from photoplan.matching.facets.observe import Facets, Pyramid, Relief, View, look
 from photoplan.project.cameras import central_without_pixels
 
 SIZE, FOCAL, AXIS, RADIUS, U = 110, 300.0, (X0, Y0, 100.0), 5.0, 2.0

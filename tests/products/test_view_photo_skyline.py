@@ -13,10 +13,10 @@ from scipy.ndimage import gaussian_filter
 from tools.command import inside
 
 from photoplan.errors import GeometryError
-from photoplan.io.orientation.form import TableFormat
-from photoplan.io.orientation.toml import read as read_toml_orientation
-from photoplan.io.quicklook import write_png
-from photoplan.orientation.skyline import fit_skyline
+from photoplan.io.orientation.block import TableFormat
+from photoplan.io.orientation.text import _read_toml as read_toml_orientation
+from photoplan.io.product import write_png
+from photoplan.orientation.intersection import fit_skyline
 from photoplan.products.init import InitRequest, init_project
 from photoplan.products.view.camera import open_view_ground, view_camera
 from photoplan.products.view.make import seen_surface

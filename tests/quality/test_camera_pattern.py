@@ -8,7 +8,8 @@ from scipy import ndimage
 from tools.camera_model import Sensor, gathered
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.dark_signal import (
+from photoplan.quality.camera.drift import find_blooming
+from photoplan.quality.camera.sensor import (
     LINE_SHARE,
     WHITE_SHARE,
     background,
@@ -22,7 +23,6 @@ from photoplan.quality.camera.dark_signal import (
     signed_root,
     spectrogram,
 )
-from photoplan.quality.camera.drift import find_blooming
 
 RUNS = 150
 

@@ -8,9 +8,9 @@ from tools.camera_model import Sensor, gathered
 from tools.thinned import thinned
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.dark_signal import Level, dark_current, doubling_temperature
+from photoplan.quality.camera.geometry import fit_line, grey_wedge
 from photoplan.quality.camera.photon_transfer import EmvaPoints, emva_sheet, find_saturation, linearity, photon_transfer
-from photoplan.quality.camera.straight_lines import fit_line, grey_wedge
+from photoplan.quality.camera.sensor import Level, dark_current, doubling_temperature
 
 #: Small images for the many runs that a standard deviation of standard deviations needs.
 SMALL = Sensor(shape=(24, 30))

@@ -9,10 +9,10 @@ import pytest
 from tools.formed import form_image, form_series
 
 from photoplan.quality.camera.fall_off import FallOffSettings, fit_fall_off
-from photoplan.quality.camera.straight_lines import correlate_edge, fit_edge
+from photoplan.quality.camera.geometry import correlate_edge, fit_edge
 from photoplan.quality.camera.video import gain_control, line_jitter
 from photoplan.quality.formation.model import ImageModel
-from photoplan.quality.formation.parts import (
+from photoplan.quality.formation.optics import (
     AutomaticGain,
     Exposure,
     Falloff,

@@ -18,7 +18,7 @@ from photoplan.quality.colour import (
 )
 from photoplan.quality.edges.find import EdgePicture, find_edges
 from photoplan.quality.formation.model import ImageModel
-from photoplan.quality.formation.parts import Falloff, Gain, Lateral, Quantisation, Spread
+from photoplan.quality.formation.optics import Falloff, Gain, Lateral, Quantisation, Spread
 from photoplan.quality.formation.scenes import PatternScene
 
 LATERAL = (Lateral(1, (0.3, -0.2), 0.002, 0.001), Lateral(3, (-0.15, 0.05), -0.001, 0.0))

@@ -9,8 +9,14 @@ from tools.thinned import some, thinned
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.grid import Window
-from photoplan.quality.camera.fall_off import FallOffSettings, fit_fall_off
-from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off, gain_image, surface_terms
+from photoplan.quality.camera.fall_off import (
+    FallOffModel,
+    FallOffSettings,
+    correct_fall_off,
+    fit_fall_off,
+    gain_image,
+    surface_terms,
+)
 
 SIZE, POINT, FOCAL = (320, 240), (165.0, 118.0), 350.0
 TERMS = ((2, 0), (4, 0), (1, 1), (2, 2))

@@ -10,9 +10,9 @@ from tools.camera_series import edge_lines
 from tools.thinned import thinned
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.straight_lines import correlate_edge, fit_edge
+from photoplan.quality.camera.geometry import correlate_edge, fit_edge
+from photoplan.quality.camera.sensor import jitter_grey, jitter_pixels
 from photoplan.quality.camera.video import Harmonic, Waves, above_control, compare_edges, line_jitter, spectrum
-from photoplan.quality.sensor import jitter_grey, jitter_pixels
 
 LINES = np.arange(400.0)
 

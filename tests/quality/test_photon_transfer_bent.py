@@ -7,8 +7,8 @@ import pytest
 from tools.camera_model import Sensor, gathered
 from tools.thinned import some, thinned
 
-from photoplan.quality.camera.dark_signal import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
+from photoplan.quality.camera.sensor import Level
 
 PHOTONS = tuple(np.linspace(600, 16000, 16))
 

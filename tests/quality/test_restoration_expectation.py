@@ -34,7 +34,7 @@ from photoplan.quality.restoration.design import (
     kept_by_compression,
     sharpest,
 )
-from photoplan.quality.restoration.scene import SceneStatistics, block_spectra, fit_scene, scenes_of
+from photoplan.quality.restoration.restorer import SceneStatistics, block_spectra, fit_scene, scenes_of
 
 SCENE = SceneStatistics(2.0, 12.0, 2.6)
 INSIDE = np.s_[16:-16, 16:-16]

@@ -11,7 +11,7 @@ from tools.thinned import some
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import SpreadFunction
 from photoplan.quality.restoration.design import DesignOptions, Sharpness, curve_transfer, design_filter
-from photoplan.quality.restoration.scene import SceneStatistics, block_spectra, fit_scene
+from photoplan.quality.restoration.restorer import SceneStatistics, block_spectra, fit_scene
 
 INSIDE = np.s_[24:-24, 24:-24]
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality import sensor
-from photoplan.quality.sensor import NoiseBudget, VideoNorm
+from photoplan.quality.camera import sensor
+from photoplan.quality.camera.sensor import NoiseBudget, VideoNorm
 
 CCIR = VideoNorm(625, 64e-6, 12e-6, 25 * 64e-6 + 12e-6, 4 / 3, 0.67)
 

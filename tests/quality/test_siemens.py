@@ -11,8 +11,7 @@ from tools.thinned import some, thinned
 
 from photoplan.errors import InputError
 from photoplan.quality.edges.response import measure_edge
-from photoplan.quality.patterns.bars import clipped_pixels
-from photoplan.quality.patterns.siemens import StarRules, measure_star
+from photoplan.quality.patterns.bars import StarRules, clipped_pixels, measure_star
 
 TURN = np.linspace(0.0, pi, 180, endpoint=False)
 

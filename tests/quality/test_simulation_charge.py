@@ -5,8 +5,8 @@ import pytest
 from tools.formed import form_image, form_series
 
 from photoplan.errors import InputError
-from photoplan.quality.formation.model import ImageModel
-from photoplan.quality.formation.parts import (
+from photoplan.quality.formation.model import ImageModel, overflow
+from photoplan.quality.formation.optics import (
     AutomaticGain,
     DarkCurrentPart,
     DefectPart,
@@ -21,7 +21,6 @@ from photoplan.quality.formation.parts import (
     Well,
 )
 from photoplan.quality.formation.scenes import PatternScene
-from photoplan.quality.formation.sensor import overflow
 
 FLAT = np.ones((400, 500))
 

@@ -10,9 +10,8 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.products.simulate import check_fit
 from photoplan.quality.formation import optics
-from photoplan.quality.formation.kernels import pixel_kernel
 from photoplan.quality.formation.model import ImageModel, model_modulation, model_mtf50, model_transfer
-from photoplan.quality.formation.parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
+from photoplan.quality.formation.optics import Aperture, Falloff, Lateral, LineJitterPart, Spread, pixel_kernel
 from photoplan.quality.formation.scenes import PatternScene, parse_pattern
 from photoplan.quality.mtf_curve import GAUSSIAN_WIDTH
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.camera.stage import b4_lines, stage_calibration
+from photoplan.quality.camera.geometry import b4_lines, stage_calibration
 
 #: DX, DY (µm), column, row, printed residuals; point 1 with its sign, which the print has lost.
 TABLE = {

@@ -16,7 +16,7 @@ from photoplan.cameras.base import project
 from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.rpc import RpcCamera, fitted_functions
 from photoplan.geometry.local import GeodeticGround
-from photoplan.io.camera.rpc import read_rpc
+from photoplan.io.camera.satellite import read_rpc
 
 
 def test_pleiades_polynomials_are_those_of_its_location_grid(shared: Path) -> None:

@@ -20,7 +20,7 @@ from tools.thinned import some
 
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.geometry.grid import Window
-from photoplan.io.mark_model import Mark
+from photoplan.io.camera.model import Mark
 from photoplan.orientation.marks.single import AloneMark, find_mark
 from photoplan.project.camera_marks import ScanImage, mark_pattern
 

@@ -35,15 +35,12 @@ from tools.small_model import write_small
 from photoplan.codec import NotData, decode, encode
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.camera.csm import read_frame
-from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.line import read_line
-from photoplan.io.camera.rpc import read_rpc
+from photoplan.io.camera.satellite import read_frame, read_rpc
+from photoplan.io.formats import read_cameras, read_orientation_block, write_orientation
 from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.objects import read_objects
-from photoplan.io.orientation.file import read_orientation_block, write_orientation
-from photoplan.io.orientation.form import TableFormat
-from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
+from photoplan.io.orientation.block import TableFormat
 from photoplan.io.points import read_gcp_list, read_ground_points, read_image_points, read_observed_positions
 from photoplan.io.project.file import load_project
 from photoplan.io.quality_files import (
@@ -59,7 +56,15 @@ from photoplan.io.store import ResultLog, TileLog
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.model import ModelReader
 from photoplan.io.terrain.options import ReadOptions, read_code_table
-from photoplan.io.vector_layer import read_drawn_features, read_features, read_regions, write_features
+from photoplan.io.vector_layer import (
+    PlanTables,
+    read_drawn_features,
+    read_features,
+    read_plan_tables,
+    read_regions,
+    write_features,
+    write_plan_tables,
+)
 from photoplan.products.describe import describe
 from photoplan.project.ground import open_terrain
 

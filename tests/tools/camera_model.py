@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from photoplan.quality.camera.dark_signal import FrameStack, StackSums
+from photoplan.quality.camera.sensor import FrameStack, StackSums
 
 __all__ = ["Sensor", "gathered", "write_frame"]
 

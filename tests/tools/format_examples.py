@@ -14,9 +14,8 @@ from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.frame import FrameCamera
 from photoplan.geometry.pose import Pose
 from photoplan.io.camera.model import BrownLens, FrameEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
-from photoplan.io.orientation.block import OrientationBlock, OrientationTable, OrientedImage
-from photoplan.io.orientation.file import read_orientation_block, write_orientation
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.formats import read_orientation_block, write_orientation
+from photoplan.io.orientation.block import OrientationBlock, OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project.model import Image, interior_of, lens_of
 
 LENSES: dict[str, Any] = {

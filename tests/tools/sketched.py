@@ -41,12 +41,12 @@ def drawn() -> Iterator[None]:
 def begin(item: pytest.Item) -> None:
     """What this test gets, its fixtures included."""
     global _wanted
-    from photoplan.report import drawing
+    from photoplan.report import page
 
     _wanted = item.get_closest_marker("drawn") is None
-    if drawing.load_matplotlib is not _load:
-        _load.real = drawing.load_matplotlib  # type: ignore[attr-defined]
-        drawing.load_matplotlib = _load
+    if page.load_matplotlib is not _load:
+        _load.real = page.load_matplotlib  # type: ignore[attr-defined]
+        page.load_matplotlib = _load
 
 
 def _load(what: str, otherwise: str = "") -> Any:

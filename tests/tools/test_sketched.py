@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from photoplan.report.drawing import figure_of, png
+from photoplan.report.page import figure_of, png
 from tools.sketched import BLANK, drawn
 
 pytest.importorskip("matplotlib")

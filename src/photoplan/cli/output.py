@@ -84,7 +84,7 @@ def talking(quiet: bool) -> Callable[[str], None]:
 
 def can_draw(wanted: bool, talk: Callable[[str], None], what: str = "picture") -> bool:
     """Return whether what is wanted can be drawn; `talk` says how, where matplotlib is missing."""
-    from photoplan.report.drawing import has_matplotlib
+    from photoplan.report.page import has_matplotlib
 
     if wanted and not has_matplotlib():
         talk(f"no {what}: it needs matplotlib (pip install 'photoplan[report]')")

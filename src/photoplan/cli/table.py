@@ -58,7 +58,7 @@ _PROJECT: dict[str, Verb] = {
         """,
         "requests.project:BudgetRequest",
         "products.budget:budget_or_tables",
-        {"picture": "report.budget:draw_picture"},
+        {"picture": "report.products:draw_picture"},
     ),
     "info": Verb(
         "Show the content of a raster, project, plan or run record.",
@@ -77,7 +77,7 @@ _PROJECT: dict[str, Verb] = {
         """,
         "requests.project:ReportRequest",
         "products.report:report_project",
-        {"report": "report.project:project_page"},
+        {"report": "report.products:project_page"},
     ),
     "schema": Verb(
         "Print the options of a command as JSON Schema.",
@@ -111,7 +111,7 @@ _ORIENT: dict[str, Verb] = {
         """,
         "requests.orient:FiducialsRequest",
         "products.film:locate_fiducials",
-        {"pictures/": "report.fiducials:draw_marks"},
+        {"pictures/": "report.orientation:draw_marks"},
     ),
     "interior": Verb(
         "Compute the interior orientation of film scans.",
@@ -122,7 +122,7 @@ _ORIENT: dict[str, Verb] = {
         """,
         "requests.orient:InteriorRequest",
         "products.film:interior_orientations",
-        {"report": "report.interior:interior_page", "plot": "report.interior:interior_plot"},
+        {"report": "report.orientation:interior_page", "plot": "report.orientation:interior_plot"},
         record="interior",
     ),
     "tie": Verb(
@@ -134,7 +134,7 @@ _ORIENT: dict[str, Verb] = {
         """,
         "requests.orient:TieRequest",
         "products.tie:find_ties",
-        {"picture": "report.tie:draw_ties"},
+        {"picture": "report.orientation:draw_ties"},
     ),
     "control": Verb(
         "Propose control points from an orthophoto and heights.",
@@ -156,7 +156,7 @@ _ORIENT: dict[str, Verb] = {
         """,
         "requests.orient:ResectRequest",
         "products.film:resect_project",
-        {"report": "report.resect:resect_page"},
+        {"report": "report.orientation:resect_page"},
     ),
     "adjust": Verb(
         "Adjust a block of images (bundle adjustment).",
@@ -219,7 +219,7 @@ _ORTHO: dict[str, Verb] = {
         """,
         "requests.ortho:BalanceRequest",
         "products.balance:balance_project",
-        {"picture": "report.radiometry:draw_balance"},
+        {"picture": "report.restore:draw_balance"},
     ),
     "seams": Verb(
         "Find where images of a mosaic are best joined.",
@@ -241,7 +241,7 @@ _ORTHO: dict[str, Verb] = {
         """,
         "requests.ortho:IlluminationRequest",
         "products.illumination:correct_illumination",
-        {"preview": "report.radiometry:draw_light"},
+        {"preview": "report.restore:draw_light"},
     ),
     "run": Verb(
         "Execute a plan written by `ortho --plan`.",
@@ -389,7 +389,7 @@ _VIEW: dict[str, Verb] = {
         The same command continues a run that was interrupted.
         """,
         "requests.view:ViewRequest",
-        "report.views:labelled_picture",
+        "report.products:labelled_picture",
     ),
     "sequence": Verb(
         "Render views along a path, and a film of them.",
@@ -399,7 +399,7 @@ _VIEW: dict[str, Verb] = {
         The same command continues a run that was interrupted; renderings that exist already are kept.
         """,
         "requests.view:SequenceRequest",
-        "report.views:labelled_sequence",
+        "report.products:labelled_sequence",
     ),
     "matrix": Verb(
         "Compute the ground of every pixel as a raster.",
@@ -458,7 +458,7 @@ _MEASURE: dict[str, Verb] = {
         """,
         "requests.measure:RegisterRequest",
         "products.register:register",
-        {"picture": "report.register:draw_vectors"},
+        {"picture": "report.orientation:draw_vectors"},
     ),
 }
 
@@ -473,7 +473,7 @@ _QUALITY: dict[str, Verb] = {
         """,
         "requests.quality:MtfRequest",
         "products.mtf.patterns:measure_mtf",
-        {"report": "report.mtf:mtf_page"},
+        {"report": "report.camera:mtf_page"},
         record="mtf",
         figures_first=True,
     ),
@@ -539,7 +539,7 @@ _ALONE: dict[str, Verb] = {
         """,
         "requests.surface:SurfaceRequest",
         "products.surface.run:surface_project",
-        {"report": "report.surface:surface_page"},
+        {"report": "report.maps:surface_page"},
         each="report.maps:surface_drawn",
     ),
     "demo": Verb(

@@ -271,8 +271,7 @@ def _drawn_keys(verb: Verb, request: Any, made: list[Path], files: list[Path]) -
 
 def _opened(path: Path, key: str, request: Any) -> ReportFile | None:
     """Return a picture, a report or a folder of pictures that can be written; its place is checked before any work."""
-    from photoplan.report.drawing import load_matplotlib
-    from photoplan.report.page import ReportFile, open_picture, open_report
+    from photoplan.report.page import ReportFile, load_matplotlib, open_picture, open_report
 
     if key.endswith("/"):
         load_matplotlib("a picture", "leave the pictures out")

@@ -916,7 +916,7 @@ def _refuse_deep(root: Element, where: str) -> None:
     raise InputError(f"{where}: nested deeper than {MAX_DEPTH} levels; this is no file of this kind")
 
 
-def numbers(element: Element | None, where: str, count: int) -> tuple[float, ...]:
+def element_numbers(element: Element | None, where: str, count: int) -> tuple[float, ...]:
     """The `count` numbers that an element holds as text."""
     words = (element.text or "").split() if element is not None else []
     try:

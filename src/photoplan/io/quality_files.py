@@ -16,8 +16,8 @@ from pydantic import Field, Strict, model_validator
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import Entry, Name, NotNegative, Number, Pair, Pixels, Positive
+from photoplan.io.disk import gdal_settings, open_raster
 from photoplan.io.files import finite, read_entries, read_head, read_text, read_toml
-from photoplan.io.gdal import gdal_settings, open_raster
 from photoplan.io.product import DESCRIPTION
 from photoplan.io.project.file import toml_key, toml_value
 from photoplan.io.raster import read_pixels

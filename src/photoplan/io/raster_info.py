@@ -19,6 +19,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label, same_crs, split_compound
 from photoplan.geometry.grid import Placement
 from photoplan.geometry.units import known_metres, metric_heights
+from photoplan.io.disk import GDAL_ERRORS, first_cause, gdal_settings, open_raster, warnings_of_gdal
 from photoplan.io.files import (
     IMAGE_LIMITS,
     RasterLimits,
@@ -28,7 +29,6 @@ from photoplan.io.files import (
     crs_beside,
     raster_driver,
 )
-from photoplan.io.gdal import GDAL_ERRORS, first_cause, gdal_settings, open_raster, warnings_of_gdal
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _CODES = {1: "u1", 3: "u2", 4: "u4", 13: "u4", 16: "u8", 18: "u8"}

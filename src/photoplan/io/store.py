@@ -40,12 +40,18 @@ from photoplan.codec import NotData, decode, encode
 from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.disk import (
+    GDAL_ERRORS,
+    BlockCoder,
     FileLock,
     cache_folder,
     disk_error,
+    first_cause,
     free_megabytes,
+    gdal_settings,
     lock_of,
+    not_georeferenced,
     open_own,
+    open_raster,
     own_secret,
     read_own,
     refuse_outward,
@@ -54,8 +60,6 @@ from photoplan.io.disk import (
     write_all,
 )
 from photoplan.io.files import fingerprint, stated_path, stated_text
-from photoplan.io.gdal import GDAL_ERRORS, first_cause, gdal_settings, not_georeferenced, open_raster
-from photoplan.io.storage import BlockCoder
 from photoplan.plain import HasJsonFields, json_text, pick
 from photoplan.request import Request
 

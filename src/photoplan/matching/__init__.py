@@ -11,8 +11,9 @@ __getattr__, __dir__, __all__ = public(
             "thin_tracks"
         ),
         "matching.refine": "RefineSettings Refined match_between refine_tracks",
-        "matching.control": "find_patch",
-        "matching.register": "PatchDisplacements PatchSettings PixelTransfer match_grid SmoothModel fit_smooth",
+        "matching.register": (
+            "find_patch PatchDisplacements PatchSettings PixelTransfer match_grid SmoothModel fit_smooth"
+        ),
         "matching.facets.block": "FacetBlock",
         "matching.facets.reconstruct": "Scheme reconstruct",
     },

@@ -24,8 +24,7 @@ from photoplan.geometry.crs import crs_step, same_crs
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import lock_of, make_folder, make_parents
 from photoplan.io.product import check_output
-from photoplan.io.project.edit import ProjectChanges, edit_project
-from photoplan.io.project.file import load_project
+from photoplan.io.project.file import ProjectChanges, edit_project, load_project
 from photoplan.io.project.model import Project
 from photoplan.io.quality_files import BalanceBand, write_balance_file
 from photoplan.io.raster import RasterReader
@@ -42,15 +41,7 @@ from photoplan.products.orthophoto.shown import shown
 from photoplan.products.plausibility import one_colour_told
 from photoplan.products.run import BASE_MEMORY, question, refuse_inputs
 from photoplan.project.cameras import is_there
-from photoplan.project.scene import (
-    Attempts,
-    Scene,
-    SceneAddress,
-    input_files,
-    map_order,
-    open_scene,
-    refuse_unusable,
-)
+from photoplan.project.scene import Attempts, Scene, SceneAddress, input_files, map_order, open_scene, refuse_unusable
 from photoplan.radiometry.balance import Balanced, Pairs, balanced, even_images, pairs_of
 from photoplan.radiometry.equations import BLOCK, SIDE, Cells, cells_of
 from photoplan.requests.ortho import BalanceRequest

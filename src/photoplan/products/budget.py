@@ -18,7 +18,7 @@ from photoplan.events import SILENT, Events
 from photoplan.findings import Result, noted
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.local import GeodeticGround
-from photoplan.io.camera.rpc import rpc_text
+from photoplan.io.camera.satellite import rpc_text
 from photoplan.io.disk import make_parents
 from photoplan.io.files import unique_stems
 from photoplan.io.product import check_output

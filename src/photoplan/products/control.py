@@ -24,12 +24,12 @@ from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import Window
 from photoplan.io.points import write_ground_points, write_image_points
 from photoplan.io.product import check_output
-from photoplan.io.project.edit import ProjectChanges, edit_project
-from photoplan.io.project.file import load_project
+from photoplan.io.project.file import ProjectChanges, edit_project, load_project
 from photoplan.io.project.model import Project, StatedTerrain
 from photoplan.io.raster import RasterReader
 from photoplan.io.store import recording
-from photoplan.matching.control import (
+from photoplan.matching.features import GreyImage
+from photoplan.matching.register import (
     ImageControl,
     OrthoPatch,
     Photo,
@@ -39,7 +39,6 @@ from photoplan.matching.control import (
     ground_covariances,
     patch_on,
 )
-from photoplan.matching.features import GreyImage
 from photoplan.plain import pick
 from photoplan.plan.footprint import image_border
 from photoplan.project.cameras import central_without_pixels

@@ -21,24 +21,24 @@ from photoplan.geometry.crs import canonical_crs, require_projected_metres
 from photoplan.geometry.frames import triple
 from photoplan.geometry.local import enu_of_geodetic
 from photoplan.geometry.pose import degrees_of
-from photoplan.io.camera.file import read_cameras
 from photoplan.io.files import ImageNames
+from photoplan.io.formats import (
+    choose_format,
+    orientation_format,
+    read_cameras,
+    read_orientation_block,
+    write_orientation,
+    written_formats,
+)
+from photoplan.io.image_metadata import IMAGE_SUFFIXES
 from photoplan.io.orientation.block import (
     Loss,
     OrientationBlock,
     OrientationTable,
     OrientedImage,
+    TableFormat,
     without_lenses,
 )
-from photoplan.io.orientation.exif import SUFFIXES
-from photoplan.io.orientation.file import (
-    choose_format,
-    orientation_format,
-    read_orientation_block,
-    write_orientation,
-    written_formats,
-)
-from photoplan.io.orientation.form import TableFormat
 from photoplan.io.points import named_as, read_ground_points, read_image_points
 from photoplan.io.product import check_output
 from photoplan.io.project.model import Image, interior_of, lens_of
@@ -184,7 +184,7 @@ def _image_files(block: OrientationBlock) -> dict[str, Path]:
     folder = block.table.file if block.table.file.is_dir() else block.table.file.parent
     names = [image.name for image in block.table.images]
     try:
-        beside = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+        beside = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
         matched = ImageNames(names).match([path.as_posix() for path in beside])
     except (OSError, InputError):  # a folder that may be entered, but not listed; names that fit several images
         beside, matched = [], []

@@ -15,16 +15,12 @@ from photoplan.events import SILENT, Events
 from photoplan.findings import Result
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
-from photoplan.io.camera.csm import is_frame, read_frame
-from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.line import describe_line, is_line
-from photoplan.io.camera.line_correction import read_line_correction
-from photoplan.io.camera.rpc import is_rpc, read_rpc, rpc_beside, rpc_in
+from photoplan.io.camera.line import describe_line, is_line, read_line_correction
+from photoplan.io.camera.satellite import is_frame, is_rpc, read_frame, read_rpc, rpc_beside, rpc_in
 from photoplan.io.files import looks_like, raster_driver, read_json, read_toml
+from photoplan.io.formats import choose_format, read_cameras, read_orientation_block
 from photoplan.io.objects import read_objects
-from photoplan.io.orientation.file import choose_format, read_orientation_block
-from photoplan.io.orientation.form import TableFormat
-from photoplan.io.plan_file import read_plan_tables
+from photoplan.io.orientation.block import TableFormat
 from photoplan.io.points import (
     is_gcp_list,
     read_gcp_list,
@@ -47,7 +43,7 @@ from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.series import read_series
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.model import GrossError, ModelReader, is_terrain_model
-from photoplan.io.vector_layer import layers_of, read_layer
+from photoplan.io.vector_layer import layers_of, read_layer, read_plan_tables
 from photoplan.plain import pick
 from photoplan.products.simulate import stated_model
 from photoplan.project.steps import load_filter

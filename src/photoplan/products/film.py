@@ -29,20 +29,19 @@ from photoplan.errors import GeometryError, InputError, PhotoplanError, Resource
 from photoplan.events import SILENT, Events
 from photoplan.findings import Estimate, Result, noted, raise_failed, with_sigma
 from photoplan.geometry.pose import angle_in_unit, angles_from_rotation
-from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.model import FiducialSystem
 from photoplan.io.files import unique_stems
+from photoplan.io.formats import read_cameras
 from photoplan.io.product import check_output
-from photoplan.io.project.edit import ProjectChanges, edit_project
-from photoplan.io.project.file import load_project
+from photoplan.io.project.file import ProjectChanges, edit_project, load_project
 from photoplan.io.project.model import Image, Project, fiducial_fit, interior_of, lens_of
 from photoplan.io.raster_info import parse_pitch, read_pitch
 from photoplan.io.store import recording
 from photoplan.orientation.bundle.adjust import angle_derivatives
 from photoplan.orientation.bundle.model import AdjustedCamera
-from photoplan.orientation.judgement import fitting, impossible, of_resection
+from photoplan.orientation.conventions import fitting_convention, impossible, of_resection
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
-from photoplan.orientation.marks.layout import FiducialResult, MarkLayout, MarksNotFound, SoughtMark
+from photoplan.orientation.marks.locate import FiducialResult, MarkLayout, MarksNotFound, SoughtMark
 from photoplan.orientation.resection import MeasuredPoints, Resected, ResectSettings, resect
 from photoplan.plain import pick
 from photoplan.products.adjust.inputs import AdjustInputs, decimals_of, read_inputs, stated_accuracy
@@ -804,7 +803,7 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     terrain = float(nadir_heights(project, found.pose.center[None, :2], np.nan)[0])
     wrong = impossible(of_resection(working, found, terrain))
     if wrong is not None:
-        fits = fitting(
+        fits = fitting_convention(
             working,
             interior.size[1],
             lambda other: resected(project, image, other, interior, lens, settings),

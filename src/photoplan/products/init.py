@@ -32,13 +32,12 @@ from photoplan.geometry.heights import check_height_system, declared_pair, heigh
 from photoplan.geometry.local import LocalFrame
 from photoplan.geometry.pose import degrees_of
 from photoplan.geometry.units import metric_heights, unit_label
-from photoplan.io.camera.file import CameraFile, read_cameras
 from photoplan.io.camera.model import CameraEntry, Triple
-from photoplan.io.camera.rpc import read_rpc, rpc_beside, rpc_in
+from photoplan.io.camera.satellite import read_rpc, rpc_beside, rpc_in
 from photoplan.io.disk import make_parents, received
 from photoplan.io.files import ImageNames, check_input_name, crs_beside, relative_path, shortest_paths
+from photoplan.io.formats import CameraFile, read_cameras, read_orientation
 from photoplan.io.orientation.block import OrientationTable, OrientedImage
-from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.opensfm import resized
 from photoplan.io.project.file import parse_project, write_project
 from photoplan.io.project.model import TAGS, Image, ImageEntry, Project, RpcImage, StatedTerrain

@@ -14,9 +14,7 @@ from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.products.mtf.edges import LightImage, measure_edges
 from photoplan.products.mtf.result import ImageMtf, MtfReport
-from photoplan.project.steps import (
-    linearisation_of,
-)
+from photoplan.project.steps import linearisation_of
 from photoplan.quality.edges.groups import LEAST_EDGES, sharpness_of
 from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.restoration.design import (
@@ -30,8 +28,13 @@ from photoplan.quality.restoration.design import (
     image_noise,
     kept_by_compression,
 )
-from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
-from photoplan.quality.restoration.scene import SceneStatistics, block_spectra, scenes_of
+from photoplan.quality.restoration.restorer import (
+    FilterKernel,
+    RestorationFilter,
+    SceneStatistics,
+    block_spectra,
+    scenes_of,
+)
 from photoplan.requests.quality import MtfRequest, RestoreRequest
 
 #: Windows of an image in which its contrast is looked for, in each direction, and their side.

@@ -15,9 +15,8 @@ from photoplan.errors import InputError
 from photoplan.geometry.bounds import area_note
 from photoplan.geometry.crs import agreement, crs_step
 from photoplan.geometry.grid import Window
-from photoplan.io.image_metadata import read_image_metadata
+from photoplan.io.image_metadata import IMAGE_SUFFIXES, read_image_metadata
 from photoplan.io.orientation.block import OrientationTable
-from photoplan.io.orientation.exif import SUFFIXES
 from photoplan.io.project.model import Image, ImageEntry, Project
 from photoplan.orientation.conventions import ImagePlausibility, JudgedView, look, other_reading
 from photoplan.plan.footprint import footprint, mean_gsd
@@ -142,7 +141,7 @@ def geodetic_positions(files: Iterable[Path | None]) -> _Floats:
 
 def _position(file: Path | None) -> tuple[float, float, float]:
     nothing = (float("nan"),) * 3
-    if file is None or file.suffix.lower() not in SUFFIXES or not is_there(file):
+    if file is None or file.suffix.lower() not in IMAGE_SUFFIXES or not is_there(file):
         return nothing
     try:
         stated = read_image_metadata(file)

@@ -18,9 +18,9 @@ from photoplan.engine.executors import Outcome, Workers, executor_factory, run_t
 from photoplan.errors import PhotoplanError, PhotoplanWarning, UsageError
 from photoplan.geometry.crs import crs_label, parse_crs, require_projected_metres
 from photoplan.geometry.grid import MapGrid, Placement
+from photoplan.io.disk import Nodata
 from photoplan.io.product import ProductFile
 from photoplan.io.raster import RasterReader, pixels_of_dataset
-from photoplan.io.storage import Nodata
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.anchors import AnchorRule
 from photoplan.plan.footprint import Tiles

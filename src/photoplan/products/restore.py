@@ -16,14 +16,12 @@ from photoplan.engine.run import Kept, Made, Runner, Tally, Work, tiles_in_fligh
 from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Result, raise_failed
-from photoplan.io.disk import make_folder, make_parents
+from photoplan.io.disk import COMPRESSIONS, Nodata, make_folder, make_parents
 from photoplan.io.files import fingerprint, unique_stems
-from photoplan.io.product import ProductFacts, ProductFile, check_output
+from photoplan.io.product import ProductFacts, ProductFile, check_output, write_quicklook
 from photoplan.io.quality_files import filter_text
-from photoplan.io.quicklook import write_quicklook
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import ImageForm, form_of, placement_of
-from photoplan.io.storage import COMPRESSIONS, Nodata
 from photoplan.io.store import (
     input_entry,
     record_path,
@@ -57,9 +55,7 @@ from photoplan.project.steps import (
 )
 from photoplan.quality.colour import ChromaticModel
 from photoplan.quality.linearise import Linearisation
-from photoplan.quality.restoration.design import (
-    aperture_filter,
-)
+from photoplan.quality.restoration.design import aperture_filter
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 from photoplan.requests.quality import RestoreRequest, table_of
 

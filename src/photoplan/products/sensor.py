@@ -27,8 +27,8 @@ from photoplan.io.quality_files import (
 )
 from photoplan.io.tables import write_table
 from photoplan.plain import pick
-from photoplan.quality import sensor
-from photoplan.quality.sensor import NoiseBudget, VideoNorm
+from photoplan.quality.camera import sensor
+from photoplan.quality.camera.sensor import NoiseBudget, VideoNorm
 from photoplan.requests.quality import SensorRequest
 
 

@@ -35,9 +35,8 @@ from photoplan.products.orthophoto.plan import two_figures
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.rendered import ProjectScene, ground_pixel
 from photoplan.quality.formation.model import MOST_PIXELS, FormedFrame, ImageModel, exposed, frame_light, model_mtf50
-from photoplan.quality.formation.parts import Quantisation
-from photoplan.quality.formation.rendered import RenderedScene
-from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, parse_pattern
+from photoplan.quality.formation.optics import Quantisation
+from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, RenderedScene, parse_pattern
 from photoplan.requests.quality import SimulateRequest
 
 #: A description with a table of defects for every element of a large sensor stays below.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io import mark_model as described
+from photoplan.io.camera import model as described
 from photoplan.io.camera.model import FiducialSystem
 from photoplan.io.files import resolve_input
 from photoplan.io.raster import RasterReader

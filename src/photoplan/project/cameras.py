@@ -19,11 +19,9 @@ from photoplan.errors import InputError
 from photoplan.geometry.heights import height_step
 from photoplan.geometry.local import GeodeticGround
 from photoplan.geometry.pose import Pose, angle_in_radians, rotation_from_angles
-from photoplan.io.camera.csm import StatedFrame, read_frame
-from photoplan.io.camera.line import StatedLine, read_line
-from photoplan.io.camera.line_correction import read_line_correction, read_pose_errors
+from photoplan.io.camera.line import StatedLine, read_line, read_line_correction, read_pose_errors
 from photoplan.io.camera.model import CameraEntry
-from photoplan.io.camera.rpc import read_rpc
+from photoplan.io.camera.satellite import StatedFrame, read_frame, read_rpc
 from photoplan.io.project.model import (
     FrameImage,
     Image,

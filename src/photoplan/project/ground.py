@@ -25,12 +25,12 @@ from photoplan.geometry.crs import (
 )
 from photoplan.geometry.heights import HeightStep, declared_pair, height_step, require_metric_heights
 from photoplan.geometry.units import metric_heights
+from photoplan.io.disk import target_of
 from photoplan.io.files import resolve_input
-from photoplan.io.gdal import target_of
 from photoplan.io.project.model import Objects, Project, StatedTerrain
+from photoplan.io.raster import TerrainReader
 from photoplan.io.terrain.model import ModelReader, is_terrain_model
 from photoplan.io.terrain.options import KnownRanges
-from photoplan.io.terrain.reader import TerrainReader
 from photoplan.surfaces.base import LevelSurface, Terrain
 from photoplan.surfaces.hybrid import HeightErrors, HybridSurface, ModelHeightErrors
 from photoplan.surfaces.objects import ObjectSurface, without_objects

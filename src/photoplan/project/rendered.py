@@ -19,7 +19,7 @@ from photoplan.kernels.terrain import sample_points
 from photoplan.plan.footprint import FAR
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import Ground, ground_of
-from photoplan.quality.formation.rendered import FromAbove, RenderedScene, SolidTexture, Texture
+from photoplan.quality.formation.scenes import FromAbove, RenderedScene, SolidTexture, Texture
 from photoplan.surfaces.base import Hits
 from photoplan.surfaces.objects import painted_surface
 

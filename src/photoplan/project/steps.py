@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from photoplan.engine.execute import Step
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Pixels, Window, reduced
+from photoplan.io.disk import Nodata
 from photoplan.io.files import fingerprint
 from photoplan.io.product import check_output
 from photoplan.io.quality_files import (
@@ -25,11 +26,10 @@ from photoplan.io.quality_files import (
 )
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
-from photoplan.io.storage import Nodata
 from photoplan.io.store import write_atomically
 from photoplan.io.tables import Columns, read_table
 from photoplan.plain import pick
-from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off, largest_gain
+from photoplan.quality.camera.fall_off import FallOffModel, correct_fall_off, largest_gain
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter, RestoredPixels, Restorer, light_of
 from photoplan.radiometry.tone import Tone, toned
@@ -98,7 +98,7 @@ def read_linearisation_table(path: Path) -> NDArray[np.float64]:
 
 
 def read_fall_off(path: Path) -> FallOffModel:
-    """The model of a correction file; `photoplan.quality.camera.fall_off_model.correct_fall_off` applies it."""
+    """The model of a correction file; `photoplan.quality.camera.fall_off.correct_fall_off` applies it."""
     entry = read_fall_off_entry(path)
     try:
         return FallOffModel(

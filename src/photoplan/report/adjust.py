@@ -19,7 +19,7 @@ from photoplan.products.adjust.findings import (
     NamedMeasurement,
     ResidualField,
 )
-from photoplan.report.drawing import (
+from photoplan.report.page import (
     BLUE,
     GREEN,
     INK,
@@ -28,15 +28,21 @@ from photoplan.report.drawing import (
     RED,
     SKY,
     SOFT,
+    Cell,
     axes_of,
     draw_normalised,
+    figure,
     figure_of,
+    headline,
     mpl,
+    page,
     png,
     round_down,
+    section,
     styled,
+    table,
+    text,
 )
-from photoplan.report.page import Cell, figure, headline, page, section, table, text
 
 _WIDTH = 7.2
 #: Radius of the 95 % ellipse of two normal coordinates in standard deviations: root of −2 ln 0.05.

@@ -19,21 +19,27 @@ from photoplan.geometry.grid import MapGrid
 from photoplan.kernels.prediction import sides_of
 from photoplan.products.dtm.build import BuildReport
 from photoplan.products.dtm.lines import ContourFacts, Profile, Profiles
-from photoplan.report.drawing import (
+from photoplan.report.page import (
     BLUE,
     INK,
     PURPLE,
     RED,
     SKY,
     SOFT,
+    Cell,
     axes_of,
     draw_normalised,
+    figure,
     figure_of,
+    headline,
     mpl,
+    page,
     png,
+    section,
     styled,
+    table,
+    text,
 )
-from photoplan.report.page import Cell, figure, headline, page, section, table, text
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.units import MeasuredTerrain, MemoryUnits
 from photoplan.targets.map import MapTarget

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.report.drawing import INK, SOFT, figure_of, mpl, png, shortened, styled
+from photoplan.report.page import INK, SOFT, figure_of, mpl, png, shortened, styled
 
 #: Sides of the page, margins at the sides, at the top and at the bottom, points.
 _PAGE, _SIDE, _TOP, _BOTTOM = (595.28, 841.89), 43.0, 46.0, 54.0

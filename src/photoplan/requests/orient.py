@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from photoplan.errors import UsageError
-from photoplan.io.orientation.form import Direction, TableFormat
+from photoplan.io.orientation.block import Direction, TableFormat
 from photoplan.request import (
     BEYOND_AREA,
     DRY_RUN,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from photoplan.errors import UsageError
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.block import TableFormat
 from photoplan.request import BEYOND_AREA, IMAGES, OVERWRITE, PROJECT, Request, arg, opt
 
 

@@ -36,8 +36,7 @@ from photoplan.cameras.lenses import Brown, Fisheye, NoLens, OpenCV
 from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry, InPixels, frame_in_pixels
 from photoplan.io.files import finite, parse_yaml, read_head, read_json, read_text, read_yaml, unique_stems
-from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, TableFormat
 from photoplan.io.project.model import lens_of
 
 

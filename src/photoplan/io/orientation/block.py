@@ -1,7 +1,7 @@
-"""Exterior orientations as a file states them, with their cameras, and what a file format for them is.
+"""Orientations of images as formats read and write them, with what tables of numbers do not state.
 
 To add a format, define an `OrientationFormat` of four functions in a module of its family, and add a line to
-`photoplan.io.orientation.file.FORMATS`. Nothing else changes.
+`photoplan.io.formats.FORMATS`. Nothing else changes.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.errors import InputError
+from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.pose import (
     angle_in_radians,
@@ -26,7 +26,65 @@ from photoplan.geometry.pose import (
 )
 from photoplan.geometry.units import agreed_metres, metric_heights, metric_system, unit_label
 from photoplan.io.camera.model import CameraEntry, IdealLens, UnusableCamera
-from photoplan.io.orientation.form import Direction, TableFormat
+from photoplan.request import Request, opt
+
+Direction = Literal["camera-to-ground", "ground-to-camera"]
+_DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
+
+
+class TableFormat(Request):
+    """Form and conventions of a table of numbers.
+
+    A file format with conventions of its own gives way to those that are set, also to the value of the default.
+    """
+
+    columns: str | None = opt(
+        "Columns of a table: name,x,y,z,omega,phi,kappa[,camera] in their order, - for one that is not used; or by the "
+        "header: name=LABEL,x=…",
+        None,
+        section="input",
+    )
+    delimiter: str | None = opt("Delimiter of a table [the one that splits all lines equally].", None,
+                                choices=_DELIMITERS, section="input")  # fmt: skip
+    decimal_comma: bool = opt("Numbers of a table are written 1,5.", False, section="input")
+    angle_unit: Literal["deg", "gon", "rad"] = opt("Unit of angles [deg, or the format's own].", "deg", section="input")
+    rotation: Literal["opk", "pok", "kpo", "kop", "okp", "pko"] = opt(
+        "Order of omega, phi, kappa, whatever the order of columns; the first is primary [opk, or the format's own].",
+        "opk",
+        section="input",
+    )
+    direction: Direction = opt(
+        "Direction of the file's rotation [camera-to-ground; some formats require it].",
+        "camera-to-ground",
+        flag="rotation-direction",
+        section="input",
+    )
+
+    def check(self) -> None:
+        """Refuse unknown delimiters, and a comma with two meanings."""
+        if self.delimiter not in (None, *_DELIMITERS.values()):
+            raise UsageError(f"delimiter {self.delimiter!r} must be one of {', '.join(_DELIMITERS)}")
+        if self.delimiter == "," and self.decimal_comma:
+            raise UsageError("a comma cannot be both delimiter and decimal sign")
+
+    @classmethod
+    def of(cls, angle_unit: str, rotation: str) -> Self:
+        """Return the format of a table in the conventions of a project; usual ones yield to the file's own."""
+        usual, given = cls(), {"angle_unit": angle_unit, "rotation": rotation}
+        return cls(**{name: value for name, value in given.items() if value != getattr(usual, name)})
+
+    def declares(self, name: str) -> bool:
+        """Return whether a convention was set."""
+        return name in self.model_fields_set
+
+    def conventions(self, angle_unit: str, rotation: str, direction: Direction) -> tuple[str, str, Direction]:
+        """Return angle unit, rotation and direction for a format that defines its own, unless others are declared."""
+        return (
+            self.angle_unit if self.declares("angle_unit") else angle_unit,
+            self.rotation if self.declares("rotation") else rotation,
+            self.direction if self.declares("direction") else direction,
+        )
+
 
 #: By the letters that spell an order of rotations.
 ANGLE_NAMES = {"o": "omega", "p": "phi", "k": "kappa"}

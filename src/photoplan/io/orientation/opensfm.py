@@ -54,13 +54,13 @@ from photoplan.io.orientation.block import (
     OrientationFormat,
     OrientationTable,
     OrientedImage,
+    TableFormat,
     common_losses,
     height_losses,
     posed,
     require_cameras,
     without_unusable,
 )
-from photoplan.io.orientation.form import TableFormat
 
 _COEFFICIENTS = {
     "perspective": ("k1", "k2"),

@@ -18,13 +18,12 @@ from photoplan.geometry.crs import crs_label, require_projected_metres, same_crs
 from photoplan.geometry.heights import check_height_system
 from photoplan.geometry.units import MetricSystem, agreed_metres, metric_system, unit_label
 from photoplan.io.files import check_plain_file
-from photoplan.io.raster import USUAL_NODATA
-from photoplan.io.terrain import landxml as terrain_landxml
+from photoplan.io.raster import HIGHEST, LOWEST, USUAL_NODATA
 from photoplan.io.terrain import las as terrain_las
 from photoplan.io.terrain import text as terrain_text
+from photoplan.io.terrain import vector as terrain_landxml
 from photoplan.io.terrain import vector as terrain_vector
 from photoplan.io.terrain.options import ReadOptions
-from photoplan.io.terrain.reader import HIGHEST, LOWEST
 from photoplan.io.terrain.vector import check_matched
 from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, PointGroup, Tin
 
@@ -84,7 +83,7 @@ def _reader(path: Path) -> _Reader:
     if head.startswith((b"SQLite format 3\x00", b"\x00\x00\x27\x0a", b"AutoCAD Binary DXF")) or start.startswith(b"{"):
         return terrain_vector.read
     if start.startswith(b"<"):
-        return terrain_landxml.read
+        return terrain_landxml.read_landxml
     if start.startswith(_RASTERS):
         raise InputError(f"{path}: a raster, not measured points; a grid model is given to orthophotos as it is")
     words = start.split(maxsplit=4)

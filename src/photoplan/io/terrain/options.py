@@ -20,8 +20,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.units import metres_in
 from photoplan.io.disk import cache_folder
 from photoplan.io.files import fingerprint, read_toml
+from photoplan.io.raster import TerrainReader
 from photoplan.io.tables import Columns, Dialect, decimal, read_table
-from photoplan.io.terrain.reader import TerrainReader
 from photoplan.surfaces.units import LINE_KINDS, POINT_KINDS
 
 KINDS: tuple[str, ...] = (*POINT_KINDS, *LINE_KINDS, "ignore")

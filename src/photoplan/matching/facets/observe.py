@@ -1,7 +1,9 @@
-"""Observation equations of facets: grey values, radiometry, curvature."""
+"""Observation equations of facets: image pyramids, means, grey values, radiometry, curvature."""
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -9,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from photoplan.cameras.base import Camera, project, tremor_of
 from photoplan.geometry.grid import MapGrid, Window
@@ -22,11 +25,142 @@ from photoplan.kernels.facet_transfer import (
     transfer,
 )
 from photoplan.kernels.facets import curvature_gradient
-from photoplan.matching.facets.means import means_around
-from photoplan.matching.facets.pyramid import Pyramid
+from photoplan.kernels.matching import box_means
+from photoplan.matching.features import Grey
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
+
+
+def means_around(values: NDArray[np.floating], patch: int) -> _Doubles:
+    """Means over patches of patch × patch values, fewer at the border, shape (rows, columns); an even patch has one
+    more before than behind."""
+    out = np.empty(values.shape)
+    box_means(np.ascontiguousarray(values, float), patch // 2, patch - patch // 2, out)
+    return out
+
+
+def smoothed(values: _Floats) -> _Floats:
+    """Means of three by three."""
+    padded = np.pad(values, 1, mode="edge")
+    across = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+    return (across[:-2] + across[1:-1] + across[2:]) / np.float32(9)
+
+
+def corners(facets: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Posts at the corners of any of these facets: shape (rows, columns) of (rows − 1, columns − 1)."""
+    around = np.pad(facets, 1)
+    return around[:-1, :-1] | around[:-1, 1:] | around[1:, :-1] | around[1:, 1:]
+
+
+def away_from_border(seen: NDArray[np.bool_], border: int, least: float) -> NDArray[np.bool_]:
+    """Of what is seen of a block, what is `border` values away from its border and from what is not seen along that.
+
+    Where less than the part `least` of what is seen would be left, the latter does not count. Holes do not, either:
+    heights hang together around them. All of shape (rows, columns).
+    """
+    inner = np.zeros_like(seen)
+    inner[border:-border, border:-border] = True
+    inner &= seen
+    if seen.all():
+        return inner
+    parts, _ = ndimage.label(~seen)
+    edge = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+    beside = ndimage.maximum_filter(np.isin(parts, edge[edge > 0]), 2 * border + 1)
+    away: NDArray[np.bool_] = inner & ~beside
+    return away if np.count_nonzero(away) >= least * np.count_nonzero(inner) else inner
+
+
+#: Low-pass filters (Kaiser, Schmolla and Wrobel 1992, in Schlüter 2001, table 1), by how many pixels they span.
+FILTERS = {
+    3: np.array([1, 2, 1]) / 4,
+    5: np.array([1, 4, 6, 4, 1]) / 16,
+    # The printed coefficients add up to 0.999.
+    11: np.array([51, 0, -87, 0, 298, 475, 298, 0, -87, 0, 51]) / 999,
+}
+#: Pixels of a block along a side.
+_SIDE = 256
+
+
+@dataclass(eq=False)
+class Pyramid:
+    """Levels of an image, read by windows; level 0 is the image. Safe to call from several threads.
+
+    Pixel (i, j) of a level lies at (i, j)·2^level of the image: filters are symmetric about the pixels that are kept.
+    """
+
+    image: Grey
+    span: int = 11
+    """Pixels that the low-pass filter spans."""
+    kept: int = 64 << 20
+    """Bytes of blocks that are kept for the next window."""
+    _blocks: OrderedDict[tuple[int, int, int], _Floats] = field(default_factory=OrderedDict, init=False, repr=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False)
+
+    def size(self, level: int) -> tuple[int, int]:
+        """Width and height of a level."""
+        width, height = self.image.size
+        return ((width - 1) >> level) + 1, ((height - 1) >> level) + 1
+
+    def read(self, level: int, window: Window) -> _Floats:
+        """Grey values of any window of a level, shape (height, width); NaN where there are none."""
+        if level == 0:
+            return self.image.read(window)
+        out = np.full((window.height, window.width), np.nan, np.float32)
+        inside = window & Window(0, 0, *self.size(level))
+        for row in range(inside.row // _SIDE, -(-inside.stop[1] // _SIDE)):
+            for col in range(inside.col // _SIDE, -(-inside.stop[0] // _SIDE)):
+                block = Window(col * _SIDE, row * _SIDE, _SIDE, _SIDE)
+                part = block & inside
+                out[part.slices(window)] = self._block(level, block)[part.slices(block)]
+        return out
+
+    def _block(self, level: int, block: Window) -> _Floats:
+        key = level, block.col, block.row
+        with self._lock:
+            if key in self._blocks:
+                self._blocks.move_to_end(key)
+                return self._blocks[key]
+        reach = self.span // 2
+        finer = Window(
+            2 * block.col - reach, 2 * block.row - reach, 2 * block.width + 2 * reach, 2 * block.height + 2 * reach
+        )
+        made = halved(self.read(level - 1, finer), FILTERS[self.span])
+        with self._lock:
+            self._blocks[key] = made
+            while len(self._blocks) * _SIDE**2 * 4 > max(self.kept, 4 * _SIDE**2):
+                # The oldest of the finest level: a block is made of four times as many pixels as one of a level finer.
+                del self._blocks[min(self._blocks, key=lambda one: one[0])]
+        return made
+
+
+def halved(fine: _Floats, low_pass: NDArray[np.float64]) -> _Floats:
+    """Filter along rows and columns and keep every second pixel, the first of them where the filter first fits.
+
+    Pixels without a value count nothing; where they have most of the weight there is none.
+    """
+    valid = np.isfinite(fine)
+    values, whole = np.where(valid, fine, np.float32(0)), bool(valid.all())
+    total = _along(_along(values, low_pass, 0), low_pass, 1)
+    if whole:
+        return total
+    weight = _along(_along(valid.astype(np.float32), low_pass, 0), low_pass, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(weight > 0.6, total / weight, np.float32(np.nan))
+
+
+def _along(values: _Floats, low_pass: NDArray[np.float64], axis: int) -> _Floats:
+    count = (values.shape[axis] - len(low_pass) + 1 + 1) // 2
+    out: _Floats | None = None
+    for k, share in enumerate(low_pass):
+        if share:
+            index = [slice(None), slice(None)]
+            index[axis] = slice(k, k + 2 * count - 1, 2)
+            part = values[tuple(index)] * np.float32(share)
+            out = part if out is None else out + part
+    assert out is not None
+    return out
+
 
 #: Posts around a window that are adjusted with it and belong to its neighbours: half a patch of the roughness, the
 #: border of which nothing is learnt, and some more.

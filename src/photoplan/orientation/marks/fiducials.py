@@ -15,27 +15,25 @@ from photoplan.adjustment.least_squares import solve
 from photoplan.cameras.fiducials import FiducialFit, MarkExample, MarkPattern, fit_affine
 from photoplan.errors import InputError, PhotoplanError
 from photoplan.geometry.grid import Window
-from photoplan.orientation.marks.layout import (
+from photoplan.orientation.marks.locate import (
+    BLURS,
     FILM,
     FLOOR,
+    LEAST_CORRELATION,
     TURNS,
     FiducialResult,
     LocatedMark,
+    Location,
     MarkLayout,
     MarkPlacement,
     MarksNotFound,
     MissingMark,
     ScanTurn,
     SoughtMark,
-    combine,
-    fit_placement,
-)
-from photoplan.orientation.marks.locate import (
-    BLURS,
-    LEAST_CORRELATION,
-    Location,
     best_blur,
+    combine,
     correlation_surface,
+    fit_placement,
     locate_mark,
 )
 from photoplan.orientation.marks.single import fit_edges

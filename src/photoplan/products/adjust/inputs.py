@@ -15,8 +15,8 @@ from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.bounds import area_note
 from photoplan.geometry.pose import Pose, angle_in_radians, angle_in_unit, angles_from_rotation
 from photoplan.io.files import ImageNames, match_key
-from photoplan.io.orientation.exif import image_files
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.image_metadata import image_files
+from photoplan.io.orientation.block import TableFormat
 from photoplan.io.points import (
     PositionTable,
     is_gcp_list,

@@ -17,14 +17,13 @@ from photoplan.errors import DatumDefect, GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.product import check_output
-from photoplan.io.project.edit import ProjectChanges, edit_project
-from photoplan.io.project.file import load_project
+from photoplan.io.project.file import ProjectChanges, edit_project, load_project
 from photoplan.io.project.model import Image, Project, interior_of, lens_of
 from photoplan.io.store import recording, stated_json, write_atomically
 from photoplan.io.vector_layer import write_point_layers, write_residuals
 from photoplan.orientation.bundle.adjust import Cause, adjust_block, weighed_causes
 from photoplan.orientation.bundle.model import Adjusted, AdjustSettings
-from photoplan.orientation.judgement import Evidence, fitting, impossible, misfit
+from photoplan.orientation.conventions import Evidence, fitting_convention, impossible, misfit
 from photoplan.orientation.resection import ResectSettings
 from photoplan.plain import pick
 from photoplan.products.adjust.findings import AdjustReport, block_json, point_layers, summarise
@@ -149,7 +148,7 @@ def _hint(result: MapResult) -> str:
         return "are X and Y, the direction of y in the images, units and height systems as they are stated?"
     given, described = measured_control(inputs, rows[image.name]), inputs.project.cameras[image.camera]
     interior, lens = interior_of(described, image), lens_of(described)
-    return fitting(
+    return fitting_convention(
         given,
         interior.size[1],
         lambda other: resected(inputs.project, image, other, interior, lens, ResectSettings()),

@@ -20,7 +20,7 @@ from photoplan.errors import HeightSystemError, InputError, UsageError
 from photoplan.geometry.heights import OPTIONS, check_height_system, declared_pair, height_step
 from photoplan.geometry.local import LocalFrame
 from photoplan.geometry.pose import angles_from_rotation
-from photoplan.io.camera.line_correction import line_correction_text, read_line_correction
+from photoplan.io.camera.line import line_correction_text, read_line_correction
 from photoplan.io.camera.model import BrownLens, CameraEntry, RadialTableLens
 from photoplan.io.project.model import ImageEntry, LineImage, Project, RpcImage, StripAdjustment, lens_of
 from photoplan.orientation.bundle.adjust import BlockFrame

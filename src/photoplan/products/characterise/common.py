@@ -14,8 +14,8 @@ from photoplan.errors import InputError
 from photoplan.findings import Findings, Subject, Trace, joined
 from photoplan.io.series import Plane
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.quality.camera.dark_signal import Level
 from photoplan.quality.camera.photon_transfer import Saturation, find_saturation
+from photoplan.quality.camera.sensor import Level
 
 #: Share of saturated samples up to which a mean grey value is one.
 MOST_SATURATED = 1e-2

@@ -11,7 +11,7 @@ from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, w
 from photoplan.io.series import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.quality.camera.dark_signal import DarkCurrent, Level, dark_current, doubling_temperature
+from photoplan.quality.camera.sensor import DarkCurrent, Level, dark_current, doubling_temperature
 
 _LEAST = 3
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series import CONDITIONS, Plane, Series, SeriesFrame, frame_pixels, plane_mask, series_planes, split
-from photoplan.quality.camera.dark_signal import FrameStack, Level, StackSums
 from photoplan.quality.camera.photon_transfer import FullWell
+from photoplan.quality.camera.sensor import FrameStack, Level, StackSums
 
 #: What tells settings apart, and the units. Light is told by its photons; time is no setting.
 _CONDITIONS = (("kind", ""), *(each for each in CONDITIONS.items() if each[0] not in ("irradiance_uw_cm2", "time_s")))

@@ -8,21 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.findings import (
-    Chart,
-    Findings,
-    Picture,
-    Subject,
-    Table,
-    Trace,
-    joined,
-    known,
-    shrunk,
-)
+from photoplan.findings import Chart, Findings, Picture, Subject, Table, Trace, joined, known, shrunk
 from photoplan.io.series import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, no_pair, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.quality.camera.dark_signal import (
+from photoplan.quality.camera.sensor import (
     DefectList,
     FrameStack,
     Kind,

@@ -13,8 +13,8 @@ from photoplan.products.characterise import dark, pattern
 from photoplan.products.characterise.common import SettingsRun, exposure_runs, of_one_temperature, tried, used_and_rest
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.transfer import reduced_level
-from photoplan.quality.camera.dark_signal import Level, cut_off, dark_current
 from photoplan.quality.camera.photon_transfer import EmvaPoints, EmvaSheet, emva_sheet
+from photoplan.quality.camera.sensor import Level, cut_off, dark_current
 
 _LEAST = 5
 #: Figures of other analyses that belong to the sheet: name there, name here, words, unit, and whether K divides them.

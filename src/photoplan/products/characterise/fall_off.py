@@ -17,8 +17,7 @@ from photoplan.io.series import Plane
 from photoplan.products.characterise.common import black_of, dark_like
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.groups import FrameGroup
-from photoplan.quality.camera.fall_off import FallOff, FallOffSettings, fit_fall_off
-from photoplan.quality.camera.fall_off_model import gain_image
+from photoplan.quality.camera.fall_off import FallOff, FallOffSettings, fit_fall_off, gain_image
 
 _SATURATED = 1e-3
 #: Longer side of the gain image that is written.

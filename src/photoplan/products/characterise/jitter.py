@@ -14,9 +14,9 @@ from photoplan.geometry.grid import Window
 from photoplan.io.series import EdgeEntry, SeriesFrame, frame_pixels
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.quality.camera.straight_lines import EdgeLines, correlate_edge, fit_edge
+from photoplan.quality.camera.geometry import EdgeLines, correlate_edge, fit_edge
+from photoplan.quality.camera.sensor import jitter_grey
 from photoplan.quality.camera.video import LineJitter, above_control, compare_edges, line_jitter, mean_correlation
-from photoplan.quality.sensor import jitter_grey
 
 #: Frames that are drawn.
 _CHARTS = 4

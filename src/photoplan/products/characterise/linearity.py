@@ -19,8 +19,8 @@ from photoplan.products.characterise.common import (
     used_and_rest,
 )
 from photoplan.products.characterise.data import SeriesData
-from photoplan.quality.camera.dark_signal import check_level, cut_off
 from photoplan.quality.camera.photon_transfer import HIGH, Linearity, linearity
+from photoplan.quality.camera.sensor import check_level, cut_off
 
 _KINDS = ("flat", "scene")
 _LEAST = 3

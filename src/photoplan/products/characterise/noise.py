@@ -8,7 +8,7 @@ import numpy as np
 
 from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined
 from photoplan.products.characterise.data import SeriesData
-from photoplan.quality.camera.dark_signal import Level
+from photoplan.quality.camera.sensor import Level
 
 #: What stands still: between frames of other kinds the scene or its brightness changes.
 _KINDS = ("dark", "flat", "scene", "wedge", "drift")

@@ -13,7 +13,7 @@ from photoplan.io.series import Plane
 from photoplan.plain import plain
 from photoplan.products.characterise.common import black_of, dark_like, no_pair, of_one_temperature, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.quality.camera.dark_signal import (
+from photoplan.quality.camera.sensor import (
     FrameStack,
     PatternVariance,
     Spectrogram,

@@ -10,7 +10,7 @@ from photoplan.findings import Chart, Findings, Subject, Trace, known
 from photoplan.io.series import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, SettingsRun, no_run, of_runs
 from photoplan.products.characterise.data import SeriesData
-from photoplan.quality.camera.dark_signal import check_level
+from photoplan.quality.camera.sensor import check_level
 
 _KINDS = ("flat", "scene")
 _LEAST = 4

@@ -13,7 +13,7 @@ from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
 from photoplan.products.characterise.targets import locate_targets
-from photoplan.quality.camera.stage import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
+from photoplan.quality.camera.geometry import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
 
 _GON = 200.0 / math.pi
 

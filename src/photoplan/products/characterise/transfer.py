@@ -8,8 +8,8 @@ from photoplan.findings import Chart, Findings, Subject, Table, Trace, joined, k
 from photoplan.io.series import Plane, ReducedPoint
 from photoplan.products.characterise.common import dark_levels, tried, used_and_rest
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.quality.camera.dark_signal import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
+from photoplan.quality.camera.sensor import Level
 
 _LEAST = 3
 

@@ -13,8 +13,8 @@ from photoplan.geometry.grid import Window
 from photoplan.io.series import Plane, SeriesFrame, plane_pixels
 from photoplan.products.characterise.common import black_of, saturation_of, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.quality.camera.dark_signal import Level, StackSums
-from photoplan.quality.camera.straight_lines import GreyWedge, grey_wedge
+from photoplan.quality.camera.geometry import GreyWedge, grey_wedge
+from photoplan.quality.camera.sensor import Level, StackSums
 
 _LEAST = 3
 

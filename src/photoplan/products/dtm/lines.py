@@ -19,7 +19,7 @@ from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.product import check_output
 from photoplan.io.tables import Dialect, csv_line
-from photoplan.io.terrain.export import replacing
+from photoplan.io.terrain.model_write import replacing
 from photoplan.io.terrain.text import PointTable, PointTableFormat
 from photoplan.io.vector_layer import ContourRow, LabelRow, contour_files, read_features, write_contours
 from photoplan.plain import pick

@@ -20,13 +20,11 @@ from photoplan.events import SILENT, Events
 from photoplan.findings import Result
 from photoplan.geometry.grid import MapGrid, Placement, Window, refuse_absurd
 from photoplan.geometry.heights import crs_with_heights
-from photoplan.io.disk import free_megabytes
-from photoplan.io.product import ProductFacts, ProductFile, check_output
-from photoplan.io.quicklook import write_quicklook
+from photoplan.io.disk import Nodata, free_megabytes
+from photoplan.io.product import ProductFacts, ProductFile, check_output, write_quicklook
 from photoplan.io.raster_info import ImageForm
-from photoplan.io.storage import Nodata
 from photoplan.io.store import input_entry, run_key, run_times, settings_of, standing, together, write_run_record
-from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
+from photoplan.io.terrain.model_write import TIN_SUFFIXES, replacing, write_points, write_tin
 from photoplan.plain import pick
 from photoplan.plan.footprint import Tile, Tiles
 from photoplan.project.ground import OpenTerrain, open_terrain

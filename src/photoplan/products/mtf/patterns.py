@@ -22,8 +22,16 @@ from photoplan.products.mtf.result import MtfReport
 from photoplan.project.steps import linearisation_of
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.mtf_curve import MtfCurve
-from photoplan.quality.patterns.bars import BarCurve, bar_curve, clipped_pixels, coltman_mtf, measure_bars
-from photoplan.quality.patterns.siemens import StarMtf, StarRules, measure_star
+from photoplan.quality.patterns.bars import (
+    BarCurve,
+    StarMtf,
+    StarRules,
+    bar_curve,
+    clipped_pixels,
+    coltman_mtf,
+    measure_bars,
+    measure_star,
+)
 from photoplan.quality.patterns.usaf import UsafBars, UsafResult, UsafRules, measure_usaf
 from photoplan.requests.quality import MtfRequest
 

@@ -19,9 +19,16 @@ from photoplan.errors import InputError, PhotoplanError, TilesFailed
 from photoplan.events import Events
 from photoplan.io.disk import make_folder
 from photoplan.io.files import safe_stem
-from photoplan.io.product import ProductFacts, ProductFile, is_product, refuse_foreign_virtual, write_stacked
+from photoplan.io.product import (
+    ProductFacts,
+    ProductFile,
+    is_product,
+    refuse_foreign_overview,
+    refuse_foreign_virtual,
+    write_overview,
+    write_stacked,
+)
 from photoplan.io.project.model import Project
-from photoplan.io.quicklook import refuse_foreign_overview, write_overview
 from photoplan.io.raster_info import ImageForm, bands_of
 from photoplan.io.store import (
     KeptTiles,
@@ -241,10 +248,7 @@ def _complete(
         painted: dict[str, float] | None = None
         if "sources" in files and facts is not None:
             # A product without regions does not need the libraries of vector data.
-            from photoplan.io.vector_layer import (  # noqa: PLC0415
-                source_regions,
-                write_regions,
-            )
+            from photoplan.io.vector_layer import source_regions, write_regions  # noqa: PLC0415
 
             shapes = source_regions(standing(files["sources"].path), product.grid, len(product.images))
             painted = {product.images[row - 1]: float(shape.area) for row, shape in shapes.items()}

@@ -22,8 +22,8 @@ from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.bounds import bounds_fault
 from photoplan.geometry.grid import MapGrid, Window, refuse_absurd
+from photoplan.io.disk import nodata_for
 from photoplan.io.project.model import Project
-from photoplan.io.storage import nodata_for
 from photoplan.orientation.conventions import ImagePlausibility, JudgedView
 from photoplan.plain import advised, plain
 from photoplan.plan.accuracy import in_image

@@ -22,11 +22,10 @@ from photoplan.findings import Result
 from photoplan.geometry.grid import MOST_TILES, MapGrid
 from photoplan.io.disk import disk_error, library_error
 from photoplan.io.files import file_in
-from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project
-from photoplan.io.vector_layer import Regions
+from photoplan.io.vector_layer import PlanTables, Regions, read_plan_tables, write_plan_tables
 from photoplan.plain import pick, plain
 from photoplan.plan.footprint import Footprint, Tiles
 from photoplan.plan.product import compile_tile

@@ -23,13 +23,11 @@ from photoplan.geometry.bounds import MOST_HEIGHT, bounds_fault, odd_place
 from photoplan.geometry.frames import CylinderFrame, Frame, ImageFrame
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.files import fingerprint, safe_stem
-from photoplan.io.point_cloud import check_cloud
+from photoplan.io.points import check_cloud
 from photoplan.io.project.model import Project
 from photoplan.io.store import run_key
-from photoplan.matching.facets.observe import View
-from photoplan.matching.facets.pyramid import Pyramid
-from photoplan.matching.facets.reconstruct import MARGIN, Scheme, reconstruct
-from photoplan.matching.facets.search import Planes, Search
+from photoplan.matching.facets.observe import Pyramid, View
+from photoplan.matching.facets.reconstruct import MARGIN, Planes, Scheme, Search, reconstruct
 from photoplan.matching.features import GreyImage
 from photoplan.plain import advised, pick
 from photoplan.plan.footprint import Tile, Tiles

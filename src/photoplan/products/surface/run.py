@@ -15,9 +15,8 @@ from photoplan.engine.run import Tally, Work
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Result, noted
-from photoplan.io.disk import make_folder
-from photoplan.io.gdal import TARGET
-from photoplan.io.point_cloud import write_cloud
+from photoplan.io.disk import TARGET, make_folder
+from photoplan.io.points import write_cloud
 from photoplan.io.product import ProductFile, check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.raster_info import ImageForm

@@ -21,23 +21,16 @@ from photoplan.events import SILENT, Events
 from photoplan.findings import Result
 from photoplan.geometry.grid import Placement, Window
 from photoplan.geometry.pose import dot
-from photoplan.io.disk import make_folder
+from photoplan.io.disk import PICTURES, make_folder
 from photoplan.io.files import fingerprint
 from photoplan.io.product import DESCRIPTION, ProductFile, check_output
 from photoplan.io.quality_files import BANDS, MatrixFile
 from photoplan.io.raster_info import ImageForm
-from photoplan.io.storage import PICTURES
 from photoplan.io.store import input_entry, run_key, scratch, together, write_atomically, write_run_record
 from photoplan.plain import json_text, pick, plain
 from photoplan.plan.footprint import Tile, Tiles
 from photoplan.products.run import Run, refuse_inputs
-from photoplan.products.view.camera import (
-    ViewCamera,
-    ViewGround,
-    map_axes,
-    open_view_ground,
-    view_camera,
-)
+from photoplan.products.view.camera import ViewCamera, ViewGround, map_axes, open_view_ground, view_camera
 from photoplan.products.view.content import (
     Colours,
     Overlay,

@@ -14,22 +14,16 @@ from numpy.typing import NDArray
 from photoplan.adjustment.least_squares import by_differences, spread
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.geometry.pose import (
-    angle_in_unit,
-    angles_from_rotation,
-    small_rotations,
-    view_from_rotation,
-)
+from photoplan.geometry.pose import angle_in_unit, angles_from_rotation, small_rotations, view_from_rotation
 from photoplan.io.orientation.block import OrientationBlock, OrientationTable, OrientedImage
-from photoplan.io.orientation.toml import render
+from photoplan.io.orientation.text import render_toml
+from photoplan.io.product import write_png
 from photoplan.io.project.file import toml_value
-from photoplan.io.quicklook import write_png
 from photoplan.io.raster import RasterReader
 from photoplan.io.store import write_atomically
 from photoplan.io.tables import Columns, read_table
-from photoplan.matching.features import GreyImage
-from photoplan.matching.sky_edge import edge_strength, sky_edge
-from photoplan.orientation.skyline import SkylineFit, fit_skyline
+from photoplan.matching.features import GreyImage, edge_strength, sky_edge
+from photoplan.orientation.intersection import SkylineFit, fit_skyline
 from photoplan.products.view.camera import ViewCamera, ViewGround, map_axes
 from photoplan.products.view.content import Colours, Overlay, OverlayFacts, grey_span, in_colours
 from photoplan.products.view.lines import LineStyle
@@ -405,4 +399,4 @@ def _orientation_text(
     if constant is not None:
         factor, sigma = constant
         note = f"# Its camera constant is {factor:.7f} (±{sigma:.7f}) times that of its camera: alter it there, too.\n"
-    return note + render(OrientationBlock(table), file)[file]
+    return note + render_toml(OrientationBlock(table), file)[file]

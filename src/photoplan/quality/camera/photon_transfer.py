@@ -14,8 +14,8 @@ from photoplan.adjustment.least_squares import solve, spread
 from photoplan.adjustment.statistics import chance_chi_square, chance_t
 from photoplan.errors import InputError
 from photoplan.findings import with_sigma
-from photoplan.quality.camera.dark_signal import Level, check_level, cut_off
-from photoplan.quality.camera.straight_lines import fit_line
+from photoplan.quality.camera.geometry import fit_line
+from photoplan.quality.camera.sensor import Level, check_level, cut_off
 
 #: Variance of rounding to whole grey values (Behr 1989, eq. 3.14); of other steps times their square.
 QUANTISATION = 1.0 / 12.0

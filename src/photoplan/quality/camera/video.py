@@ -14,7 +14,7 @@ from photoplan.adjustment.least_squares import levenberg, solve, spread
 from photoplan.adjustment.statistics import chance_f, chance_normal, chance_t
 from photoplan.errors import InputError
 from photoplan.quality.camera.drift import LEAST_VALUES, Approach, check_times, fit_approach
-from photoplan.quality.camera.straight_lines import LEAST_LINES
+from photoplan.quality.camera.geometry import LEAST_LINES
 
 Array = NDArray[np.float64]
 

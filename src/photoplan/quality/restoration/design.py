@@ -13,8 +13,14 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import GAUSSIAN_WIDTH, MtfCurve, SpreadFunction, disc_transfer
-from photoplan.quality.restoration.restorer import FilterKernel
-from photoplan.quality.restoration.scene import FOLDS, SceneStatistics, Transfer, block_spectra, frequency_grid
+from photoplan.quality.restoration.restorer import (
+    FOLDS,
+    FilterKernel,
+    SceneStatistics,
+    Transfer,
+    block_spectra,
+    frequency_grid,
+)
 
 #: Frequencies per axis over which the series of the inverse is summed.
 _GRID = 256

@@ -1,4 +1,6 @@
-"""Camera descriptions from files of any known format.
+"""File formats of cameras and orientations: the registries, and reading and writing files of any of them.
+
+Camera descriptions from files of any known format.
 
 A camera from a calibration report of the U.S. Geological Survey is a camera in photoplan's TOML
 (``docs/templates/usgs-camera.toml`` is a template); beside its ``[cameras.NAME]`` the file may have a table
@@ -10,20 +12,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from photoplan.errors import InputError
+from photoplan.errors import InputError, UsageError
 from photoplan.io.camera.model import Camera, CameraEntry
 from photoplan.io.camera.opencv import is_opencv, read_opencv, read_orthority
+from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.files import explain, finite, looks_like, read_head, read_toml
-from photoplan.io.orientation import colmap as orientation_colmap
-from photoplan.io.orientation import metashape as orientation_metashape
-from photoplan.io.orientation import opensfm, pix4d
-from photoplan.io.orientation.form import TableFormat
+from photoplan.io.orientation import opensfm, projects, structure_from_motion
+from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, OrientationTable, TableFormat
+from photoplan.io.product import check_output
+from photoplan.io.store import together, write_atomically
 
 #: Coordinates and distances are printed to a micrometre each; rounding makes 2 µm, and the least-squares solution that
 #: the coordinates come from one more.
@@ -78,9 +82,9 @@ def _text(path: Path) -> dict[str, CameraEntry]:
     """Cameras of one of the formats whose files end in ``.txt``."""
     head = read_head(path)
     if head.lstrip().lower().startswith("filename imagewidth"):
-        return dict(pix4d.read(path, TableFormat()).cameras)
+        return dict(projects.read_pix4d(path, TableFormat()).cameras)
     if "CAMERA_ID, MODEL" in head or path.name == "cameras.txt":
-        return orientation_colmap.read_cameras(path)
+        return structure_from_motion.read_colmap_cameras(path)
     raise InputError(
         f"{path}: no camera format; of text files, COLMAP's cameras.txt and Pix4D's calibrated_camera_parameters.txt "
         f"describe cameras{looks_like(path)}"
@@ -118,10 +122,10 @@ CAMERA_FORMATS: dict[str, Callable[[Path], dict[str, CameraEntry]]] = {
     ".yaml": _yaml,
     ".yml": _yaml,
     ".json": _json,
-    ".xml": orientation_metashape.read_cameras,
-    ".cam": pix4d.read_cameras,
+    ".xml": structure_from_motion.read_metashape_cameras,
+    ".cam": projects.read_pix4d_cameras,
     ".txt": _text,
-    ".bin": orientation_colmap.read_cameras,
+    ".bin": structure_from_motion.read_colmap_cameras,
 }
 
 
@@ -150,3 +154,87 @@ def read_cameras(path: str | Path) -> CameraFile:
     if not cameras:
         raise InputError(f"{path}: describes no camera")
     return CameraFile(path, cameras, suffix == ".json" and not is_opencv(path))
+
+
+#: Module and value of every format, by name; the value is `FORMAT` unless it is named.
+FORMATS: dict[str, str] = {
+    "csv": "photoplan.io.orientation.text:CSV",
+    "toml": "photoplan.io.orientation.text:TOML",
+    "opensfm": "photoplan.io.orientation.opensfm",
+    "patb": "photoplan.io.orientation.text:PATB",
+    "bingo": "photoplan.io.orientation.text:BINGO",
+    "bluh": "photoplan.io.orientation.text:BLUH",
+    "inpho": "photoplan.io.orientation.projects:INPHO",
+    "metashape": "photoplan.io.orientation.structure_from_motion:METASHAPE",
+    "pix4d": "photoplan.io.orientation.projects:PIX4D",
+    "opk": "photoplan.io.orientation.text:OPK",
+    "exif": "photoplan.io.image_metadata:EXIF",
+    "odm": "photoplan.io.orientation.opensfm:ODM",
+    "colmap": "photoplan.io.orientation.structure_from_motion:COLMAP",
+    "opencv": "photoplan.io.camera.opencv",
+}
+
+#: Formats whose reader says what is wrong with a file that no format claims, by suffix; else it is a table of text.
+_BY_SUFFIX = {".toml": "toml", ".json": "opensfm"}
+
+
+def orientation_format(name: str) -> OrientationFormat:
+    """The format of a name."""
+    if name not in FORMATS:
+        raise UsageError(f"orientation format {name!r}; allowed are {', '.join(FORMATS)}")
+    module, _, value = FORMATS[name].partition(":")
+    found: OrientationFormat = getattr(import_module(module), value or "FORMAT")
+    return found
+
+
+def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
+    """The one format that a file is of, by its content."""
+    if form.columns is not None:
+        # Only a table has columns to be declared.
+        return orientation_format("csv")
+    head = "" if path.is_dir() else read_head(path)
+    claiming = [f for f in map(orientation_format, FORMATS) if f.sniff(path, head)]
+    if path.is_dir() and not claiming:
+        raise InputError(f"{path}: a folder without photographs (JPEG, TIFF) or a COLMAP model; give one, or a file")
+    if len(claiming) > 1:
+        kinds = ", ".join(f"{f.name} ({f.title})" for f in claiming)
+        raise InputError(f"{path}: its content does not tell which format it is: {kinds}; say it with `format`")
+    return claiming[0] if claiming else orientation_format(_BY_SUFFIX.get(path.suffix.lower(), "csv"))
+
+
+def read_orientation_block(
+    path: str | Path, form: TableFormat | None = None, format: str | None = None
+) -> OrientationBlock:
+    """Oriented images of a file, with cameras where it holds them; coordinates are brought into metres."""
+    path, form = Path(path), form or TableFormat()
+    chosen = choose_format(path, form) if format is None else orientation_format(format)
+    block = chosen.read(path, form)
+    return replace(block, table=block.table.in_metres())
+
+
+def read_orientation(path: str | Path, form: TableFormat | None = None, format: str | None = None) -> OrientationTable:
+    """Orientation table of a file; see `read_orientation_block`."""
+    return read_orientation_block(path, form, format).table
+
+
+def write_orientation(block: OrientationBlock, path: str | Path, format: str, *, overwrite: bool = False) -> list[Path]:
+    """Write a block in a format; each file appears complete or not at all."""
+    render = orientation_format(format).render
+    if render is None:
+        raise UsageError(f"orientation format {format} is read only; written are {', '.join(written_formats())}")
+    texts = render(block, Path(path))
+    for file in texts:
+        check_output(file, overwrite=overwrite)
+    with together():
+        for file, text in texts.items():
+            try:
+                make_parents(file.parent)
+            except OSError as error:
+                raise disk_error(file.parent, error) from None
+            write_atomically(file, text.encode())
+    return list(texts)
+
+
+def written_formats() -> list[str]:
+    """Names of the formats that can be written."""
+    return [name for name in FORMATS if orientation_format(name).render is not None]
