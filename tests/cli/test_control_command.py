@@ -14,7 +14,8 @@ from tools.real_projects import drone_project
 from tools.recorded import recorded
 
 from photoplan.io.points import read_ground_points, read_image_points
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 
 IMAGES = ("DJI_0025", "DJI_0026", "DJI_0027")
 

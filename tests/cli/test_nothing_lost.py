@@ -54,7 +54,7 @@ class TestDemo:
 
 
 def test_edits_of_a_project_keep_every_state_before(tmp_path: Path) -> None:
-    from photoplan.io.project.file import ProjectChanges, edit_project
+    from photoplan.io.project.edit import ProjectChanges, edit_project
 
     project = write_block(tmp_path).project
     states = [project.read_text()]

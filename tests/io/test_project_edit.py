@@ -9,8 +9,9 @@ import pytest
 import tomlkit
 
 from photoplan.errors import InputError
-from photoplan.io.project import file
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project import edit
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 
 WRITTEN = """# The block of 1987.
 format = 1
@@ -79,7 +80,7 @@ def test_only_what_changes_changes(path: Path) -> None:
 
 def test_new_entries_stand_before_the_comments_of_the_next_table() -> None:
     document = tomlkit.parse("[a]\nx = 1  # one\n\n# Defaults of b\n[b]\n# z = 3\n")
-    file._set(document.item("a"), {"y": [2.0, 3.0]})
+    edit._set(document.item("a"), {"y": [2.0, 3.0]})
     assert document.as_string().startswith("[a]\nx = 1  # one\ny = [2.0, 3.0]\n\n# Defaults of b\n[b]\n")
 
 

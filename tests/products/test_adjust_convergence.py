@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tools.adjust_project import MIDDLE, Make, write_project
 
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 from photoplan.products.adjust.run import AdjustRequest, adjust_project
 
 

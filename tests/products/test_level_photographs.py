@@ -12,7 +12,8 @@ from rasterio.transform import from_origin
 from tools.command import inside
 
 from photoplan.geometry.pose import ANGLE_UNITS, rotation_from_angles
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 from photoplan.io.project.model import turned_angles, turned_correlation
 
 #: Ecker 1991, section 8.1: the quarry, as printed.

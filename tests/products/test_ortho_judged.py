@@ -11,7 +11,8 @@ from tools.real_projects import drone_project
 from tools.small_block import Block, make_project
 
 from photoplan.errors import GeometryError, UsageError
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 from photoplan.products.check import check_project
 from photoplan.products.orthophoto.plan import plan_orthophotos
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.base import project as into_image
 from photoplan.io.points import read_ground_points, read_image_points
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 from photoplan.project.scene import open_scene
 
 __all__ = ["residuals", "spoilt"]

@@ -58,7 +58,7 @@ _PROJECT: dict[str, Verb] = {
         """,
         "requests.project:BudgetRequest",
         "products.budget:budget_or_tables",
-        {"picture": "report.products:draw_picture"},
+        {"picture": "report.project:draw_picture"},
     ),
     "info": Verb(
         "Show the content of a raster, project, plan or run record.",
@@ -77,7 +77,7 @@ _PROJECT: dict[str, Verb] = {
         """,
         "requests.project:ReportRequest",
         "products.report:report_project",
-        {"report": "report.products:project_page"},
+        {"report": "report.project:project_page"},
     ),
     "schema": Verb(
         "Print the options of a command as JSON Schema.",
@@ -389,7 +389,7 @@ _VIEW: dict[str, Verb] = {
         The same command continues a run that was interrupted.
         """,
         "requests.view:ViewRequest",
-        "report.products:labelled_picture",
+        "report.views:labelled_picture",
     ),
     "sequence": Verb(
         "Render views along a path, and a film of them.",
@@ -399,7 +399,7 @@ _VIEW: dict[str, Verb] = {
         The same command continues a run that was interrupted; renderings that exist already are kept.
         """,
         "requests.view:SequenceRequest",
-        "report.products:labelled_sequence",
+        "report.views:labelled_sequence",
     ),
     "matrix": Verb(
         "Compute the ground of every pixel as a raster.",

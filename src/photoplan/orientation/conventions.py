@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,9 @@ from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, InputError, PhotoplanError
 from photoplan.geometry.bounds import HIGHEST_FLIGHT
 from photoplan.geometry.pose import ANGLE_UNITS, FLIP, ROTATION_ORDERS, angle_in_radians, rotation_from_angles
-from photoplan.orientation.resection import MeasuredPoints, Resected
+
+if TYPE_CHECKING:  # orthophotos start without the bundle adjustment
+    from photoplan.orientation.resection import MeasuredPoints, Resected
 
 DIRECTIONS = ("camera-to-ground", "ground-to-camera")
 CAMERA_AXES = ("up-back", "down-forward")

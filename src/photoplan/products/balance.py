@@ -24,7 +24,8 @@ from photoplan.geometry.crs import crs_step, same_crs
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import lock_of, make_folder, make_parents
 from photoplan.io.product import check_output
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.io.quality_files import BalanceBand, write_balance_file
 from photoplan.io.raster import RasterReader

@@ -24,7 +24,8 @@ from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import Window
 from photoplan.io.points import write_ground_points, write_image_points
 from photoplan.io.product import check_output
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project, StatedTerrain
 from photoplan.io.raster import RasterReader
 from photoplan.io.store import recording

@@ -33,7 +33,8 @@ from photoplan.io.camera.model import FiducialSystem
 from photoplan.io.files import unique_stems
 from photoplan.io.formats import read_cameras
 from photoplan.io.product import check_output
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Image, Project, fiducial_fit, interior_of, lens_of
 from photoplan.io.raster_info import parse_pitch, read_pitch
 from photoplan.io.store import recording

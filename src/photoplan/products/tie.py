@@ -26,7 +26,8 @@ from photoplan.io.files import ImageNames, fingerprint, read_text
 from photoplan.io.orientation.block import TableFormat
 from photoplan.io.points import read_observed_positions, write_image_points
 from photoplan.io.product import check_output
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Image, Project, interior_of, lens_of
 from photoplan.io.raster import RasterReader
 from photoplan.io.store import ResultLog, input_entry, run_key, run_times, together, write_run_record

@@ -17,7 +17,8 @@ from photoplan.errors import DatumDefect, GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import disk_error, make_parents
 from photoplan.io.product import check_output
-from photoplan.io.project.file import ProjectChanges, edit_project, load_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Image, Project, interior_of, lens_of
 from photoplan.io.store import recording, stated_json, write_atomically
 from photoplan.io.vector_layer import write_point_layers, write_residuals

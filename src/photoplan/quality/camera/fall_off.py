@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from photoplan.adjustment.least_squares import bisquare, by_differences, solve, spread
 from photoplan.errors import GeometryError, InputError
@@ -677,9 +677,9 @@ def _dirt(blocks: Blocks, residuals: Array, relative: Array) -> tuple[Dirt, ...]
     limit = _DIRTY * spread(residuals[known])
     if not limit > 0.0:
         return ()
-    pieces, _ = ndimage.label(known & (np.abs(residuals) > limit), np.ones((3, 3)))
+    pieces, _ = scipy.ndimage.label(known & (np.abs(residuals) > limit), np.ones((3, 3)))
     found = []
-    for number, place in enumerate(ndimage.find_objects(pieces), 1):
+    for number, place in enumerate(scipy.ndimage.find_objects(pieces), 1):
         values = np.where(pieces[place] == number, relative[place], 0.0)
         rows, columns = (s for s in place)
         deepest = float(values.flat[int(np.abs(values).argmax())])
