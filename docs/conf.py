@@ -29,15 +29,15 @@ autodoc_default_options = {"members": True}
 # In docstrings a single backtick marks code.
 default_role = "code"
 
+# The theme that comes with Sphinx; `_static/custom.css` makes wide tables and output scroll.
 html_theme = "alabaster"
 html_title = "photoplan"
 html_static_path = ["_static"]
 html_theme_options = {
-    "description": "Photographs with known geometry become measurable pictures.",
+    "description": "Orthophotos, mosaics, terrain models and views from images, with their accuracy.",
     "fixed_sidebar": False,
-    "page_width": "1040px",
-    "sidebar_width": "230px",
-    "font_family": "Georgia, 'Times New Roman', serif",
+    "page_width": "940px",
+    "sidebar_width": "250px",
     "show_powered_by": False,
 }
 html_sidebars = {"**": ["about.html", "searchfield.html", "navigation.html"]}
