@@ -99,9 +99,9 @@ def test_of_a_project(photoplan: Here, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "give PROJECT, or --camera-constant and --height"),
-        (("--camera-constant", 150), "give --height METRES"),
-        (("--camera-constant", 150, "--height", -1), "positive ones are needed"),
+        ((), "requires PROJECT, or --camera-constant and --height"),
+        (("--camera-constant", 150), "set --height METRES"),
+        (("--camera-constant", 150, "--height", -1), "must be positive"),
         ((*NUMBERS, "--kernel", "sharp"), "allowed are nearest"),
     ],
 )

@@ -56,7 +56,7 @@ def test_json(photoplan, toml, tmp_path):
         (("--to", "csv", "--format", "nonsense"), 2, "allowed are csv"),
         ((), 2, "--to FORMAT"),
         (("--to", "csv", "--list-readings"), 2, "--image-points FILE and --control FILE"),
-        (("--to", "csv", "--control", "x"), 2, "go with --list-readings"),
+        (("--to", "csv", "--control", "x"), 2, "require --list-readings"),
         (("--to", "csv", "--crs", "EPSG:4326"), 3, "projected"),
         (("--to", "csv", "--camera", "missing.toml"), 3, "missing.toml"),
         (("--to", "csv", "--format", "bingo"), 3, "no line begins with ORIA"),

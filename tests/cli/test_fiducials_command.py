@@ -265,10 +265,10 @@ def test_a_mirrored_scan_does_not_enter_a_project_that_says_it_is_not(
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
-        (("{a}",), 2, "--camera FILE is needed"),
-        (("{a}", "{a}", "--camera", "{camera}"), 2, "given twice"),
+        (("{a}",), 2, "--camera FILE, which describes the fiducial marks, or a project file is required"),
+        (("{a}", "{a}", "--camera", "{camera}"), 2, "is set twice"),
         (("{a}", "--camera", "{camera}", "--camera-name", "zeiss"), 2, "no film camera 'zeiss'"),
-        (("{a}", "--camera", "{camera}", "--images", "a"), 2, "among the images of a project"),
+        (("{a}", "--camera", "{camera}", "--images", "a"), 2, "--images requires a project"),
         (("{a}", "--camera", "{camera}", "--scan-resolution", "fine"), 2, "scan resolution 'fine'"),
         (("{a}", "--camera", "{camera}", "--band", "4"), 3, "band 4; the file has 3"),
         (("{a}", "--camera", "{camera}", "--rotation", "45"), 2, "45"),

@@ -36,7 +36,7 @@ def with_defaults(folder: Path, text: str) -> Path:
         ("features = [1, 2]", (), "[defaults.tie] features: list [1, 2]; needed is a whole number"),
         ("features = { a = 1 }", (), "[defaults.tie] features: dict {'a': 1}; needed is a whole number"),
         ("features = 1979-05-27", (), "[defaults.tie] features: date; needed is a whole number"),
-        ("features = -5", (), "[defaults.tie] -5 features and 500 points per image; 50 and 1 are the least"),
+        ("features = -5", (), "[defaults.tie] features -5 must be at least 50, per_image 500 at least 1"),
         ("refine = 0", (), "[defaults.tie] refine: int 0; needed is True or False"),
         ("pairs = 5", (), "[defaults.tie] pairs 5 must be one of auto or all (pairs of images that are compared: auto"),
         ('pairs = "\\u0000"', (), "input '\\x00'"),

@@ -279,7 +279,7 @@ class TestFaults:
         ("words", "code", "message"),
         [
             (["--memory", "100MB"], 2, "MiB are needed for one tile"),
-            (["--dtype", "uint32"], 2, "dtype 'uint32'; allowed are same, float32, uint16"),
+            (["--dtype", "uint32"], 2, "--dtype 'uint32' must be same, float32 or uint16"),
             (["--compress", "zip"], 2, "compression 'zip'"),
             (["--band", "4"], 3, "band 4 is asked for; the image has 3"),
             (["--linearisation", "gamma.txt"], 3, "gamma.txt"),

@@ -126,10 +126,10 @@ def test_pairs_of_a_file(photoplan: Here, project: Path, tmp_path: Path) -> None
     ("options", "message"),
     [
         (["--images", "DJI_0025"], "tie points need two images"),
-        (["--scale", "0"], "a number from 0.01 to 1"),
-        (["--features", "3"], "50 and 1 are the least"),
+        (["--scale", "0"], "--scale 0 must be from 0.01 to 1"),
+        (["--features", "3"], "--features 3 must be at least 50"),
         (["--images", "nothing*"], "is not in the project"),
-        (["-o", "points.png"], "a table is written"),
+        (["-o", "points.png"], "must be the name of a table"),
     ],
 )
 def test_wrong_use(photoplan: Here, project: Path, options: list[str], message: str) -> None:

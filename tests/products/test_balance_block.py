@@ -125,7 +125,7 @@ def test_a_coarse_reference_gives_its_colours(block: Block, capsys: pytest.Captu
     said = photoplan("balance", block.project, "-o", path, "--overwrite")
     assert said.code == 2 and "give the name of a folder" in said.err
     both = photoplan("balance", block.project, "--reference", path, "--reference-image", "one", "--overwrite")
-    assert both.code == 2 and "give one of them" in both.err
+    assert both.code == 2 and "exclude each other; set one of them" in both.err
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, pytest.param(np.float32, marks=pytest.mark.slow)])

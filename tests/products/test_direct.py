@@ -82,8 +82,8 @@ def test_no_ray_goes_through_a_house_and_walls_are_not_painted(town: Block, caps
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (("--method", "slow"), "method 'slow'; allowed are indirect, direct"),
-        (("--fill", 3), "--fill 3; allowed are 0 to 32 pixels, with --method direct"),
+        (("--method", "slow"), "method 'slow' must be one of indirect, direct"),
+        (("--fill", 3), "--fill 3 must be from 0 to 32 pixels, and requires --method direct"),
         (("--method", "direct", "--fill", 99), "--fill 99"),
         (("--method", "direct", "--hidden", "mark"), "paints no hidden ground"),
         (("--method", "direct", "--accuracy"), "--accuracy"),

@@ -144,8 +144,8 @@ def test_runs_go_on_and_nothing_is_replaced(tmp_path: Path) -> None:
 def test_words_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     town = write_town(tmp_path, (64, 48))
     for words, said in (
-        (["simulate"], "give SCENE"),
-        (["simulate", "edge:5", "--scene", town.path], "give SCENE"),
+        (["simulate"], "SCENE, a file or a pattern, or --scene is required"),
+        (["simulate", "edge:5", "--scene", town.path], "SCENE, a file or a pattern, or --scene is required"),
         (["simulate", "edge:5", "--truth"], "--truth does not go with a file or pattern"),
         (["simulate", "--scene", town.path, "--levels", 0, 1], "--levels does not go with a project"),
         (["simulate", "--scene", town.path, "--bounds", 0, 0, 1, 1], "--resolution"),

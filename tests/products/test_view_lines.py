@@ -169,7 +169,7 @@ def test_geojson_is_wgs_84_and_what_states_no_crs_is_not_guessed(small: Block, w
         ("@width=1e9", InputError, "0.1 to 200"),
         ("@dash=3", InputError, "strokes and gaps"),
         ("@label=nobody", InputError, "no such attribute"),
-        ("@shade=3", UsageError, "options are KEY=VALUE"),
+        ("@shade=3", UsageError, "must be KEY=VALUE"),
         ("@width=nan", InputError, "0.1 to 200"),
     ],
 )
@@ -183,7 +183,7 @@ def test_files_that_cannot_be_used_are_said(small: Block, ways: Path, tmp_path: 
         drawn(small, str(ways))
     with pytest.raises(UsageError, match="no such file"):
         LinesRequest.parse("nothing.gpkg")
-    with pytest.raises(UsageError, match="nothing is drawn"):
+    with pytest.raises(UsageError, match="`svg` requires `lines`"):
         ViewRequest(small.terrain, STAND, svg=tmp_path / "a.svg")
     svg = tmp_path / "x.svg"
     svg.touch()

@@ -256,11 +256,11 @@ def test_what_makes_no_sense_is_refused(mountains: tuple[Path, Path], tmp_path: 
     dem, photo = mountains
     words = ("--from", 502000, 5300300, "--altitude", 900, "--azimuth", 3, "--size", 480, 300, "-o", tmp_path / "s.csv")
     for more, why in (
-        (("--refine",), "belongs to a photograph"),
-        (("--photo", photo, "--focal"), "set --refine"),
+        (("--refine",), "requires --photo"),
+        (("--photo", photo, "--focal"), "--focal requires --refine"),
         (("--photo", photo, "--exaggeration", 2, "--reference", 500, "--force"), "heights as they are"),
         (("--photo", photo, "--refine", "--panorama", "cylinder", "--force"), "panorama"),
-        (("--photo", photo, "--picture", tmp_path / "p.jpg"), "written as .png"),
+        (("--photo", photo, "--picture", tmp_path / "p.jpg"), "must end with .png"),
     ):
         said = inside("view", "skyline", dem, *words, *more)
         assert said.code == 2 and why in said.err, said.err

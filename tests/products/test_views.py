@@ -199,7 +199,7 @@ def test_what_cannot_be_seen_or_written_is_refused(small: Block, tmp_path: Path)
                   {"azimuth": 0.0, "size": (300_000, 10)}, {"azimuth": 0.0, "exaggeration": -1.0}):  # fmt: skip
         with pytest.raises(UsageError):
             CameraRequest(**at, **wrong)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="no such file"):
+    with pytest.raises(UsageError, match="must be a file, or shade"):
         ContentRequest.parse("nothing.tif")
 
 

@@ -59,11 +59,11 @@ class ConvertRequest(Request):
     def check(self) -> None:
         """Refuse a list of readings without points, and points without it."""
         if self.list_readings and (self.image_points is None or self.control is None):
-            raise UsageError("`list_readings` needs `image_points` FILE and `control` FILE")
+            raise UsageError("`list_readings` requires `image_points` FILE and `control` FILE")
         if not self.list_readings and self.target is None:
             raise UsageError("the format is missing: set `target` FORMAT")
         if not self.list_readings and (self.image_points is not None or self.control is not None):
-            raise UsageError("`image_points` and `control` go with `list_readings`")
+            raise UsageError("`image_points` and `control` require `list_readings`")
 
 
 _AUTO = {"auto": None, "yes": True, "no": False}
@@ -107,13 +107,13 @@ class FiducialsRequest(Request):
             if self.camera is not None or self.camera_name is not None:
                 raise UsageError("a project describes its cameras itself; leave out `camera` and `camera_name`")
         elif not self.images:
-            raise UsageError("no image is given; give scans and `camera` FILE, or a project file")
+            raise UsageError("no image is set; set scans and `camera` FILE, or a project file")
         elif self.select:
-            raise UsageError("`select` chooses among the images of a project; here the images are given themselves")
+            raise UsageError("`select` requires a project; the images are already set one by one")
         elif self.camera is None:
-            raise UsageError("`camera` FILE is needed: it describes the fiducial marks; or give a project file")
+            raise UsageError("`camera` FILE, which describes the fiducial marks, or a project file is required")
         if twice := sorted({str(f) for f in self.images if self.images.count(f) > 1}):
-            raise UsageError(f"image {twice[0]} is given twice")
+            raise UsageError(f"image {twice[0]} is set twice")
 
 
 class InteriorRequest(Request):
@@ -135,7 +135,7 @@ class InteriorRequest(Request):
     def check(self) -> None:
         """Refuse to write no model."""
         if self.write and self.model is None:
-            raise UsageError("`write` sets the model of the cameras; set `model`, too")
+            raise UsageError("`write` requires `model`, which it writes into the cameras")
 
 
 class ControlRequest(Request):
@@ -197,11 +197,11 @@ class TieRequest(Request):
     def check(self) -> None:
         """Refuse numbers with which nothing is found, and names that other files need."""
         if self.features < 50 or self.per_image < 1:
-            raise UsageError(f"{self.features} features and {self.per_image} points per image; 50 and 1 are the least")
+            raise UsageError(f"`features` {self.features} must be at least 50, `per_image` {self.per_image} at least 1")
         if self.scale is not None and not 0.01 <= self.scale <= 1:
-            raise UsageError(f"scale {self.scale:g}; a number from 0.01 to 1 is needed, such as 0.5")
+            raise UsageError(f"`scale` {self.scale:g} must be from 0.01 to 1, such as 0.5")
         if self.product.suffix.lower() in (".png", ".matches", ".json"):
-            raise UsageError(f"{self.product}: a table is written; give it a name such as tie_points.csv")
+            raise UsageError(f"{self.product}: must be the name of a table, such as tie_points.csv")
 
     @property
     def product(self) -> Path:
@@ -245,7 +245,7 @@ class ResectRequest(Request):
     def check(self) -> None:
         """Refuse negative standard deviations."""
         if min(self.sigma_control or (0.0,)) < 0:
-            raise UsageError(f"`sigma_control` {self.sigma_control}: numbers of at least 0 are needed, in metres")
+            raise UsageError(f"`sigma_control` {self.sigma_control} must be at least 0 metres each")
 
 
 class AdjustRequest(Request):
@@ -281,7 +281,7 @@ class AdjustRequest(Request):
     def check(self) -> None:
         """Refuse a critical value that rejects everything."""
         if not self.critical > 0:
-            raise UsageError(f"`critical` {self.critical:g}; a positive number of standard deviations is needed")
+            raise UsageError(f"`critical` {self.critical:g} must be a positive number of standard deviations")
 
     @property
     def folder(self) -> Path:

@@ -44,7 +44,7 @@ def _one_of(what: str, names: Any) -> BeforeValidator:
 
     def judged(given: Any) -> Any:
         if given is not None and given not in get_args(names):
-            raise UsageError(f"{what} {given!r}; allowed are {', '.join(get_args(names))}")
+            raise UsageError(f"{what} {given!r} must be one of {', '.join(get_args(names))}")
         return given
 
     return BeforeValidator(judged)
@@ -74,7 +74,7 @@ class Choice(Request):
     def check(self) -> None:
         """Refuse a blending without a width."""
         if self.blend == "multiband" and self.feather == 0:
-            raise UsageError("`blend` multiband needs the width over which coarse detail passes; give `feather`")
+            raise UsageError("`blend` multiband requires `feather`, the width over which coarse detail passes")
 
 
 def _number_or_text(given: Any) -> Any:
@@ -147,15 +147,15 @@ class OrthoSettings(SingleOptions, PixelOptions):
             object.__setattr__(self, "hidden", "nodata" if self.true or self.method == "direct" else "show")
         if not (self.tolerance == 0 or 1e-6 <= self.tolerance <= 10):
             raise UsageError(
-                f"tolerance {self.tolerance} px; it must be 0 (every pixel strictly by its camera) or 1e-6 to 10 "
+                f"`tolerance` {self.tolerance} px must be 0 (every pixel strictly by its camera) or 1e-6 to 10 "
                 "(usual is 0.02)"
             )
         if self.tile < 128 or self.tile > 4096 or self.tile % 16:
-            raise UsageError(f"tile side {self.tile}; allowed are multiples of 16 from 128 to 4096")
+            raise UsageError(f"`tile` {self.tile} must be a multiple of 16 from 128 to 4096")
         if self.nodata not in ("auto", "mask") and isinstance(_number_or_text(self.nodata), str):
-            raise UsageError(f"nodata {self.nodata!r}; allowed are auto, mask or a number")
+            raise UsageError(f"`nodata` {self.nodata!r} must be auto, mask or a number")
         if not 0 <= self.fill <= MOST_FILLED or (self.fill and self.method != "direct"):
-            raise UsageError(f"`fill` {self.fill}; allowed are 0 to {MOST_FILLED} pixels, with `method` direct")
+            raise UsageError(f"`fill` {self.fill} must be from 0 to {MOST_FILLED} pixels, and requires `method` direct")
         if self.method == "direct" and (self.choice is not None or self.accuracy or self.hidden != "nodata"):
             raise UsageError(
                 "`method` direct makes orthophotos of single images, paints no hidden ground and knows no `accuracy`: "
@@ -170,7 +170,7 @@ class OrthoSettings(SingleOptions, PixelOptions):
             # Filled pixels are never without their mark.
             object.__setattr__(self, "sources", True)
         if self.stack and self.choice is not None:
-            raise UsageError(f"`stack` {self.stack!r} shows orthophotos as bands; a mosaic is one picture already")
+            raise UsageError(f"`stack` {self.stack!r} shows orthophotos as bands; a mosaic is one raster already")
 
     @property
     def exactness(self) -> str:
@@ -217,7 +217,7 @@ class ProductRequest(PixelOptions):
     def check(self) -> None:
         """Refuse squares of a plan that is not shown."""
         if self.show_quadtree and not self.dry_run and self.plan_file is None:
-            raise UsageError("`show_quadtree` shows a plan: set `plan_file` or `dry_run`, too")
+            raise UsageError("`show_quadtree` requires `plan_file` or `dry_run`")
 
     @property
     def folder(self) -> Path:
@@ -366,11 +366,11 @@ class BalanceRequest(Request):
     def check(self) -> None:
         """Refuse what does not go together."""
         if self.reference is not None and self.factor:
-            raise UsageError("factors from ratios know no reference; set `reference_image`, or leave `factor` out")
+            raise UsageError("`reference` does not go with `factor`; set `reference_image`, or leave `factor` out")
         if self.reference is not None and self.reference_image is not None:
-            raise UsageError("a reference image and a reference; give one of them")
+            raise UsageError("`reference_image` and `reference` exclude each other; set one of them")
         if not 0 <= self.degree <= 4:
-            raise UsageError(f"degree {self.degree}; allowed are 0 (tables alone) to 4, usual is 2")
+            raise UsageError(f"`degree` {self.degree} must be from 0 (tables alone) to 4, usually 2")
 
 
 class IlluminationRequest(Request):

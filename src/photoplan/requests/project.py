@@ -96,14 +96,12 @@ class BudgetRequest(Request):
         if self.tables:
             return
         if (self.project is None) == (self.camera_constant is None):
-            raise UsageError(
-                "a budget is that of a project or of numbers: give PROJECT, or `camera_constant` and `height`"
-            )
+            raise UsageError("a budget requires PROJECT, or `camera_constant` and `height`")
         if self.project is None and self.height is None:
-            raise UsageError("a budget of numbers needs the flying height above ground: give `height` METRES")
+            raise UsageError("a budget of numbers requires the flying height above ground: set `height` METRES")
         numbers = [self.camera_constant, self.height, *self.format, self.pixel, self.tolerance]
         if not all(n is None or n > 0 for n in numbers):
-            raise UsageError(f"numbers {numbers} of the flight; positive ones are needed")
+            raise UsageError(f"numbers of the flight must be positive, found {numbers}")
 
 
 class ReportRequest(Request):

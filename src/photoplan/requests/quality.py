@@ -64,7 +64,7 @@ class MtfRequest(Request):
             if name in of_edges and self.pattern is not None:
                 raise UsageError(f"`{name}` is for edges, not for `pattern` {self.pattern}")
             if name in patterns and self.pattern not in patterns[name]:
-                raise UsageError(f"`{name}` goes with `pattern` {' or '.join(patterns[name])}")
+                raise UsageError(f"`{name}` requires `pattern` {' or '.join(patterns[name])}")
         low, high = (0.01, 1e4) if self.pattern is None else (1e-3, 1e6)
         if self.pixel_um is not None and not low <= self.pixel_um <= high:
             raise UsageError(f"`pixel_size` {self.pixel_um:g} must be from {low:g} to {high:.0f} micrometres")
@@ -122,9 +122,9 @@ class RestoreRequest(Request):
     def check(self) -> None:
         """Refuse options of a measurement beside a filter."""
         if not self.images:
-            raise UsageError("no image is given")
+            raise UsageError("no image is set; set one or more")
         if self.filter is not None and self.aperture is not None:
-            raise UsageError("give `filter`, `aperture`, or neither to measure a filter in the images; one of them")
+            raise UsageError("`filter` and `aperture` exclude each other; set one, or none to measure a filter")
         given = "filter" if self.filter is not None else "aperture"
         measuring = ("method", "rotation", "size", "cells", "per_band", "most_edges", "least_length", "noise",
                      "save_filter")  # fmt: skip
@@ -132,9 +132,9 @@ class RestoreRequest(Request):
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise UsageError(f"`{name}` is for filters that are measured; leave out `{given}`")
         if self.size is not None and self.size % 2 == 0:
-            raise UsageError(f"`size` {self.size}: a filter has an odd number of rows and columns")
+            raise UsageError(f"`size` {self.size} must be odd: a filter has as many rows and columns")
         if self.dtype not in ("same", "float32", "uint16"):
-            raise UsageError(f"dtype {self.dtype!r}; allowed are same, float32, uint16")
+            raise UsageError(f"`dtype` {self.dtype!r} must be same, float32 or uint16")
 
     @property
     def folder(self) -> Path:
@@ -205,14 +205,14 @@ class SimulateRequest(Request):
     def check(self) -> None:
         """Refuse options that do not belong to the kind of scene."""
         if (self.scene is None) == (self.project is None):
-            raise UsageError("give SCENE, a file or a pattern, or `project`")
+            raise UsageError("SCENE, a file or a pattern, or `project` is required")
         of_projects, of_patterns = "images texture grain truth resolution bounds", "frames exposure size levels phase"
         idle, kind = (of_patterns, "project") if self.scene is None else (of_projects, "file or pattern")
         for name in idle.split():
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise UsageError(f"`{name}` does not go with a {kind}; leave it out")
         if self.bounds is not None and self.resolution is None:
-            raise UsageError("`bounds` are those of the true orthophoto; give its `resolution`, too")
+            raise UsageError("`bounds` of the true orthophoto require its `resolution`")
         if self.size is not None and min(self.size) < 1:
             raise UsageError(f"`size` {self.size[0]} {self.size[1]}: each side must be at least 1 pixel")
 

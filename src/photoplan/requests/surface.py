@@ -34,7 +34,7 @@ class SurfaceSettings(Request):
     def check(self) -> None:
         """Refuse bands that no image has."""
         if len(set(self.bands)) < len(self.bands) or any(band < 1 for band in self.bands):
-            raise UsageError(f"bands {', '.join(map(str, self.bands))}; numbers from 1 on are needed, each once")
+            raise UsageError(f"`bands` {', '.join(map(str, self.bands))} must be numbers from 1 on, each once")
 
     @property
     def seen(self) -> str:

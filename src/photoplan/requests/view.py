@@ -75,19 +75,19 @@ class CameraRequest(Request):
 
         if self.look_at_height is not None:
             if self.look_at is None:
-                raise UsageError("`look_at_height` belongs to a point; give `look_at` X Y")
+                raise UsageError("`look_at_height` requires `look_at` X Y")
             object.__setattr__(self, "look_at", (*self.look_at[:2], self.look_at_height))
             object.__setattr__(self, "look_at_height", None)
         if self.is_file:
             return
         if self.image is not None and self.position is not None:
-            raise UsageError("a view needs one `camera`: an image of the project, or a standpoint `position` X Y")
+            raise UsageError("a view requires a `camera`, an image of the project, or a standpoint `position` X Y")
         declared = type(self).model_fields
         own = [name for name in _OF_STANDPOINT if getattr(self, name) != declared[name].default]
         if self.image is not None and own:
-            raise UsageError(f"`{own[0]}` belongs to a standpoint `position`; an image is seen with its own camera")
+            raise UsageError(f"`{own[0]}` requires a standpoint `position`; an image is seen with its own camera")
         if self.aside is not None and self.image is None:
-            raise UsageError("`aside` belongs to the camera of an image; a standpoint is moved by its `position`")
+            raise UsageError("`aside` requires the camera of an image; a standpoint is moved by its `position`")
         odd = odd_angles((self.azimuth or 0.0, self.roll), "deg", ("`azimuth`", "`roll`"))
         far = odd_place((0.0, 0.0, self.reference or 0.0), camera=True)
         if odd is not None or far is not None:
@@ -95,25 +95,25 @@ class CameraRequest(Request):
         if self.panorama and self.look_at is None and self.azimuth is None:
             object.__setattr__(self, "azimuth", 0.0)
         if self.position is not None and (self.look_at is None) == (self.azimuth is None):
-            raise UsageError("a standpoint needs either `look_at` X Y [Z] or `azimuth`")
+            raise UsageError("a standpoint requires either `look_at` X Y [Z] or `azimuth`")
         if self.look_at is not None and len(self.look_at) not in (2, 3):
-            raise UsageError(f"`look_at` {self.look_at}; X Y or X Y Z are needed")
+            raise UsageError(f"`look_at` {self.look_at} must be X Y or X Y Z")
         most = 360.0 if self.panorama else 170.0
         if self.field_of_view is not None and not 1e-4 <= self.field_of_view <= most:
-            raise UsageError(f"`field_of_view` {self.field_of_view}°; 0.0001 to {most:g} are allowed")
+            raise UsageError(f"`field_of_view` {self.field_of_view}° must be from 0.0001 to {most:g}")
         if not all(1 <= side <= _LARGEST for side in self.size):
-            raise UsageError(f"picture of {self.size[0]} × {self.size[1]} pixels; sides of 1 to {_LARGEST} are allowed")
-        refuse_absurd(self.size, USUAL_TILE, "the picture")
+            raise UsageError(f"`size` {self.size[0]} × {self.size[1]} pixels must have sides from 1 to {_LARGEST}")
+        refuse_absurd(self.size, USUAL_TILE, "the rendering")
         if not 0.01 <= self.pixel_aspect <= 100:
-            raise UsageError(f"`pixel_aspect` {self.pixel_aspect}; 0.01 to 100 are allowed")
+            raise UsageError(f"`pixel_aspect` {self.pixel_aspect} must be from 0.01 to 100")
         if self.refraction is not None and not -1 <= self.refraction < 1:
-            raise UsageError(f"`refraction` {self.refraction}; from -1 to below 1, usual is {USUAL_REFRACTION}")
+            raise UsageError(f"`refraction` {self.refraction} must be from -1 to below 1, usually {USUAL_REFRACTION}")
         if self.earth_radius is not None and not 1e6 <= self.earth_radius <= 1e8:
-            raise UsageError(f"`earth_radius` {self.earth_radius} m; that of the earth is 6380000")
+            raise UsageError(f"`earth_radius` {self.earth_radius} m is not a radius of the earth (about 6380000)")
         if self.exaggeration != 1.0:
             Exaggeration(0.0, self.exaggeration)
         if not abs(self.pitch) <= 90:
-            raise UsageError(f"`pitch` {self.pitch}°; -90 to 90 are allowed")
+            raise UsageError(f"`pitch` {self.pitch}° must be from -90 to 90")
 
     @property
     def is_file(self) -> bool:
@@ -158,7 +158,7 @@ class PathCameraRequest(CameraRequest):
     def check(self) -> None:
         """Refuse a standpoint, which the path states."""
         if self.image is not None or self.position is not None:
-            raise UsageError("standpoints of a sequence are those of its `path`; give neither `camera` nor `position`")
+            raise UsageError("standpoints of a sequence are those of its `path`; set neither `camera` nor `position`")
         super().check()
 
 
@@ -176,7 +176,7 @@ class ContentRequest:
 
     def __post_init__(self) -> None:
         if not 0 < self.opacity <= 1:
-            raise UsageError(f"content {self.value or self.kind}: opacity {self.opacity}; above 0 and up to 1")
+            raise UsageError(f"content {self.value or self.kind}: opacity {self.opacity} must be above 0 and at most 1")
 
     @classmethod
     def parse(cls, text: str) -> ContentRequest:
@@ -200,8 +200,8 @@ class ContentRequest:
             return cls(kind, known, opacity)
         if not Path(text).is_file():
             raise UsageError(
-                f"content {text!r}: no such file; other contents are shade, slope, tint, tint:RAMP:LOW:HIGH, photos "
-                "and photo:NAME, each with @OPACITY if you like, files also with @classes"
+                f"content {text!r} must be a file, or shade, slope, tint, tint:RAMP:LOW:HIGH, photos "
+                "or photo:NAME, each with or without @OPACITY, files also with @classes"
             )
         return cls("raster", text, opacity, classes)
 
@@ -225,7 +225,7 @@ class LinesRequest:
         pairs = [tuple(part.strip() for part in each.split("=", 1)) for each in tail.split(",")] if tail else []
         wrong = [each for each in pairs if len(each) != 2 or each[0] not in KEYS]
         if wrong:
-            raise UsageError(f"lines {text!r}: {'='.join(wrong[0])!r}; options are KEY=VALUE with {', '.join(KEYS)}")
+            raise UsageError(f"lines {text!r}: {'='.join(wrong[0])!r} must be KEY=VALUE with one of {', '.join(KEYS)}")
         options = tuple((key, value) for key, value in pairs)
         kind, _, value = head.partition(":")
         if kind == "contours" and not Path(head).is_file():
@@ -234,7 +234,7 @@ class LinesRequest:
             return cls(Path(head), None, 0.0, options)
         file, _, layer = head.rpartition(":")
         if not (file and layer and Path(file).is_file()):
-            raise UsageError(f"lines {text!r}: no such file; give FILE, FILE:LAYER or contours:INTERVAL")
+            raise UsageError(f"lines {text!r} must be FILE, FILE:LAYER or contours:INTERVAL; there is no such file")
         return cls(Path(file), layer, 0.0, options)
 
 
@@ -261,9 +261,9 @@ class PhotoRequest:
 
     def __post_init__(self) -> None:
         if self.how not in ("over", "squares", "beside"):
-            raise UsageError(f"photo {self.path}: {self.how!r}; allowed are over, squares, beside, or an opacity")
+            raise UsageError(f"photo {self.path}: {self.how!r} must be over, squares, beside, or an opacity")
         if not 0 < self.opacity <= 1:
-            raise UsageError(f"photo {self.path}: opacity {self.opacity}; above 0 and up to 1")
+            raise UsageError(f"photo {self.path}: opacity {self.opacity} must be above 0 and at most 1")
 
     @classmethod
     def parse(cls, text: str) -> PhotoRequest:
@@ -310,16 +310,16 @@ class LookRequest(Request):
     def check(self) -> None:
         """Refuse what cannot be meant."""
         if not 0 <= self.haze <= 100:
-            raise UsageError(f"`haze` {self.haze} per kilometre; 0 to 100 are allowed, 0.1 is much")
+            raise UsageError(f"`haze` {self.haze} per kilometre must be from 0 to 100; 0.1 is much")
         if not 1 <= self.samples <= 8:
-            raise UsageError(f"`samples` {self.samples}; 1 to 8 rays along each side of a pixel are allowed")
+            raise UsageError(f"`samples` {self.samples} must be from 1 to 8 rays along each side of a pixel")
         if not (self.tolerance == 0 or 1e-6 <= self.tolerance <= 10):
             raise UsageError(
                 f"`tolerance` {self.tolerance} px; it must be 0 (every pixel strictly) or 1e-6 to 10 (usual is 0.02)"
             )
         for name in ("haze_colour", "sky", "nodata", "water_colour"):
             if not all(0 <= v <= 255 for v in getattr(self, name)):
-                raise UsageError(f"`{name}` {getattr(self, name)}; red, green and blue from 0 to 255 are needed")
+                raise UsageError(f"`{name}` {getattr(self, name)} must be red, green and blue from 0 to 255")
         self.light()
 
     def light(self, exaggeration: float = 1.0) -> Lighting:
@@ -357,7 +357,7 @@ class Stereo:
         if self.base is not None:
             return self
         if nearest is None:
-            raise UsageError("no ground is seen from which a `base` would follow; state it")
+            raise UsageError("no ground is seen from which a `base` would follow; set it")
         return Stereo(self.how, float(f"{nearest * (1 / 30):.2g}"))
 
 
@@ -410,11 +410,11 @@ class PictureOptions(SightRequest):
     def check(self) -> None:
         """Refuse what does not go together."""
         if self.base is not None and self.stereo is None:
-            raise UsageError("`base` belongs to a pair; give `stereo`, too")
+            raise UsageError("`base` requires `stereo`")
         if self.base is not None and not self.base > 0:
-            raise UsageError(f"`base` {self.base} m; a positive number is needed")
+            raise UsageError(f"`base` {self.base} m must be positive")
         if not 4 <= self.text_size <= 400:
-            raise UsageError(f"`text_size` {self.text_size} pixels; 4 to 400 are allowed")
+            raise UsageError(f"`text_size` {self.text_size} pixels must be from 4 to 400")
 
     @property
     def pair(self) -> Stereo | None:
@@ -445,11 +445,11 @@ class ViewRequest(PictureOptions):
         """Refuse what does not go together."""
         super().check()
         if self.stereo is not None and (self.matrix or self.svg or self.photo or self.kind == "matrix"):
-            raise UsageError("a stereo pair has two cameras; give no matrix, `photo` or `svg`")
+            raise UsageError("a stereo pair has two cameras; leave out matrix, `photo` and `svg`")
         if self.svg is not None and not self.lines:
-            raise UsageError(f"{self.svg}: nothing is drawn; give `lines`, too")
+            raise UsageError(f"{self.svg}: `svg` requires `lines`")
         if self.svg is not None and self.svg.suffix.lower() != ".svg":
-            raise UsageError(f"{self.svg}: what is drawn is written as .svg")
+            raise UsageError(f"{self.svg}: must end with .svg")
 
 
 class SequenceRequest(PictureOptions):
@@ -468,11 +468,11 @@ class SequenceRequest(PictureOptions):
         """Refuse a film that cannot be."""
         super().check()
         if self.video is not None and self.video.suffix.lower() != ".mp4":
-            raise UsageError(f"{self.video}: a film is written as .mp4")
+            raise UsageError(f"{self.video}: must end with .mp4")
         if not 0.1 <= self.rate <= 240:
-            raise UsageError(f"`rate` {self.rate}; 0.1 to 240 pictures per second are allowed")
+            raise UsageError(f"`rate` {self.rate} must be from 0.1 to 240 renderings per second")
         if self.stereo is not None and self.base is None:
-            raise UsageError("pairs of a sequence have one `base`; state it")
+            raise UsageError("pairs of a sequence require one `base`")
 
     @property
     def along(self) -> bool:
@@ -533,12 +533,12 @@ class SkylineRequest(MeasuringRequest):
         of_photo = ("border", "search", "control", "picture", "refine", "focal", "refined")
         given = [name for name in of_photo if name in self.model_fields_set and getattr(self, name) is not None]
         if given and self.photo is None:
-            raise UsageError(f"`{given[0]}` belongs to a photograph; give `photo`, too")
+            raise UsageError(f"`{given[0]}` requires `photo`")
         for name in ("focal", "refined"):
             if getattr(self, name) and not self.refine:
-                raise UsageError(f"`{name}` belongs to a camera that is turned; set `refine`, too")
+                raise UsageError(f"`{name}` requires `refine`")
         if self.border < 0 or (self.search is not None and self.search < 2):
-            raise UsageError(f"`border` {self.border}, `search` {self.search}; pixels from 0 and from 2 are needed")
+            raise UsageError(f"`border` {self.border} must be at least 0 pixels, `search` {self.search} at least 2")
         for path, suffix in ((self.picture, ".png"), (self.refined, ".toml")):
             if path is not None and path.suffix.lower() != suffix:
-                raise UsageError(f"{path}: is written as {suffix}")
+                raise UsageError(f"{path}: must end with {suffix}")
