@@ -14,7 +14,7 @@ from photoplan.geometry.grid import Breaks
 
 
 class ImageField(Protocol):
-    """What happens in the image, whatever the ground: from ideal positions (of the projective factor) to real ones.
+    """Displacements in the image, whatever the ground: from ideal positions (of the projective factor) to real ones.
 
     Lens distortion, film deformation, the remainder of each line of a trajectory. Continuous, and close to the
     identity: two points keep their order. All methods are vectorised; NaN in gives NaN out.
@@ -22,7 +22,7 @@ class ImageField(Protocol):
 
     @property
     def breaks(self) -> Breaks | None:
-        """Where it is bent, by ideal positions; None: nowhere."""
+        """Return where it is bent, by ideal positions; None: nowhere."""
         ...
 
     def __call__(self, xy: ArrayLike) -> NDArray[np.float64]:
@@ -39,7 +39,7 @@ class ImageField(Protocol):
 
 
 class Tremor(Protocol):
-    """What of a mapping changes from line to line of the image, apart from the rest: a turbulent flight."""
+    """Trajectory jitter: the part of a mapping that changes from line to line of the image."""
 
     @property
     def largest(self) -> NDArray[np.float64]:
@@ -59,7 +59,7 @@ class Tremor(Protocol):
         ...
 
     def told(self, height: float) -> str:
-        """How strong it is, and how much of the ground at a height is seen several times: a sentence."""
+        """Return how strong it is, and how much of the ground at a height is seen several times: a sentence."""
         ...
 
 
@@ -95,7 +95,7 @@ class Part:
     """Some columns of an image, with a smooth mapping of their own."""
 
     projection: Projection
-    """Of all columns; it holds for its own."""
+    """Camera of all columns; it holds for its own."""
     first: float
     """Outer edge of the first of them."""
     end: float
@@ -113,7 +113,7 @@ class Parts:
     """An image of parts beside each other, as of a line of several chips: between them the mapping has a step."""
 
     parts: tuple[Part, ...]
-    """Of what several see, the first counts."""
+    """Parts in order; the first that sees a place counts."""
 
 
 class Projection(Protocol):
@@ -136,8 +136,8 @@ class Projection(Protocol):
 
     @property
     def breaks(self) -> Breaks | Tremor | Parts | None:
-        """Where the first factor is bent, by its ideal positions (knots of a trajectory), or what bends it at every
-        line, or the parts between which it has steps; None: nowhere."""
+        """Return where the first factor is bent, by its ideal positions (knots of a trajectory), or what bends it
+        at every line, or the parts between which it has steps; None if it is bent nowhere."""
         ...
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
@@ -164,12 +164,12 @@ class Vantage:
 
     @property
     def central(self) -> bool:
-        """Whether all rays pass through the point."""
+        """Return whether all rays pass through the point."""
         return self.reach is None
 
 
 class Rays(Protocol):
-    """What can be followed from image points to the ground, whether or not ground can be projected."""
+    """Camera whose rays can be followed from image points to the ground."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -191,7 +191,7 @@ class Camera(Projection, Rays, Protocol):
 
     @property
     def vantage(self) -> Vantage:
-        """Where it looks from."""
+        """Return where it looks from."""
         ...
 
     def derivatives(self, XYZ: ArrayLike) -> NDArray[np.float64]:
@@ -218,7 +218,7 @@ def project(projection: Projection, XYZ: ArrayLike) -> NDArray[np.float64]:
 
 
 def on_level(camera: Camera, xy: ArrayLike, level: float) -> NDArray[np.float64]:
-    """Where rays of image points (n, 2) go down to a level, (n, 3); NaN where they do not."""
+    """Return where rays of image points (n, 2) go down to a level, (n, 3); NaN where they do not."""
     origin, direction = camera.rays(xy, level)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (level - origin[:, 2:]) / direction[:, 2:]
@@ -228,7 +228,7 @@ def on_level(camera: Camera, xy: ArrayLike, level: float) -> NDArray[np.float64]
 
 
 def tremor_of(projection: Projection) -> Tremor | None:
-    """What of it changes from line to line; None: nothing does."""
+    """Return what of it changes from line to line; None: nothing does."""
     breaks = projection.breaks
     return None if breaks is None or isinstance(breaks, Breaks | Parts) else breaks
 
@@ -246,12 +246,12 @@ def steady(projection: Projection) -> Projection:
 
 
 def tremor_told(projection: Projection, height: float) -> str | None:
-    """How strongly it shakes, see `Tremor.told`; None: it does not. Parts of one image shake alike."""
+    """Return how strongly it shakes, see `Tremor.told`; None: it does not. Parts of one image shake alike."""
     tremors = tremors_of(projection)
     return tremors[0].told(height) if tremors else None
 
 
 def tremors_of(projection: Projection) -> list[Tremor]:
-    """What of it and of the parts of its image changes from line to line; empty: nothing does."""
+    """Return what of it and of the parts of its image changes from line to line; empty: nothing does."""
     each = [tremor_of(projection if part is None else part.projection) for part in parts_of(projection)]
     return [tremor for tremor in each if tremor is not None]

@@ -80,7 +80,7 @@ class BodyFrameCamera:
         return point.reshape(*xy.shape[:-1], 3), tangent.reshape(*xy.shape[:-1], 3)
 
     def _hidden(self, P: _Floats) -> NDArray[np.bool_]:
-        """Whether the lowest ground there may be lies between the camera and points (..., 3) of the body."""
+        """Return whether the lowest ground there may be lies between the camera and points (..., 3) of the body."""
         a, b = (radius + heights_of(self.ground)[0] for radius in self.ground.radii)
         s = self.frame.center / (a, a, b)
         way = P / (a, a, b) - s

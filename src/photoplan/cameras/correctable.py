@@ -30,15 +30,15 @@ class Corrections:
     key: str
     """By which images share it; messages call it so."""
     owners: tuple[str, ...]
-    """What each row of the parameters belongs to: an image, moments of a flight."""
+    """Owner of each row of the parameters: an image, moments of a flight."""
     parameters: tuple[str, ...]
-    """How messages call them; {} stands for the owners: "row shift of {}"."""
+    """Name in messages; {} stands for the owners: "row shift of {}"."""
     values: _Floats
-    """Where an adjustment begins, (owners, parameters); zero is what was delivered."""
+    """Initial values of an adjustment, (owners, parameters); zero is as delivered."""
     known: sparse.csr_matrix
-    """What is known beforehand: rows over the flattened values, each observed as zero with unit weight."""
+    """A priori knowledge: rows over the flattened values, each observed as zero with unit weight."""
     owner: str = ""
-    """What an owner is: "image"."""
+    """Kind of an owner: "image"."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Correctable(Protocol):
         ...
 
     def seen(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> _Floats:
-        """Where `camera` sees ground points (n, 3) that were measured at `xy` (n, 2): (n, 2); NaN where it does not."""
+        """Return where `camera` sees ground points (n, 3) that were measured at `xy` (n, 2); NaN where it does not."""
         ...
 
     def by_ground(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> _Floats:
@@ -126,7 +126,7 @@ class CorrectableRpc:
 
     @property
     def key(self) -> str:
-        """Of the set."""
+        """Return the key of the set."""
         return f"correction of {self.name!r}"
 
     @property
@@ -190,7 +190,7 @@ _SPLINE = ("position correction east of {}", "position correction north of {}", 
 
 @dataclass(frozen=True)
 class TrackPriors:
-    """What is known of a trajectory beforehand: standard deviations; 0: a parameter is held fixed."""
+    """A priori standard deviations of a trajectory; 0 if a parameter is held fixed."""
 
     boresight: float = 0.0
     """Radians, about each axis."""
@@ -201,11 +201,11 @@ class TrackPriors:
     knots: float | None = None
     """Between knots of the splines, seconds; None: there are none."""
     position: float = 0.0
-    """Of each coefficient, metres."""
+    """Standard deviation of each coefficient, metres."""
     attitude: float = 0.0
     """Radians."""
     smooth_position: float = np.inf
-    """Of second differences of coefficients, metres."""
+    """Standard deviation of second differences of coefficients, metres."""
     smooth_attitude: float = np.inf
     """Radians."""
 
@@ -226,7 +226,7 @@ class CorrectableLine:
 
     @property
     def keys(self) -> tuple[str, str]:
-        """Of the two sets."""
+        """Return the keys of the two sets."""
         return f"mount of {self.mount!r}", f"trajectory of {self.flight!r}"
 
     @property
@@ -293,7 +293,7 @@ class CorrectableLine:
         return tuple(sets)
 
     def correction(self, values: Mapping[str, _Floats]) -> LineCorrection:
-        """What values of the sets mean."""
+        """Return what values of the sets mean."""
         mount = np.concatenate([self.start.boresight, self.start.lever_arm, [self.start.time_offset]])
         if len(self.free):
             mount[self.free] = values[self.keys[0]][0]
@@ -313,7 +313,7 @@ class CorrectableLine:
         return plain.breaks is not None
 
     def by_mount(self, track: LineTrack, rows: _Floats, axes: _Floats) -> _Floats:
-        """What the parameters of the mount do to poses at rows (n,), as `TrackSpline` has them: (n, 6, 7).
+        """Return what the parameters of the mount do to poses at rows (n,), as `TrackSpline` has them: (n, 6, 7).
 
         axes: east, north and up in those of the body.
         """
@@ -328,7 +328,7 @@ class CorrectableLine:
     def pose_errors(
         self, correction: LineCorrection, mount: _Floats | None, joint: _Floats | None
     ) -> PoseErrors | None:
-        """How exactly the poses are known that come of all corrections together; None: nothing is unknown.
+        """Return how exactly the poses are known that come of all corrections together; None: nothing is unknown.
 
         mount: covariance of what is unknown of it; joint: those of it and of four knots that follow each other.
         """

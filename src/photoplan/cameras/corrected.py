@@ -60,7 +60,7 @@ class CurvatureCorrection:
         return J
 
     def inverse(self, displaced: ArrayLike) -> NDArray[np.float64]:
-        """Where displaced points (..., 3) are; NaN where there is no such point."""
+        """Return where displaced points (..., 3) are; NaN where there is no such point."""
         return inverse_by_newton(self, displaced)
 
     def _terms(

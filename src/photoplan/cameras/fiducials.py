@@ -30,12 +30,12 @@ class MarkPattern:
     """A mark drawn from parts: each covers those before it."""
 
     name: str
-    """What kind it is, for messages: cross, dot, ring, block …"""
+    """Kind of the mark, for messages: cross, dot, ring, block …"""
     parts: tuple[MarkPart, ...]
     background: float
     """Tone where no part is; NaN: not compared."""
     window: tuple[float, float, float, float]
-    """What is compared: xmin, ymin, xmax, ymax about the reference point, millimetres."""
+    """Area that is compared: xmin, ymin, xmax, ymax about the reference point, millimetres."""
 
     def __post_init__(self) -> None:
         x0, y0, x1, y1 = self.window
@@ -259,7 +259,7 @@ class AffineFacts:
 
     @property
     def rotation(self) -> float:
-        """How far the picture is turned in the scan, clockwise, −π to π: x and y axis in the mean.
+        """Return how far the picture is turned in the scan, clockwise, −π to π: x and y axis in the mean.
 
         0: x to the right, y up. Of a mirrored scan: x to the left, y up, since `photoplan fiducials` too exchanges left
         and right first and turns then.
@@ -271,7 +271,7 @@ class AffineFacts:
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """How much shorter the film is than when its camera was calibrated, as parts of the length."""
+    """Shrinkage of the film since its camera was calibrated, as parts of the length."""
 
     x: float
     """Along the image's x axis; negative where it has grown."""
@@ -282,7 +282,7 @@ class Shrinkage:
 
     @property
     def mean(self) -> float:
-        """Of both axes."""
+        """Return the mean of both axes."""
         return (self.x + self.y) / 2
 
 
@@ -368,7 +368,7 @@ class FiducialFit:
     sigma0: float
     """Standard deviation of one measured coordinate, pixels; NaN without redundancy."""
     covariance: NDArray[np.float64]
-    """Of the coefficients, in the transformation's order, shape (6, 6) or (8, 8); NaN without redundancy. Of a
+    """Covariance of the coefficients, in the transformation's order, (6, 6) or (8, 8); NaN without redundancy. For a
     similarity, whose six coefficients are functions of four, it has rank 4."""
     missing: tuple[str, ...]
     """Calibrated marks that were not measured."""

@@ -49,7 +49,7 @@ class FramedCamera:
 
     @property
     def vantage(self) -> Vantage:
-        """Where it looks from.
+        """Return where it looks from.
 
         Where the frame ends in front, its heights bound what is seen, and the camera is central no more. One that is
         not central itself looks from as far away as the target is long.
@@ -105,7 +105,7 @@ class FramedCamera:
         return uvh, np.asarray(np.linalg.solve(self.frame.jacobian(uvh), way[..., None])[..., 0])
 
     def _met_by_tangents(self, xy: _Doubles, uvh: _Doubles, height: float) -> tuple[_Doubles, _Doubles]:
-        """Where rays meet a height: their tangents do, at the Z where they met it before; and the ways there.
+        """Return where rays meet a height: their tangents do, at the Z where they met it before; and the ways there.
 
         A line on a turbulent flight sees a place several times, but each pixel has one ray.
         """

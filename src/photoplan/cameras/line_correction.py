@@ -50,13 +50,13 @@ class TrackSpline:
 
     @classmethod
     def over(cls, known: tuple[float, float], step: float) -> TrackSpline:
-        """None yet, over a time."""
+        """Return a correction of zero over a time."""
         count = max(1, int(np.ceil((known[1] - known[0]) / step - 1e-9)))
         return cls(known[0] - step, step, np.zeros((count + 3, 6)))
 
     @property
     def times(self) -> _Floats:
-        """Of the coefficients, (k,)."""
+        """Return the times of the coefficients, (k,)."""
         return np.asarray(self.first + self.step * np.arange(len(self.coefficients)))
 
     def __call__(self, t: _Floats) -> _Floats:
@@ -67,7 +67,7 @@ class TrackSpline:
 
 @dataclass(frozen=True, eq=False)
 class LineCorrection:
-    """What is added to a trajectory; axes are those of frame images: x along the flight, y to the left, z up."""
+    """Correction of a trajectory; axes are those of frame images: x along the flight, y to the left, z up."""
 
     boresight: _Floats
     """Small rotations about the camera's x, y, z, (3,), radians."""
@@ -112,7 +112,7 @@ def displaced(given: LineTrack, course: Course, axes: _Floats) -> LineTrack:
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """How exactly a trajectory is known: covariances of its poses over time."""
+    """Accuracy of a trajectory: covariances of its poses over time."""
 
     times: _Floats
     """Growing, (k,), seconds as the track counts them; before and after them it is as at the ends."""
@@ -128,7 +128,7 @@ class PoseErrors:
         return np.asarray(scale[:, :, None] * root)
 
     def course(self, change: _Floats) -> Course:
-        """What one of six independent errors, or a part of some, (6,), does to poses at times (n,): (n, 6)."""
+        """Return what one of six independent errors, or a part of some, (6,), does to poses at times (n,): (n, 6)."""
         moved = self._roots @ change
         return lambda t: np.stack([np.interp(t, self.times, column) for column in moved.T], axis=1)
 

@@ -72,7 +72,7 @@ class ImagePoints:
         return len(self.image)
 
     def label(self, k: int) -> str:
-        """How a measurement is named in messages."""
+        """Return how a measurement is named in messages."""
         return f"point {self.points[self.point[k]]!r} in image {self.images[self.image[k]]!r}"
 
     def where(self, keep: ArrayLike) -> ImagePoints:
@@ -124,7 +124,7 @@ class GroundPoints:
     check: NDArray[np.bool_]
     """True: the point is only compared with the result, shape (n,)."""
     covariance: NDArray[np.float64] | None = None
-    """Of X, Y, Z of each point, shape (n, 3, 3), m², where it is known in full; `sigma` is then the root of its
+    """Covariance of X, Y, Z of each point, (n, 3, 3), m², if it is known in full; `sigma` is then the root of its
     diagonal."""
 
     def __post_init__(self) -> None:

@@ -66,7 +66,7 @@ class LineCamera:
 
     @cached_property
     def breaks(self) -> LineTremor[LineCamera] | None:
-        """What of a turbulent flight changes from line to line; None: the trajectory is smooth."""
+        """Return what of a turbulent flight changes from line to line; None: the trajectory is smooth."""
         if not self.track.per_line:
             return None
         return smoothed(self)
@@ -80,7 +80,7 @@ class LineCamera:
 
     @cached_property
     def sight(self) -> LineSight:
-        """What it sees in the axes of the body, from the origin of `near`."""
+        """Return what it sees in the axes of the body, from the origin of `near`."""
         return LineSight(self.track, self.look, self.near.origin)
 
     def moments(self, XYZ: ArrayLike) -> Moments:
@@ -268,7 +268,7 @@ class ChippedLine:
 
     @property
     def track(self) -> LineTrack:
-        """Where it was."""
+        """Return where it was."""
         return self.chips[0].track
 
     @property
@@ -309,7 +309,7 @@ class ChippedLine:
 
     @property
     def vantage(self) -> Vantage:
-        """That of its first chip, whose line goes straight on."""
+        """Return that of its first chip, whose line goes straight on."""
         return self.chips[0].vantage
 
     def project_homogeneous(self, XYZ: ArrayLike) -> _Floats:
@@ -357,7 +357,7 @@ class ChippedLine:
         return np.searchsorted([each.look.ends[1] for each in self.chips[:-1]], np.nan_to_num(column), side="right")
 
     def _chosen(self, found: _Floats, columns: _Floats) -> _Floats:
-        """Of what each chip says (chips, ..., k), with these columns (chips, ...), that of the first part that sees."""
+        """Return the values (chips, ..., k) of the first chip that sees the columns (chips, ...)."""
         out = np.full(found.shape[1:], np.nan)
         count = len(self.chips)
         for number, part in reversed(list(enumerate(self.breaks.parts))):
@@ -371,7 +371,7 @@ class ChippedLine:
 
 @dataclass(frozen=True, eq=False)
 class LineMiss:
-    """How ground points lie beside where they were measured."""
+    """Image residuals of ground points against where they were measured."""
 
     miss: _Floats
     """From there to where they are seen, (n, 2), pixels; NaN: behind the camera, or the row has no orientation."""

@@ -85,7 +85,7 @@ class LineTrack:
         return low if low > -0.5 + _SLACK else -0.5, high if high < self.lines - 0.5 - _SLACK else self.lines - 0.5
 
     def is_oriented(self, line: _Floats) -> NDArray[np.bool_]:
-        """Whether position and attitude are known at rows (n,)."""
+        """Return whether position and attitude are known at rows (n,)."""
         slack = _SLACK * self.rates.max()
         t = self.time(line)
         inside = (t >= self.known[0] - slack) & (t <= self.known[1] + slack)
@@ -172,7 +172,7 @@ class LineBend:
     """Odd powers of the distance r from the axis: r (a + b r²). Where the line passes the axis it has a kink."""
 
     place: _Floats
-    """Where column 0 lies in the focal plane, (2,)."""
+    """Place of column 0 in the focal plane, (2,)."""
     step: _Floats
     """From column to column, (2,)."""
     a: _Floats
@@ -219,7 +219,7 @@ class LineLook:
     part: tuple[int, int] | None = None
     """First and end column of those that are its own, of a line of several chips; None: all."""
     bend: LineBend | None = None
-    """What comes on top of the polynomials."""
+    """Distortion in addition to the polynomials."""
 
     @classmethod
     def of(
@@ -296,7 +296,7 @@ class LineLook:
 
     @cached_property
     def is_wide(self) -> bool:
-        """Whether it looks further to the sides than ahead."""
+        """Return whether it looks further to the sides than ahead."""
         middle = self.tangents(self._outer).mean(axis=0)
         half = abs(self.along(self.ends[1]) - self.along(self.ends[0])) / 2
         return bool(half > abs(middle @ self.axes[1]))
@@ -362,7 +362,7 @@ class StraightFlight:
     place: _Floats
     """Projection centre there, in the axes of the body, (3,), metres."""
     speed: _Floats
-    """How it moves on from row to row, (3,), metres."""
+    """Movement from row to row, (3,), metres."""
     R: _Floats
     """From camera axes to those of the body, (3, 3)."""
 
@@ -428,7 +428,7 @@ class LineSight:
             return np.asarray(np.where(d[:, 2:] > 0, d[:, :2] / d[:, 2:], np.nan))
 
     def across(self, P: _Floats, y: _Floats) -> tuple[_Floats, _Floats]:
-        """How far points lie beside the line at rows (n,), as tangents, and their columns."""
+        """Return how far points lie beside the line at rows (n,), as tangents, and their columns."""
         tangents = self.tangents(P, y)
         e, n = self.look.axes
         column = self.look.column(tangents @ e)
@@ -462,7 +462,7 @@ class LineSight:
         return out
 
     def crossings(self, P: _Floats, near: _Floats, reach: int) -> tuple[NDArray[np.int64], _Floats, NDArray[np.bool_]]:
-        """Where points (n, 3) pass through the line, as far as `reach` rows from rows `near` (n,).
+        """Return where points (n, 3) pass through the line, as far as `reach` rows from rows `near` (n,).
 
         How far a point lies beside the line between the rows is interpolated as the poses are, so that what passes
         there and back within a row is found too.
@@ -570,7 +570,7 @@ class Moments:
 
 
 class _LineImage(Camera, Hashable, Protocol):
-    """What is asked of an image of a line here."""
+    """Image of a line, as far as it is needed here."""
 
     @property
     def track(self) -> LineTrack: ...
@@ -595,7 +595,7 @@ class LineTremor(Generic[_L]):
     """A trajectory as a smooth one, and shifts against it that change from line to line (see `cameras.base.Tremor`)."""
 
     smooth: _L
-    """As the smooth part of the trajectory would see the ground."""
+    """Camera of the smooth part of the trajectory."""
     rough: _L
     """The whole."""
     largest: _Floats
@@ -627,7 +627,7 @@ class LineTremor(Generic[_L]):
         return int(np.floor(first)), int(np.ceil(np.minimum(begin + _BLOCK, high + far)[some].max()))
 
     def passages(self, P: _Floats) -> tuple[_Rows, _Floats, NDArray[np.bool_]]:
-        """Where points (n, 3), from the origin of `rough.near`, pass through the line; see `LineSight.crossings`.
+        """Return where points (n, 3), from the origin of `rough.near`, pass the line; see `LineSight.crossings`.
 
         From the first point to the last, and of each from the first row to the last.
         """

@@ -29,7 +29,7 @@ _OFF = 0.1
 
 @dataclass(frozen=True)
 class Direct:
-    """How the pixels of an image come to lie in a product."""
+    """Places of the pixels of an image in a product, by the direct method."""
 
     levels: tuple[float, float]
     """Heights between which rays are followed: those of all that the image sees, metres."""
@@ -100,7 +100,7 @@ class Direct:
 
 
 def _strips(tile: CompiledTile, source: Source) -> Iterator[Window]:
-    """What of an image can reach a tile, in strips of some rows."""
+    """Return what of an image can reach a tile, in strips of some rows."""
     for layer in tile.layers:
         whole = layer.window(source.camera.size)
         rows = max(1, _AT_ONCE // max(1, whole.width))

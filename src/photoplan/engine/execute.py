@@ -199,7 +199,7 @@ class Mask:
 def rise_of_holes(
     level: NDArray[np.floating], valid: NDArray[np.bool_], holes: NDArray[np.bool_], largest: int
 ) -> NDArray[np.float64]:
-    """How far the valid pixels around each pixel of holes lie above it, pixels; 0 if they lie below it or far above.
+    """Return the height of valid pixels around each pixel of holes above it, pixels; 0 if below or far above.
 
     Roughness of a surface hides its lower places; the level around them is nearer to the truth.
     """
@@ -314,7 +314,7 @@ def execute_tile(
 
 
 def _painted(tile: CompiledTile, values: NDArray[Any], valid: NDArray[np.bool_]) -> Painted:
-    """What was painted, with its figures."""
+    """Return what was painted, with its figures."""
     bare = 0
     if tile.hidden is not None:
         bare = int(np.count_nonzero(np.isfinite(tile.relief) & ~valid & ~tile.hidden))
@@ -462,7 +462,7 @@ def _with_others(tile: CompiledTile, again: CompiledTile, given: NDArray[np.bool
 
 
 def _bytes(layer: Layer, source: Source) -> int:
-    """What a layer reads."""
+    """Return what a layer reads."""
     return layer.anchors.source_window.size * source.reader.bands * source.reader.dtype.itemsize
 
 
@@ -524,7 +524,7 @@ def _columns_of(
 
 
 class Opened(Protocol):
-    """What pixels and depths come from."""
+    """Opened sources and surface of a product."""
 
     @property
     def sources(self) -> Sequence[Source]:
@@ -533,12 +533,12 @@ class Opened(Protocol):
 
     @property
     def surface(self) -> Surface:
-        """What a product's depth is taken from."""
+        """Return what a product's depth is taken from."""
         ...
 
 
 class Address(Protocol):
-    """How a worker opens what a plan needs: small, and pickles."""
+    """Address by which a worker opens what a plan needs; small, and can be pickled."""
 
     def open(self) -> Opened:
         """Sources and surface; kept for the next tile."""
@@ -546,11 +546,11 @@ class Address(Protocol):
 
 
 class KnownErrors(Protocol):
-    """What is known of the errors of sources and surface."""
+    """Errors of sources and surface, as far as they are known."""
 
     @property
     def depth(self) -> DepthErrors:
-        """Of the surface."""
+        """Return the depth of the surface."""
         ...
 
     @property
@@ -560,7 +560,7 @@ class KnownErrors(Protocol):
 
 
 class ErrorsAddress(Protocol):
-    """How a worker opens what is known of errors: small, and pickles."""
+    """Address by which a worker opens the errors; small, and can be pickled."""
 
     def open(self) -> KnownErrors:
         """Errors of all sources; each is made when it is asked for, and kept for the next tile."""
@@ -577,20 +577,20 @@ class Paint(Protocol):
 
 @dataclass(frozen=True)
 class RenderJob:
-    """What a worker is told once of a product that is resampled."""
+    """Job of a worker: one product that is resampled."""
 
     address: Address
     product: ProductPlan
     """Without its tiles."""
     kernel: str
     outputs: tuple[OutputName, ...] = ("picture",)
-    """What a tile gives, in the order of the sinks: its ``picture``; what is ``hidden``, 1, or 0 for what is seen, not
+    """Outputs of a tile, in the order of the sinks: its ``picture``; what is ``hidden``, 1, or 0 for what is seen, not
     valid beyond the images; of the ``sources``, the row in their table, plus one, that painted a pixel, and codes of
     filled ones; of the ``accuracy``, the bands of `photoplan.plan.accuracy`."""
     errors: ErrorsAddress | None = None
     """Needed for the output ``accuracy``."""
     paint: Paint | None = None
-    """What paints a tile; None: `render`, with the kernel."""
+    """Function that paints a tile; None for `render` with the kernel."""
 
     def __call__(self, tile: Tile) -> Made:
         """Outputs of a tile, and its figures: of its anchors, and how many pixels are hidden or in no image if somebody
@@ -616,7 +616,7 @@ class RenderJob:
         return Made(tuple(made[name] for name in self.outputs), record)
 
     def _accuracy(self, tile: Tile, painted: Painted, surface: Surface, errors: KnownErrors) -> Output | None:
-        """How exactly lies what is painted."""
+        """Return how exactly lies what is painted."""
         if painted.valid is None:
             return None
         owner = painted.owner
@@ -635,7 +635,7 @@ def _picture(painted: Painted) -> Output | None:
 
 
 def _mark(painted: Painted) -> Output | None:
-    """Whether pixels are hidden, where the image has them."""
+    """Return whether pixels are hidden, where the image has them."""
     hidden = painted.hidden
     if hidden is None or (painted.valid is None and not hidden.any()):
         return None

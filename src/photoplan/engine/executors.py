@@ -42,22 +42,22 @@ _NAMED = ("GDAL", "numba", "numpy", "rasterio")
 
 @dataclass(frozen=True)
 class Question:
-    """What workers are asked before any tile."""
+    """Check of the workers before any tile."""
 
     versions: Callable[[], Mapping[str, str]]
     """Versions of packages by their names."""
     inputs: tuple[str, ...] = ()
     """Files that they must see."""
     folder: str = ""
-    """Where results may go, if they see that as well."""
+    """Folder of the results, if the workers see it as well."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What one worker says."""
+    """Answer of one worker to the check."""
 
     fingerprint: str
-    """Of photoplan's sources."""
+    """Fingerprint of photoplan's sources."""
     versions: Mapping[str, str]
     unseen: tuple[str, ...]
     """Inputs that it does not see."""
@@ -76,7 +76,7 @@ def source_fingerprint() -> str:
 
 
 def answer(question: Question, token: str) -> Answer:
-    """What this process says; runs on the workers."""
+    """Return what this process says; runs on the workers."""
     unseen = tuple(path for path in question.inputs if not Path(path).is_file())
     try:
         found = Path(token).read_text() if token else ""
@@ -138,7 +138,7 @@ class RemoteJob:
     job: Callable[[Any], Any]
     fingerprint: str
     folder: str | None
-    """Where results go; None: to the client."""
+    """Folder of the results; None if they go to the client."""
 
     def __call__(self, task: Any) -> Any:
         """The job's result, or where it lies."""
@@ -243,7 +243,7 @@ class Cluster(Executor):
             )
 
     def lost(self) -> ResourceError:
-        """What to say when the scheduler is gone."""
+        """Return what to say when the scheduler is gone."""
         return ResourceError(
             f"executor {self.address}: the scheduler is gone; start it again, or choose another executor, and run the "
             "same command again: finished tiles are kept"
@@ -271,18 +271,18 @@ _MOST_WORKERS = 4096
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one task."""
+    """Outcome of one task."""
 
     task: Any
     """The task as it was given."""
     result: Any
-    """What the work returned; None if it failed."""
+    """Value that the work returned; None if it failed."""
     error: str | None
     """Why it failed at last; None if it did not."""
 
 
 def executor_factory(kind: str, workers: int) -> Callable[[], Executor]:
-    """How to make (and make again) the executor a user asked for."""
+    """Return how to make (and make again) the executor a user asked for."""
     if not 1 <= workers <= _MOST_WORKERS:
         raise UsageError(f"{workers} workers; 1 to {_MOST_WORKERS} are accepted")
     if kind == "threads":
@@ -379,7 +379,7 @@ class Workers:
 
     @property
     def shares_folder(self) -> bool:
-        """Whether a cluster sees the folder of the products."""
+        """Return whether a cluster sees the folder of the products."""
         return self._cluster is not None and self._cluster.shares_folder
 
     def prepared(self, job: Callable[[Any], Any], folder: Path | None) -> Callable[[Any], Any]:
@@ -392,7 +392,7 @@ class Workers:
             self._cluster.check()
 
     def lost(self) -> PhotoplanError:
-        """What to say of tasks that were taken back."""
+        """Return what to say of tasks that were taken back."""
         return ResourceError("tasks were cancelled") if self._cluster is None else self._cluster.lost()
 
     def __enter__(self) -> Workers:
@@ -479,7 +479,7 @@ def run_tiles(
 
 
 def _next(waiting: deque[Any], alone: deque[Any], pending: dict[Future[Any], Any], in_flight: int) -> deque[Any] | None:
-    """Where the next task comes from: many at once, or one of those that must run alone; None: nothing may begin."""
+    """Return the source of the next task: many at once, or one that must run alone; None if nothing may begin."""
     if alone:
         return None if pending else alone
     return waiting if waiting and len(pending) < in_flight else None

@@ -31,7 +31,7 @@ class Shared:
         self._left = False
 
     def __call__(self, task: Any) -> Any:
-        """What the job makes of a task."""
+        """Return what the job makes of a task."""
 
         def told(share: float, what: str) -> None:
             if self._left:
@@ -56,7 +56,7 @@ class Shared:
         self._begun.pop(task.index, None)
 
     def under_way(self) -> tuple[float, str]:
-        """How many tasks the parts add up to that are done of those under way, and what is done in the oldest."""
+        """Return the sum of the shares done of tasks in progress, and the phase of the oldest."""
         now = list(self._begun.values())
         return sum(share for share, _ in now), next((what for _, what in now), "")
 
@@ -73,7 +73,7 @@ T = TypeVar("T")
 
 
 class Task(Protocol):
-    """What one call of a job makes: a tile, or an item of a step."""
+    """Task of a job: a tile, or an item of a step."""
 
     @property
     def index(self) -> int:
@@ -89,7 +89,7 @@ class Task(Protocol):
 @storable
 @dataclass(frozen=True, eq=False)
 class Made:
-    """What became of one tile."""
+    """Result of one tile."""
 
     layers: tuple[Any, ...]
     """An `Output` or the result of a step, one for each sink; None: not one valid pixel."""
@@ -350,7 +350,7 @@ def _complete(work: Work[T], tally: Tally, stack: ExitStack) -> T:
 
 
 class Store(Protocol):
-    """Where results of steps are kept by their names, such as `photoplan.io.store.ResultLog`; open when given."""
+    """Store of results of steps by their names, such as `photoplan.io.store.ResultLog`; open when given."""
 
     @property
     def finished(self) -> frozenset[int]:
@@ -358,7 +358,7 @@ class Store(Protocol):
         ...
 
     def index(self, name: object, /) -> int:
-        """Where the result of a name is kept."""
+        """Return where the result of a name is kept."""
         ...
 
     def append(self, index: int, result: Any, /) -> None:

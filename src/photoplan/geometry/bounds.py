@@ -145,7 +145,7 @@ def _told(crs: str, XY: ArrayLike, names: Sequence[str], most: float, asks: str)
 
 
 def is_no_fix(latitude: float, longitude: float) -> bool:
-    """Whether a latitude and a longitude are what receivers without a position write: both exactly 0."""
+    """Return whether a latitude and a longitude are what receivers without a position write: both exactly 0."""
     return latitude == 0.0 and longitude == 0.0
 
 

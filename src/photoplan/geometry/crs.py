@@ -104,7 +104,7 @@ def _axes_on_ground(crs: CRS) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=256)
 def is_left_handed(text: str) -> bool:
-    """Whether X, Y and heights of a projected CRS are a left-handed system, such as X south and Y west."""
+    """Return whether X, Y and heights of a projected CRS are a left-handed system, such as X south and Y west."""
     crs = parse_crs(text)
     crs = crs.sub_crs_list[0] if crs.is_compound else crs
     if not crs.is_projected:
@@ -277,7 +277,7 @@ def crs_label(text: str) -> str:
 
 
 def same_crs(a: str, b: str) -> bool:
-    """Whether two strings mean the same horizontal CRS; axis order is ignored (X is always east)."""
+    """Return whether two strings mean the same horizontal CRS; axis order is ignored (X is always east)."""
     if a == b:
         return True
     first, second = (parse_crs(t) for t in (a, b))
@@ -321,7 +321,7 @@ class CrsStep:
         return out
 
     def where_defined(self, XY: ArrayLike) -> NDArray[np.float64]:
-        """As a call; points where the operation is not defined become NaN."""
+        """Transform points as a call does; points where the operation is not defined become NaN."""
         XY = np.asarray(XY, float)
         X, Y = self._transformer().transform(XY[..., 0], XY[..., 1])
         out = np.stack([np.asarray(X, float), np.asarray(Y, float)], axis=-1)
@@ -415,7 +415,7 @@ def fitting_utm(crs: str, latitude: float, longitude: float) -> str:
 
 
 def _own_utm(source: str, target: str, area: Any) -> str:
-    """What to choose instead of a target on another datum: the UTM zone on the source's datum; empty: there is none."""
+    """Return the UTM zone on the source's datum, to choose instead of a target on another one, or nothing."""
     middle = area.west_lon_degree + (area.east_lon_degree - area.west_lon_degree) % 360.0 / 2
     code = fitting_utm(source, (area.south_lat_degree + area.north_lat_degree) / 2, middle)
     same = parse_crs(code).datum == parse_crs(source).datum and not same_crs(code, target)

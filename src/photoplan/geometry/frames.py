@@ -68,7 +68,7 @@ class WallFrame:
     """Everywhere."""
 
     def top(self, point: _Doubles) -> float:
-        """That of the camera."""
+        """Return that of the camera."""
         return float(point[2])
 
     @classmethod
@@ -120,7 +120,7 @@ class ImageFrame:
         return tuple(self.distance * (1 / part - 1) for part in (_FARTHEST, _NEAREST))  # type: ignore[return-value]
 
     def top(self, point: _Doubles) -> float:
-        """That of the camera, if it is in front."""
+        """Return that of the camera, if it is in front."""
         return float(np.fmin(point[2], self.heights[1]))
 
     def __call__(self, uvh: ArrayLike) -> _Doubles:
@@ -157,13 +157,13 @@ class ImageFrame:
             return points, ways / np.linalg.norm(ways, axis=-1, keepdims=True)
 
     def _nearer(self, uvh: _Doubles) -> _Doubles:
-        """How many times nearer than the distance points lie, shape (..., 1)."""
+        """Return how many times nearer than the distance points lie, shape (..., 1)."""
         nearer = 1.0 + uvh[..., 2:] / self.distance
         return np.where(nearer > 0, nearer, np.nan)
 
 
 def sine_cosine(degrees: float) -> tuple[float, float]:
-    """Of an angle; exact for quarters of a circle."""
+    """Return sine and cosine of an angle; exact for quarters of a circle."""
     quarter, rest = divmod(degrees, 90.0)
     s, c = math.sin(math.radians(rest)), math.cos(math.radians(rest))
     for _ in range(int(quarter) % 4):
@@ -236,7 +236,7 @@ class CylinderFrame:
         return np.stack([by_u, np.broadcast_to(self.axis, out.shape), -out if self.inside else out], axis=-1)
 
     def lines(self, origin: _Doubles, direction: _Doubles, height: float) -> tuple[_Doubles, _Doubles]:
-        """Where rays meet a height, from inside as they leave it, from outside as they come; their directions there."""
+        """Return where rays meet a height (from inside as they leave it, else as they come), and their directions."""
         r = float(self._r(np.array(height)))
         axis = np.array(self.axis)
         p, d = origin - self.origin, direction

@@ -18,7 +18,7 @@ from photoplan.kernels.raster import reduce_means
 
 @dataclass(frozen=True)
 class Breaks:
-    """Where a mapping is continuous but bent: no interpolation may cross these places unnoticed.
+    """Places where a mapping is continuous but bent; interpolation across them is measured.
 
     Positions are those of the image for a projection, those of the product for a target; pixels.
     """
@@ -123,7 +123,7 @@ class Placement:
     crs: str | None = None
     """Reference system of X and Y as a string that pyproj reads; None: none, or unknown."""
     unit: str = "metre"
-    """What X and Y count; `pixel` where there is no transform."""
+    """Unit of X and Y; `pixel` if there is no transform."""
 
     def __post_init__(self) -> None:
         width, height = self.size
@@ -167,7 +167,7 @@ class Placement:
 
     @property
     def linear(self) -> NDArray[np.float64]:
-        """What a step to the next column and to the next row is in the plane, (2, 2)."""
+        """Return what a step to the next column and to the next row is in the plane, (2, 2)."""
         return np.array(self.coefficients).reshape(2, 3)[:, :2]
 
     @property

@@ -137,7 +137,7 @@ class HeightStep:
         return out
 
     def where_defined(self, XYZ: ArrayLike) -> NDArray[np.float64]:
-        """As a call; points outside the operation's grid become NaN."""
+        """Transform points as a call does; points outside the grid of the operation become NaN."""
         XYZ = np.asarray(XYZ, float)
         if self.definition is None:
             return XYZ[..., 2].copy()

@@ -62,7 +62,7 @@ class GeodeticGround:
 
     @property
     def operations(self) -> tuple[CrsStep | HeightStep, ...]:
-        """What is done to coordinates and heights, for the run record."""
+        """Return what is done to coordinates and heights, for the run record."""
         heights = () if self._to_ellipsoid.definition is None else (self._to_ellipsoid,)
         return (self._to_geodetic, *heights)
 
@@ -185,7 +185,7 @@ class ProjectedCrs:
     """Radians in one unit of the geographic coordinates."""
     ellipsoid: Ellipsoid
     crs: str
-    """As it was given, for messages."""
+    """Text as it was given, for messages."""
     sphere: Transformer | None = None
     """The inverse of the same projection of a sphere; None: the body is flattened no more than the earth."""
 
@@ -442,7 +442,7 @@ class BodyGround:
 
     @property
     def on_earth(self) -> bool:
-        """Whether the body is the earth."""
+        """Return whether the body is the earth."""
         return self._geodetic is not None
 
     def __call__(self, XYZ: ArrayLike) -> NDArray[np.float64]:
@@ -511,11 +511,11 @@ class NearGround:
     middle: _Floats
     """Map X and Y (2,) around which polynomials hold."""
     reach: float
-    """As far as this from it along X and along Y, metres."""
+    """Largest distance from it along X and along Y, metres."""
     origin: _Floats
     """Place there in the axes of the body, (3,)."""
     coefficients: _Floats | None
-    """Of X, Y, Z on the ellipsoid and of their change up to 10 km above it, (terms, 6); None: there are none."""
+    """Polynomials of X, Y, Z on the ellipsoid and of their change up to 10 km above it, (terms, 6), if any."""
 
     def __call__(self, XYZ: ArrayLike) -> _Floats:
         """Map X, Y and height (n, 3) to the axes of the body, from the origin (n, 3); NaN where the CRS has
@@ -741,7 +741,7 @@ def topocentric_of_map(origin: tuple[float, float, float], crs: str, XYZ: ArrayL
 
 
 def is_local_crs(text: str, where: str) -> bool:
-    """Whether a text is the WKT of a local system, one without any relation to the earth."""
+    """Return whether a text is the WKT of a local system, one without any relation to the earth."""
     if not text.strip().upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
         return False
     if split_compound(text, where)[0] is not None:
@@ -750,7 +750,7 @@ def is_local_crs(text: str, where: str) -> bool:
 
 
 def is_wgs84_geographic(text: str, where: str) -> bool:
-    """Whether a CRS states latitude and longitude on WGS 84, or on a datum that coincides with it within metres."""
+    """Return whether a CRS is geographic on WGS 84, or on a datum that coincides with it within metres."""
     crs = parse_crs(text, where)
     if not crs.is_geographic or crs.ellipsoid is None:
         return False

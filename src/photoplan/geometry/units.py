@@ -198,7 +198,7 @@ class MetricSystem:
 
     @property
     def is_plain(self) -> bool:
-        """Whether numbers are metres upwards already."""
+        """Return whether numbers are metres upwards already."""
         return self.scale == 1.0 and self.height_scale == 1.0
 
     def declaring(self, heights: str | None, where: str = "declared height system") -> MetricSystem:

@@ -42,7 +42,7 @@ _LEAST = 500
 
 @dataclass(frozen=True, eq=False)
 class LitGround:
-    """What a place is like, beside its colour; arrays of one shape."""
+    """Illumination of places: cos i, height and shadow, as arrays of one shape."""
 
     cos_i: NDArray[np.floating]
     """Cosine of the angle between sun and normal; NaN: no terrain."""
@@ -62,7 +62,7 @@ class LitGround:
 
     @property
     def lit(self) -> NDArray[np.bool_]:
-        """Where the sun shines."""
+        """Return where the sun shines."""
         with np.errstate(invalid="ignore"):
             return np.asarray((self.cos_i > 0) & ~self.shadow)
 
@@ -80,12 +80,12 @@ class BandLight:
     haze_by_height: float = 0.0
     """Its change with height, grey values per 100 m."""
     sigmas: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Of these four."""
+    """Covariance of these four."""
 
 
 @dataclass(frozen=True)
 class LightModel:
-    """What is corrected, and by which parameters."""
+    """Corrections of illumination, with their parameters."""
 
     corrections: tuple[str, ...]
     cos_z: float

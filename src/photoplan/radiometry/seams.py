@@ -27,7 +27,7 @@ _BLIND = 50.0
 
 
 class SeamPart:
-    """What some images show of a part."""
+    """Grey values that some images show in a part."""
 
     def __init__(
         self,
@@ -152,7 +152,7 @@ class SeamPart:
         return self._layers[self._first[image] : self._first[image + 1]].reshape(height, width, -1)
 
     def _of(self, image: int) -> tuple[tuple[slice, slice], _Mask]:
-        """Where an image lies in the part, and what of that it sees."""
+        """Return where an image lies in the part, and what of that it sees."""
         row, col, height, width = self._box(image)
         return np.s_[row : row + height, col : col + width], ~np.isnan(self._values(image)[..., -1])
 
@@ -182,7 +182,7 @@ _PAIRS, _ROWS = 64, 8
 
 @dataclass(frozen=True)
 class SeamParts:
-    """How a map is cut: sides of parts, and how far they reach into their neighbours, pixels."""
+    """Division of a map into parts: their sides, and their overlap, pixels."""
 
     side: int = 320
     reach: int = 48
@@ -282,7 +282,7 @@ def without_overlap(images: Sequence[Sequence[SeamLayer]], store: ArrayStore, sh
 
 
 def standing_out(relief: _Floats) -> _Mask:
-    """Where heights (h, w), NaN unknown, stand out from those around: houses, trees, whose parallax no picture hides.
+    """Return where heights (h, w) stand out from those around, such as houses and trees; NaN is unknown.
 
     Pixels nearer to the border than `AROUND` lack some of what is around them.
     """
@@ -303,7 +303,7 @@ class _Level:
         self.usual = self._usual()
 
     def part(self, box: _Box, rim: int) -> SeamPart:
-        """What images show of a box with a rim."""
+        """Return what images show of a box with a rim."""
         row, col, height, width = wide = grown(box, rim, self.shape)
         r, c, h, w = self._boxes.T
         touching = (r < row + height) & (r + h > row) & (c < col + width) & (c + w > col)
@@ -336,7 +336,7 @@ class _Level:
         asked: dict[int, list[_Box]] = {}
 
         def solve(k: int) -> tuple[_Box, _Labels] | None:
-            """What becomes of a part in which boxes have changed: where labels are new, and which; None: nowhere."""
+            """Solve a part in which boxes have changed; return where labels are new, and which, or None if none are."""
             outer = self._parts[k][1]
             part, wide = self.part(outer, 1), grown(outer, 1, self.shape)
             free = np.zeros(wide[2:], np.bool_)
@@ -366,7 +366,7 @@ class _Level:
                 break
 
     def _asked(self, part: int, near: _Mask | None) -> bool:
-        """Whether a part has pixels that may change."""
+        """Return whether a part has pixels that may change."""
         return near is None or bool(near[_slices(self._parts[part][1])].any())
 
     def total(self, labels: _Labels) -> float:
@@ -411,7 +411,7 @@ class _Level:
 
 
 def _layer(layers: Sequence[SeamLayer], depth: int) -> SeamLayer | None:
-    """Of an image on pixels of a size; None: it is too small for them."""
+    """Return the layer of an image on pixels of a size; None if it is too small for them."""
     return layers[depth] if depth < len(layers) else None
 
 
@@ -429,7 +429,7 @@ def _common(a: Sequence[int], b: Sequence[int]) -> _Box | None:
 
 
 def _slices(box: _Box, inside: Sequence[int] = (0, 0)) -> tuple[slice, slice]:
-    """Of a map, or of another box, where a box is."""
+    """Return the slices of a box in a map, or in another box."""
     row, col = box[0] - inside[0], box[1] - inside[1]
     return slice(row, row + box[2]), slice(col, col + box[3])
 

@@ -20,7 +20,7 @@ _COLOUR, _STRENGTH = 0.15, 0.5
 
 
 class ArrayStore(Protocol):
-    """Where arrays wait; used by several threads."""
+    """Store of arrays, used by several threads."""
 
     def keep(self, values: _Floats, /) -> int:
         """Keep an array of shape (rows, columns, n); where it is."""
@@ -33,11 +33,11 @@ class ArrayStore(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What an image shows of a map."""
+    """Part of a map that an image shows."""
 
     row: int
     col: int
-    """Of its upper-left pixel in the map."""
+    """Place of its upper-left pixel in the map."""
     values: _Floats
     """Shape (bands, height, width)."""
     valid: _Mask
@@ -67,7 +67,7 @@ class SeamLayer:
     """Features and one."""
 
     def window(self, store: ArrayStore, box: tuple[int, int, int, int]) -> tuple[tuple[int, int, int, int], _Floats]:
-        """What of it lies in a box of the map: its own box, and its pixels."""
+        """Return what of it lies in a box of the map: its own box, and its pixels."""
         (row, col, height, width), (top, left, rows, cols) = self.box, box
         i, j = max(row, top), max(col, left)
         m, n = max(min(row + height, top + rows) - i, 0), max(min(col + width, left + cols) - j, 0)

@@ -26,7 +26,7 @@ class Tone:
     grey: tuple[float, ...]
     """Grey values of the table, rising."""
     becomes: tuple[float, ...]
-    """What they become, never falling; between them it is linear, beyond them the first or last interval goes on."""
+    """Grey values that they become, never falling: linear between them, and beyond them as in the last interval."""
     terms: tuple[tuple[int, int, float], ...] = ()
     """(i, j, c) of the trend 1 + Σ c (uⁱ vʲ − m); see `surface`."""
     curve: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
@@ -78,7 +78,7 @@ class Tone:
         return Tone(tuple(grey.tolist()), tuple(self.table(self.light(grey)).tolist()))
 
     def trend(self, x: ArrayLike, y: ArrayLike, size: tuple[int, int]) -> _Floats:
-        """How bright the image is at pixels, beside its mean; `size`: of the image."""
+        """Return how bright the image is at pixels, beside its mean; `size`: of the image."""
         surfaces = surface(x, y, size, tuple((i, j) for i, j, _ in self.terms))
         return np.asarray(np.maximum(1.0 + surfaces @ np.array([c for _, _, c in self.terms]), LEAST))
 
@@ -147,7 +147,7 @@ def toned(pixels: NDArray[Any], window: Window, size: tuple[int, int], tones: Se
 
 
 def _factors(terms: Sequence[tuple[int, int, float]], size: tuple[int, int]) -> _Floats:
-    """Of uⁱ vʲ in a trend, whose mean over the image is 1."""
+    """Return the factors of uⁱ vʲ in a trend, whose mean over the image is 1."""
     out = np.zeros((1 + max((i for i, _, _ in terms), default=0), 1 + max((j for _, j, _ in terms), default=0)))
     out[0, 0] = 1.0
     for i, j, c in terms:

@@ -53,7 +53,7 @@ NO_FACES: Faces = (np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays first come down onto the ground."""
+    """First intersections of rays with the ground."""
 
     XYZ: NDArray[np.float64]
     """Shape (n, 3), metres; NaN where a ray meets no ground."""
@@ -64,10 +64,10 @@ class Hits:
     below: NDArray[np.bool_]
     """True where a ray that met nothing ended below the ground: it started there, or went there through a hole."""
     normal: NDArray[np.float64]
-    """Of what is met, of length one, shape (n, 3): of the ground upwards, of walls and objects towards where the ray
+    """Unit normals of what is met, shape (n, 3): of the ground upwards, of walls and objects towards where the ray
     comes from; NaN where a ray meets nothing. A shift of heights does not count."""
     owner: NDArray[np.int64]
-    """What is met, shape (n,): 0 the ground, else the number of an object, from one; −1 where a ray meets nothing."""
+    """Number of what is met, shape (n,): 0 for the ground, else of an object, from one; −1 where a ray meets nothing."""
 
     @classmethod
     def none(cls, n: int) -> Hits:
@@ -345,7 +345,7 @@ def _kept(parts: TerrainParts, at: tuple[int, int], cache: Cache) -> TerrainPart
 
 
 def _before(parts: TerrainParts, lines: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Whether there was ground just before the places at t: the state of rays that are below ground there."""
+    """Return whether there was ground just before the places at t: the state of rays that are below ground there."""
     back = lines[:, 3:5] / (np.hypot(lines[:, 3], lines[:, 4])[:, None] + 1e-300) * _BEFORE
     ground = parts.heights(lines[:, :2] + t[:, None] * lines[:, 3:5] - back)
     return np.where(np.isfinite(ground), ABOVE, NONE)
@@ -362,7 +362,7 @@ class Lattice:
     origin: NDArray[np.float64]
     """Column and row of the centre of the map's first pixel, shape (2,)."""
     steps: NDArray[np.float64]
-    """What a column and a row of the map are in its columns and rows, shape (2, 2): origin + steps @ (u, v)."""
+    """Steps of a column and a row of the map in its columns and rows, shape (2, 2): origin + steps @ (u, v)."""
     read: Callable[[Window], NDArray[np.float32]]
     """Heights of a window, shape (height, width), metres; NaN where there is none, and beyond the surface."""
 
@@ -400,7 +400,7 @@ class Lattice:
 
 
 class Surface(Protocol):
-    """Where the object is: a depth h for every pixel of a target."""
+    """Surface of a product: a depth h for every pixel of a target."""
 
     def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
         """Depth h of every pixel centre of `window`, shape (height, width), metres; NaN where there is no surface."""
@@ -430,7 +430,7 @@ class Terrain(Surface, Protocol):
         ...
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
-        """Where rays first come down onto the surface, from above it."""
+        """Return where rays first come down onto the surface, from above it."""
         ...
 
 
@@ -458,7 +458,7 @@ class LevelSurface:
         return Lattice.of_relief(self, grid)
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
-        """Where rays first come down to the height; see `Terrain.first_hit`."""
+        """Return where rays first come down to the height; see `Terrain.first_hit`."""
         at = np.asarray(paths, float).reshape(-1, np.shape(paths)[-1])[:, :2]
         low, high = np.fmin.reduce(at, axis=0, initial=np.inf), np.fmax.reduce(at, axis=0, initial=-np.inf)
         if not np.isfinite([low, high]).all():

@@ -97,7 +97,7 @@ class HybridSurface:
         return Lattice.of_relief(self, grid, 2 * grid.resolution / self.source.finest)
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
-        """Where rays first come down onto the surface; see `Terrain.first_hit`."""
+        """Return where rays first come down onto the surface; see `Terrain.first_hit`."""
         return carried_hits(HybridParts(self), np.asarray(paths, float), self.to_model_crs, bend)
 
     def _values(self, XY: ArrayLike, layer: Layer) -> NDArray[np.float64]:
@@ -198,7 +198,7 @@ class HybridSurface:
 
 
 def _on_border(x: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether positions in sides of units lie on a border."""
+    """Return whether positions in sides of units lie on a border."""
     return np.asarray(np.abs(x - np.rint(x)) <= ON_BORDER)
 
 

@@ -190,11 +190,11 @@ class _Loose:
     xy: NDArray[np.float64]
     values: NDArray[np.float64]
     lines: int
-    """How many are vertices of lines."""
+    """Number of points that are vertices of lines."""
 
 
 def mesh_nodes(unit: Unit, lines: Sequence[LineElement], neighbours: Mapping[Side, Unit]) -> Nodes | None:
-    """What is to be triangulated in a unit; None if no mesh needs triangles."""
+    """Return what is to be triangulated in a unit; None if no mesh needs triangles."""
     n = unit.meshes
     line_xy, line_values, breaks = _line_vertices(unit, lines)
     inside = ((line_xy >= 0) & (line_xy <= n)).all(axis=1)
@@ -368,7 +368,7 @@ def _unique(xy: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def _first_heights(all_values: NDArray[np.float64], number: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-    """Where the first point at a place has no height (a border without), the first that has one counts."""
+    """Return where the first point at a place has no height (a border without), the first that has one counts."""
     lost = np.isnan(values[:, 2])
     known = np.flatnonzero(np.isfinite(all_values[:, 2]) & lost[number])[::-1]
     values[number[known], 2:] = all_values[known, 2:]
@@ -498,7 +498,7 @@ def _triangles(
 
 
 def _crossing(unit: Unit, lines: Sequence[LineElement]) -> str:
-    """What to tell of lines that cross: the first pair that is found."""
+    """Return what to tell of lines that cross: the first pair that is found."""
     place = f"computing unit X {unit.left} … {unit.left + unit.side}, Y {unit.top - unit.side} … {unit.top}"
     advice = "lines may meet in common vertices only; insert one, or leave one of the lines out"
     paths = [shapely.LineString(line.xyz[:, :2]) for line in lines]
@@ -686,7 +686,7 @@ def thin(unit: Unit, tolerance: float) -> Unit:
 
 
 def _keeps(heights: NDArray[np.float32], step: int, tolerance: float) -> bool:
-    """Whether posts at every `step` describe the same area, and all posts well enough."""
+    """Return whether posts at every `step` describe the same area, and all posts well enough."""
     count = heights.shape[0]
     coarse = np.ascontiguousarray(heights[::step, ::step])
     n = coarse.shape[0] - 1

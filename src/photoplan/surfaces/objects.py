@@ -33,7 +33,7 @@ class Faces:
     owner: NDArray[np.int32]
     """Object of each, its place in `names`, shape (n,)."""
     names: tuple[str, ...]
-    """Of the objects."""
+    """Faces of the objects."""
     _cells: Cells = field(init=False, repr=False)
     _local: NDArray[np.float64] = field(init=False, repr=False)
     _corner: NDArray[np.float64] = field(init=False, repr=False)
@@ -161,7 +161,7 @@ _FOOT, _STANDS = 0.3048, (-3.0, 25.0)
 
 @dataclass(frozen=True)
 class SingleObject:
-    """What a product shows where it is the product of a single object."""
+    """Content of a product of a single object."""
 
     objects: tuple[int, ...]
     """The object, by its places in `Faces.names`: some are made of several features."""
@@ -180,7 +180,7 @@ class ObjectSurface:
     """Without objects."""
     faces: Faces
     part: SingleObject | None = None
-    """What is shown of it; None: the ground, and all that is painted. All of it hides what is behind it."""
+    """Object that is shown; None for the ground and all that is painted. All of it hides what is behind it."""
     entries: tuple[int, ...] = ()
     """Entry of the project that each object is of, by place in `Faces.names`."""
 
@@ -200,7 +200,7 @@ class ObjectSurface:
 
     @property
     def shows_ground(self) -> bool:
-        """Whether a product shows the ground beside them."""
+        """Return whether a product shows the ground beside them."""
         return self.part is None or self.part.below
 
     def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
@@ -223,7 +223,7 @@ class ObjectSurface:
         return np.where(face < 0, relief, raised).astype(np.float32), face
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
-        """As `relief`, at map points (..., 2), shape (...)."""
+        """Return heights at map points (..., 2), shape (...), as `relief` does at pixels."""
         faces = self.shown
         heights = self.ground.heights(XY) if self.shows_ground else np.full(np.shape(XY)[:-1], np.nan)
         if faces is None:
@@ -237,11 +237,11 @@ class ObjectSurface:
         return np.stack([np.fmin(ground[..., 0], faces[..., 0]), np.fmax(ground[..., 1], faces[..., 1])], axis=-1)
 
     def lattice(self, grid: MapGrid, window: Window) -> Lattice:
-        """That of the ground: faces are no raster."""
+        """Return that of the ground: faces are no raster."""
         return self.ground.lattice(grid, window)
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
-        """What rays meet first: the ground, as `Terrain.first_hit` has it, or a face, from either side."""
+        """Return what rays meet first: the ground, as `Terrain.first_hit` has it, or a face, from either side."""
         ground = self.ground.first_hit(paths, bend)
         along, XYZ, face = self.faces.first_hit(paths, bend)
         nearer = np.isfinite(along) & ~(ground.along < along)
@@ -263,7 +263,7 @@ class RaisedSurface:
 
     surface: Surface
     window: Window
-    """Where it is raised, pixels of a target."""
+    """Window in which it is raised, pixels of a target."""
     by: NDArray[np.floating]
     """Metres for each pixel there."""
 
@@ -296,5 +296,5 @@ def as_if_in_feet(surface: Terrain, height: float) -> dict[str, float]:
 
 
 def painted_surface(surface: Terrain) -> Terrain:
-    """What a product shows, without what only hides."""
+    """Return what a product shows, without what only hides."""
     return surface.painted if isinstance(surface, ObjectSurface) else surface

@@ -28,7 +28,7 @@ class Squares:
     side: NDArray[np.float64]
     """Shape (n,), metres."""
     level: NDArray[np.int64]
-    """How often a mesh was divided, shape (n,)."""
+    """Number of divisions of a mesh, shape (n,)."""
 
     @property
     def bounds(self) -> NDArray[np.float64]:

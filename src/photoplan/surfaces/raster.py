@@ -46,7 +46,7 @@ class HeightGrid(Protocol):
 
 
 class RangeStore(Protocol):
-    """What earlier runs found out of a grid."""
+    """Ranges of heights of a grid that earlier runs kept."""
 
     def load(self, layout: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Numbers of parts (n,), row by row, and the lowest and highest heights of their cells (n, 2, rows,
@@ -71,7 +71,7 @@ class GridRanges:
     part: tuple[int, int]
     """Columns and rows that are read at once: the file's blocks."""
     store: RangeStore | None = None
-    """What earlier runs found, and where it is kept."""
+    """Ranges that earlier runs found, and their file."""
     _side: int = field(init=False, repr=False)
     _low: NDArray[np.float32] = field(init=False, repr=False)
     _high: NDArray[np.float32] = field(init=False, repr=False)
@@ -122,7 +122,7 @@ class GridRanges:
         return out
 
     def table(self, side: int, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """What was found out of squares of so many posts, rows × columns of them: −inf, inf: nothing yet."""
+        """Return what was found out of squares of so many posts, rows × columns of them: −inf, inf: nothing yet."""
         if side not in self._tables:
             self._tables[side] = np.full((*shape, 2), np.inf) * (-1.0, 1.0)
         return self._tables[side]
@@ -163,7 +163,7 @@ class GridRanges:
 
     @property
     def _layout(self) -> tuple[int, ...]:
-        """What decides the cells, for the store."""
+        """Return what decides the cells, for the store."""
         width, height = self.part
         return (*self.grid.size, self._side, width, height, height // self._side, width // self._side)
 
@@ -325,7 +325,7 @@ class RasterSurface:
         return posts
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
-        """Where rays first come down onto the surface; see `Terrain.first_hit`."""
+        """Return where rays first come down onto the surface; see `Terrain.first_hit`."""
         paths = np.asarray(paths, float)
         parts, cache = self._parts(FEW_PART if len(paths) < FEW else MANY_PART)
         return carried_hits(parts, paths, self.to_grid_crs, bend, cache)
@@ -338,7 +338,7 @@ class RasterSurface:
         rows: tuple[int, int],
         bend: float,
     ) -> ShownGround | None:
-        """What the rays of a picture whose columns are vertical planes meet; see `follow_fan`. None: the grid lies in
+        """Return what the rays of a rendering whose columns are vertical planes meet. None if the grid lies in
         another CRS."""
         if self.to_grid_crs is not None:
             return None

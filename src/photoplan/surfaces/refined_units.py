@@ -51,7 +51,7 @@ class RasterUnits:
 
     @property
     def layout(self) -> UnitLayout:
-        """Where the units lie: the first post is the corner of the first unit."""
+        """Return where the units lie: the first post is the corner of the first unit."""
         columns, rows = (-(-(count - 1) // self.meshes) for count in self.surface.grid.size)
         return UnitLayout(*self.surface.origin, side=self.meshes * self.finest, columns=columns, rows=rows)
 
@@ -255,7 +255,7 @@ class _Blend:
 
 
 def _bent(at: Index, units: dict[Index, Unit]) -> bool:
-    """Whether finer posts of a neighbour do not lie on the edge of a unit, which then needs triangles there."""
+    """Return whether finer posts of a neighbour do not lie on the edge of a unit, which then needs triangles there."""
     unit = units[at]
     for side, (dc, dr) in _BESIDE.items():
         other = units.get((at[0] + dc, at[1] + dr))

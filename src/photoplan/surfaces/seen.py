@@ -39,7 +39,7 @@ _SAME = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What pixels of a view show, shape (n, …) or (height, width, …)."""
+    """View buffer: content of pixels of a view, shape (n, …) or (height, width, …)."""
 
     XYZ: NDArray[np.float64]
     """Ground on the map, metres; NaN: sky."""
@@ -89,7 +89,7 @@ class SeenSurface:
         return self.look(target, window).uvh[..., 2].astype(np.float32)
 
     def look(self, target: Target, window: Window) -> Seen:
-        """What the pixels of a window show, shape (height, width, …).
+        """Return what the pixels of a window show, shape (height, width, …).
 
         By a profile for each column where columns are vertical planes and the terrain is a grid of heights; else by a
         ray for each pixel. Both see the same.
@@ -102,7 +102,7 @@ class SeenSurface:
         return self.at(target, np.stack([u, v], axis=-1).reshape(-1, 2)).reshaped(window.height, window.width)
 
     def at(self, target: Target, uv: NDArray[np.float64]) -> Seen:
-        """What pixels (n, 2), whole or not, show.
+        """Return what pixels (n, 2), whole or not, show.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class SeenSurface:
         return np.asarray(dark)
 
     def _by_columns(self, terrain: RasterSurface, target: ViewTarget, window: Window) -> Seen | None:
-        """What pixels show, by profiles; None: they are of no use here."""
+        """Return what pixels show, by profiles; None: they are of no use here."""
         reach = self._reach(target)
         fan = fan_of(target, window, reach, self.bound / 2)
         if fan is None:
@@ -277,7 +277,7 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class SeenLines:
-    """What a picture shows of lines."""
+    """Visible parts of lines in a rendering."""
 
     uv: NDArray[np.float64]
     """Vertices in pixels, shape (n, 2)."""
@@ -302,7 +302,7 @@ class SeenPoints:
 
 @dataclass(frozen=True, eq=False)
 class LinesOfSight:
-    """What asks whether places are seen in a view."""
+    """Test of visibility of places in a view."""
 
     target: ViewTarget
     surface: SeenSurface
@@ -324,7 +324,7 @@ class LinesOfSight:
             return np.asarray(((uv >= -0.5 - beyond) & (uv <= size - 0.5)).all(axis=1))
 
     def free(self, XYZ: NDArray[np.float64], uvh: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether nothing is in the way of places (n, 3) that are at these pixels and depths."""
+        """Return whether nothing is in the way of places (n, 3) that are at these pixels and depths."""
         out = np.zeros(len(XYZ), bool)
         with np.errstate(invalid="ignore"):
             ask = np.flatnonzero((uvh[:, 2] > 0) & (self.target.distance(uvh) <= self.surface.farthest))
@@ -346,7 +346,7 @@ class LinesOfSight:
         return SeenPoints(XYZ, uvh[:, :2], self.target.distance(uvh), shown)
 
     def lines(self, lines: Lines) -> SeenLines:
-        """What the picture shows of lines, each cut into the parts that are seen."""
+        """Return what the picture shows of lines, each cut into the parts that are seen."""
         XYZ, line, level = self._cut(lines)
         uvh = self.target.to_view(XYZ)
         near = self.inside(uvh[:, :2], _BEYOND)

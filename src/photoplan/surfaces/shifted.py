@@ -105,7 +105,7 @@ class ShiftedSurface:
 
     surface: Terrain
     shift: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-    """What is added to the heights at map points (..., 2), metres, shape (...). It is evaluated at nine points of a
+    """Shift of the heights at map points (..., 2), metres, shape (...). It is evaluated at nine points of a
     tile and bilinear between them: a geoid bends by less than a millimetre over a tile."""
 
     def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
@@ -114,7 +114,7 @@ class ShiftedSurface:
         return _raised(self.surface.relief(target, window), nodes, window)
 
     def lattice(self, grid: MapGrid, window: Window) -> Lattice:
-        """That of the surface, with the shift added."""
+        """Return that of the surface, with the shift added."""
         own = self.surface.lattice(grid, window)
 
         def read(part: Window) -> NDArray[np.float32]:
@@ -138,7 +138,7 @@ class ShiftedSurface:
         return self.surface.height_range(bounds) + np.stack([shift.min(axis=-1), shift.max(axis=-1)], axis=-1)
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
-        """Where rays first come down onto the surface; see `Terrain.first_hit`."""
+        """Return where rays first come down onto the surface; see `Terrain.first_hit`."""
         given = np.asarray(paths, float)
         fine, carried = chords(given, bend, self._lowered)
         hits = self.surface.first_hit(carried)
@@ -186,7 +186,7 @@ class FloodedSurface:
         return self._raised(self.ground.relief(target, window), XYZ).astype(np.float32)
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
-        """As `relief`, at map points (..., 2), shape (...)."""
+        """Return heights at map points (..., 2), shape (...), as `relief` does at pixels."""
         XY = np.asarray(XY, float)
         return self._raised(self.ground.heights(XY), XY)
 
@@ -199,7 +199,7 @@ class FloodedSurface:
         return Lattice.of_relief(self, grid)
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
-        """What rays meet first: the ground, as `Terrain.first_hit` has it, or the water, whose Z is `level`."""
+        """Return what rays meet first: the ground, as `Terrain.first_hit` has it, or the water, whose Z is `level`."""
         ground, water = self.ground.first_hit(paths, bend), LevelSurface(self.level).first_hit(paths, bend)
         first = ~(ground.along <= water.along) & np.isfinite(water.along) & self._inside(water.XYZ)
         water.XYZ[:, 2] = self.level

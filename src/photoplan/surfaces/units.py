@@ -108,7 +108,7 @@ def _power(ratio: float) -> float:
 
 
 def _uncut(vertices: NDArray[np.float64] | None, n: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Whether sides of meshes along x, shape (n + 1, n), and along y, shape (n, n + 1), have no vertex inside."""
+    """Return which sides of meshes along x, (n + 1, n), and along y, (n, n + 1), have no vertex inside."""
     across, along = np.ones((n + 1, n), bool), np.ones((n, n + 1), bool)
     if vertices is not None and len(vertices):
         x, y = vertices.T
@@ -166,7 +166,7 @@ class PointGroup:
     """Points of one class that were measured in one way."""
 
     name: str
-    """What users call the group: the file, or file and code."""
+    """Name of the group for users: the file, or file and code."""
     kind: PointKind
     """Mass points describe the surface; spot heights are chosen points (tops, hollows) measured with more care."""
     xyz: NDArray[np.float64]
@@ -187,7 +187,7 @@ class PointGroup:
         _check_sigma(self.sigma, self.name)
 
     def label(self, index: int) -> str:
-        """How a point is named in messages and lists."""
+        """Return how a point is named in messages and lists."""
         own = f" {self.names[index]}" if self.names is not None else ""
         return f"{self.name}{own} (record {self.records[index]})"
 
@@ -198,7 +198,7 @@ class MeasuredLine:
     """One line: its vertices in order."""
 
     name: str
-    """What users call the line: file and record, and its own name or code."""
+    """Name of the line for users: file and record, and its own name or code."""
     kind: LineKind
     """Breakline (slope jumps, or with `right` the height), form line (bends smoothly), border or hole (closed)."""
     xyz: NDArray[np.float64]
@@ -250,7 +250,7 @@ class MeasuredTerrain:
     """The file's own triangulation, if it has one."""
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = field(default=())
-    """What was noticed while reading and repaired or left out, one line each."""
+    """Notes on what was repaired or left out while reading, one line each."""
     codes: frozenset[str] = frozenset()
     """All codes and names of layers that the files hold."""
     unit: float | None = None
@@ -258,7 +258,7 @@ class MeasuredTerrain:
     height_unit: float | None = None
     """Metres in the unit of Z that the file states apart from its height system; None: none."""
     fields: tuple[str, ...] = ()
-    """What the columns, attributes or layers of the files are called, file by file, for messages."""
+    """Names of the columns, attributes or layers of the files, file by file, for messages."""
 
     @property
     def count(self) -> int:
@@ -360,7 +360,7 @@ class Unit:
 
     @cached_property
     def representation(self) -> Representation:
-        """What the meshes cannot follow between the posts; `sigmas` are those of the posts alone."""
+        """Return what the meshes cannot follow between the posts; `sigmas` are those of the posts alone."""
         if self.faces is None:
             return representation(self.heights)
         xy = self.faces.vertices[:, :2] - (self.left, self.top)
@@ -370,7 +370,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class UnitFigures:
-    """What is known of a computing unit beside its heights: one line of the model's table of units."""
+    """Figures of a computing unit: one row of the model's table of units."""
 
     column: int
     row: int
@@ -420,7 +420,7 @@ class UnitSource(Protocol):
 
     @property
     def layout(self) -> UnitLayout:
-        """Where the units lie."""
+        """Return where the units lie."""
         ...
 
     @property

@@ -37,7 +37,7 @@ _RIM = 2.5
 
 @dataclass(frozen=True, eq=False)
 class BuildPlan:
-    """What will be computed: looked at before anything is."""
+    """Plan of a terrain model, which can be inspected before anything is computed."""
 
     seen: Observations
     layout: UnitLayout
@@ -68,7 +68,7 @@ class Built:
     lines: tuple[LineElement, ...]
     """With their intersections with the grid."""
     figures: tuple[UnitFigures, ...] = field(default=())
-    """Of all units, row by row."""
+    """Figures of all units, row by row."""
     sigma: float = np.nan
     """Root mean square of the standard deviations of posts that data surround, metres; of all posts if none is."""
 

@@ -28,20 +28,20 @@ _ENOUGH = 8
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What is known of any place before its height is: four numbers of each, shape (n,)."""
+    """Surroundings of places: four numbers of each, shape (n,)."""
 
     signal: NDArray[np.float64]
     """Share of the error that is not averaged noise, 0 to 1, see `signal_share`."""
     distance: NDArray[np.float64]
     """To the nearest datum, in spacings."""
     beside: NDArray[np.float64]
-    """How near a line is: 1 on it, one half a spacing from it, 0 far off."""
+    """Nearness of a line: 1 on it, one half a spacing from it, 0 far off."""
     rough: NDArray[np.float64]
     """Mean square of the normalised residuals around."""
 
     @property
     def columns(self) -> NDArray[np.float64]:
-        """What the logarithm of the factor depends on linearly, shape (n, knots + 2)."""
+        """Return what the logarithm of the factor depends on linearly, shape (n, knots + 2)."""
         with np.errstate(invalid="ignore", divide="ignore"):
             rough = 0.5 * np.log(self.rough)
         signal = self.signal[:, None]
@@ -59,11 +59,11 @@ class HeldOut:
     noise: NDArray[np.float64]
     """Variance of measuring, m², without what may be ground."""
     around: Surroundings
-    """Of what was not held out."""
+    """Surroundings of what was not held out."""
     block: NDArray[np.int64]
-    """What was held out together has the same number."""
+    """Number of the block that was held out together."""
     bend: NDArray[np.float64]
-    """How much the ground bends there, 1/m."""
+    """Curvature of the ground there, 1/m."""
 
     @property
     def weight(self) -> NDArray[np.float64]:
@@ -74,7 +74,7 @@ class HeldOut:
 
 
 def joined(parts: Sequence[HeldOut]) -> HeldOut:
-    """What was held out in several rounds."""
+    """Return what was held out in several rounds."""
     first = np.cumsum([0, *(part.block.max(initial=-1) + 1 for part in parts)])
     around = (np.concatenate([getattr(part.around, f.name) for part in parts]) for f in fields(Surroundings))
     names = ("error", "sigma", "noise", "bend")
@@ -85,7 +85,7 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
 
 @dataclass(frozen=True)
 class ClassFigures:
-    """What was held out at some distances to data, or where the ground bends so much."""
+    """Figures of held-out points in a class of distance to data, or of curvature."""
 
     nearest: float
     """Distances from here, in spacings; or the part of all heights where the ground bends less, 0 to 1."""
@@ -102,7 +102,7 @@ class ClassFigures:
 
     @property
     def enough(self) -> bool:
-        """Whether there are blocks enough to judge by."""
+        """Return whether there are blocks enough to judge by."""
         return self.blocks >= _ENOUGH
 
 
@@ -111,14 +111,14 @@ class SigmaFactor:
     """A factor of standard deviations as a function of the surroundings."""
 
     coefficients: NDArray[np.float64]
-    """Of its logarithm: at `KNOTS`, on a line, and the power of the roughness; shape (knots + 2,)."""
+    """Coefficients of its logarithm: at `KNOTS`, on a line, and the power of the roughness; shape (knots + 2,)."""
     classes: tuple[ClassFigures, ...] = ()
     """By distance."""
     bends: tuple[ClassFigures, ...] = ()
     """By how much the ground bends, which the factor does not know; the last one is where it bends most."""
 
     def factor(self, around: Surroundings) -> NDArray[np.float64]:
-        """Of standard deviations at places, shape (n,)."""
+        """Return the factor of standard deviations at places, shape (n,)."""
         return np.asarray(np.exp(around.columns @ self.coefficients))
 
 

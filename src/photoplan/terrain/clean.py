@@ -25,11 +25,11 @@ class Finding:
     """Something that was noticed in measured terrain, and what was done about it."""
 
     kind: str
-    """What it is, in one or two words: the same for findings of one sort."""
+    """Kind in one or two words, the same for findings of one sort."""
     text: str
     """A sentence for people: names, heights, place and remedy."""
     X: float = float("nan")
-    """Where it is, metres; NaN where it has no single place."""
+    """Place, metres; NaN if it has no single place."""
     Y: float = float("nan")
     names: tuple[str, ...] = ()
     """Points and lines concerned."""
@@ -296,7 +296,7 @@ class Insertions:
     """Place at which the segment starts."""
     vertex: NDArray[np.int64]
     at: NDArray[np.float64]
-    """Where along the segment, 0 to 1."""
+    """Position along the segment, 0 to 1."""
 
 
 def make_network(lines: Sequence[MeasuredLine], tolerance: float) -> Network:
@@ -643,7 +643,7 @@ def cut_at_walls(
 
 @dataclass(frozen=True, eq=False)
 class _Walls:
-    """Where walls pass."""
+    """Sides of lines along which walls pass."""
 
     walls: dict[int, tuple[int, int, float, float, str]]
     """By inner vertex: the vertex before and after, heights left and right, name."""
@@ -744,7 +744,7 @@ class Points:
         return Points(tuple(groups), xyz, np.concatenate([np.empty(0), *sigma]), np.ones(len(xyz), bool))
 
     def label(self, index: int) -> str:
-        """How a point is named in messages."""
+        """Return how a point is named in messages."""
         for group in self.groups:
             if index < len(group.xyz):
                 return group.label(index)

@@ -186,7 +186,7 @@ class PartMesh:
         return len(self.xyz) - len(self.whole)
 
     def bends(self, edges: NDArray[np.int64]) -> NDArray[np.float64]:
-        """How a bilinear surface departs from the straight line along edges (m, 2), shape (m,), metres.
+        """Return how a bilinear surface departs from the straight line along edges (m, 2), shape (m,), metres.
 
         Along half a diagonal of a mesh the height is z0 + (z1 − z0) s − bend s (1 − s); elsewhere edges are straight.
         """
@@ -204,7 +204,7 @@ class PartMesh:
         return bends
 
     def on_crease(self, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether edges (m, 2), lower vertex first, lie on a breakline; shape (m,)."""
+        """Return whether edges (m, 2), lower vertex first, lie on a breakline; shape (m,)."""
         if not len(self.creases):
             return np.zeros(len(edges), bool)
         keys = edges[:, 0] * len(self.xyz) + edges[:, 1]
@@ -675,7 +675,7 @@ class Labeller:
         return [int(i) for i in part[order[:: max(1, len(order) // 12)]]]
 
     def _take(self, X: float, Y: float, radius: float) -> bool:
-        """Whether a disc is free; if so it is taken."""
+        """Return whether a disc is free; if so it is taken."""
         # Texts are at most two dozen digits long; in cells of that size only neighbours can touch.
         cell = 16 * self.size
         column, row = math.floor(X / cell), math.floor(Y / cell)

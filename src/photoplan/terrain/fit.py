@@ -111,7 +111,7 @@ def _part(seen: Observations, near: NDArray[np.int32], chunk: int = 50_000) -> N
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """What looks like gross errors; the model has the last word."""
+    """Candidates for gross errors, which the model then tests."""
 
     single: NDArray[np.int64]
     """Points that contradict all their neighbours."""
@@ -122,7 +122,7 @@ class Screened:
     size: NDArray[np.float64]
     """By how much each of these is wrong, about, shape (points,), metres; zero: all others."""
     slopes: NDArray[np.float64]
-    """Of the robust plane through the neighbours of each point, towards x and y, shape (points, 2); NaN: not known."""
+    """Slopes of the robust plane through the neighbours of each point, x and y, shape (points, 2); NaN if unknown."""
 
     @property
     def all(self) -> NDArray[np.int64]:
@@ -189,7 +189,7 @@ def supported(
     some: NDArray[np.int64],
     within: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Whether the planes of several neighbours meet a point: it lies on one side of an edge that no line describes."""
+    """Return whether the planes of several neighbours meet a point, as on one side of an edge without a line."""
     xyz = seen.xyz
     step = xyz[some, None] - xyz[near]
     off = step[..., 2] - (step[..., :2] * slopes[near]).sum(axis=2)
@@ -291,7 +291,7 @@ def _broken(
 def _surrounded(
     xyz: NDArray[np.float64], group: NDArray[np.int64], near: NDArray[np.int32], label: NDArray[np.int64]
 ) -> bool:
-    """Whether the neighbours outside a group lie on all its sides."""
+    """Return whether the neighbours outside a group lie on all its sides."""
     outside = np.unique(near[(near >= 0) & (label[near] != label[group[0]])])
     if not len(outside):
         return False
@@ -450,7 +450,7 @@ def _weightless(seen: Observations, screened: Screened) -> Observations:
 
 
 def _usual(found: TerrainFit) -> NDArray[np.float64]:
-    """How rough ground is on average, and how much that counts: the less, the more leaves differ beyond chance."""
+    """Return the mean roughness, and its weight, which falls if leaves differ by more than chance."""
     points, leaf = found.seen.points, _leaf_of(found)
     square = np.minimum(found.squares[:points], MOST_MISFIT)
     known = np.isfinite(square)
@@ -548,7 +548,7 @@ def choose(found: TerrainFit, some: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def _scores(found: TerrainFit, some: NDArray[np.int64], steps: int = len(LADDER)) -> NDArray[np.float64]:
-    """How badly the ladder's functions predict the points of some leaves, shape (leaves, steps)."""
+    """Return how badly the ladder's functions predict the points of some leaves, shape (leaves, steps)."""
     ids = found.neighbours.query(found.leaves.middle[some])
     scores = np.zeros((len(some), steps))
     patches = patches_at(found.leaves, some)
@@ -626,7 +626,7 @@ def _judge(
 
 
 def _at_edge(found: TerrainFit, around: Neighbourhoods, screened: Screened, group: NDArray[np.int64]) -> np.bool_:
-    """Whether the planes of neighbours beyond a group meet half of its points: a crest that breaks off all round."""
+    """Return whether planes of neighbours beyond a group meet half of its points, as at a crest."""
     near = around.points[group]
     beyond = np.where(np.isin(near, group), -1, near)
     within = MEETS_MODEL * np.abs(found.residuals[group, 0])

@@ -21,7 +21,7 @@ CELL_BYTES = 80
 @storable
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """What flows where; all arrays have the shape of the grid."""
+    """Flow over a grid; all arrays have its shape."""
 
     filled: NDArray[np.float32]
     """Heights with pits filled up to where they spill, metres."""

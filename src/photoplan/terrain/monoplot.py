@@ -33,13 +33,13 @@ class MonoplotErrors:
     """Standard deviations that ground points inherit."""
 
     image: float = 0.5
-    """Of each image coordinate, pixels."""
+    """Standard deviation of each image coordinate, pixels."""
     terrain: float | Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
-    """Of the heights of the terrain, metres: one number, or a function of map points (n, 2); None: unknown."""
+    """Standard deviation of terrain heights, metres: one number, or a function of map points (n, 2); None if unknown."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the projection centre, X, Y, Z, metres."""
+    """Standard deviations of the projection centre, X, Y, Z, metres."""
     angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the three rotations about `axes`, radians."""
+    """Standard deviations of the three rotations about `axes`, radians."""
     axes: NDArray[np.float64] | None = None
     """Axes of these rotations in ground space, shape (3, 3), a row for each; None: X, Y, Z."""
 
@@ -81,7 +81,7 @@ def monoplot(
     errors: MonoplotErrors,
     mesh: float,
 ) -> MonoplotPoints:
-    """Where the rays of image points first meet a surface.
+    """Return where the rays of image points first meet a surface.
 
     With A = ∂(x, y)/∂(X, Y, Z) and the terrain's slope s = ∂h/∂(X, Y), small changes obey
 
@@ -187,7 +187,7 @@ def _covariance(
 def _holes(
     camera: Camera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Terrain, high: float
 ) -> NDArray[np.bool_]:
-    """Whether rays cross places without terrain between the highest terrain and the point."""
+    """Return whether rays cross places without terrain between the highest terrain and the point."""
     crossed = np.zeros(len(xy), bool)
     there = np.flatnonzero(np.isfinite(XYZ[:, 0]))
     if not len(there):

@@ -62,7 +62,7 @@ class Observations:
     xyz: NDArray[np.float64]
     """Data, shape (n, 3), metres."""
     points: int
-    """How many of them are mass points and spot heights."""
+    """Number of mass points and spot heights among them."""
     parts: NDArray[np.float64]
     """Variance of each datum = the first column (m²) + the second · the variance of mass points, shape (n, 2)."""
     known_noise: float | None

@@ -80,7 +80,7 @@ class Domain:
         return np.asarray(xy[self.contains(xy)])
 
     def contains(self, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether places (n, 2) have a surface."""
+        """Return whether places (n, 2) have a surface."""
         rows, columns = self.near.shape
         column = np.floor((xy[:, 0] - self.left) / self.cell).astype(int)
         row = np.floor((self.top - xy[:, 1]) / self.cell).astype(int)
@@ -119,7 +119,7 @@ class Raw:
 
 
 def raw_at(fit: TerrainFit, unit: int, xy: NDArray[np.float64], chosen: bool = True) -> Raw:
-    """What the covariance functions say at places (n, 2) in or near a unit."""
+    """Return what the covariance functions say at places (n, 2) in or near a unit."""
     sums = np.zeros((len(xy), 6))
     sums[:, 3] = np.inf
     low, high = xy.min(axis=0), xy.max(axis=0)
@@ -147,7 +147,7 @@ def raw_at(fit: TerrainFit, unit: int, xy: NDArray[np.float64], chosen: bool = T
 
 
 def _beside(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How near lines are, 1 to 0; 0 where there are only points, or only lines."""
+    """Return how near lines are, 1 to 0; 0 where there are only points, or only lines."""
     seen = fit.seen
     if not len(seen.xyz) > seen.points > 0:
         return np.zeros(len(xy))
@@ -156,7 +156,7 @@ def _beside(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _ground_at(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What may be ground, m², linear between the middles of units: else it would step at borders."""
+    """Return what may be ground, m², linear between the middles of units: else it would step at borders."""
     layout = fit.layout
     ground = fit.ground.reshape(layout.rows, layout.columns)
     column = (xy[:, 0] - layout.left) / layout.side - 0.5
@@ -434,7 +434,7 @@ def _round(found: TerrainFit, gap: float, meshes: int, rng: np.random.Generator,
 
 
 def _bends(seen: Observations, some: NDArray[np.int64]) -> NDArray[np.float64]:
-    """How much the ground bends at data: second derivatives of a paraboloid through the heights around, 1/m.
+    """Return how much the ground bends at data: second derivatives of a paraboloid through the heights around, 1/m.
 
     Their own heights have no part in it: noise would bend the ground where its errors are large.
     """

@@ -87,7 +87,7 @@ def surface_slopes(surface: Surface, grid: MapGrid, window: Window) -> Slopes:
 
 
 def even_slopes(surface: Terrain, grid: MapGrid, window: Window) -> Slopes:
-    """As `surface_slopes`, without steps at posts that are further apart than pixels: means over two of them."""
+    """Compute slopes as `surface_slopes`, without steps at posts further apart than pixels: means over two of them."""
     reach = int(min(0.5 / surface.lattice(grid, window).per_pixel, _WIDEST))
     wide = Window(window.col - reach, window.row - reach, window.width + 2 * reach, window.height + 2 * reach)
     slopes, at = surface_slopes(surface, grid, wide), window.slices(wide)

@@ -20,7 +20,7 @@ ROWS = 32
 
 @dataclass(frozen=True)
 class Observer:
-    """Where somebody looks from."""
+    """Observer of a visibility map."""
 
     column: float
     """Column of the grid (0 = middle of the first pixel); need not be whole."""
@@ -32,7 +32,7 @@ class Observer:
 
 @dataclass(frozen=True)
 class SightSettings:
-    """How lines of sight run."""
+    """Options of lines of sight."""
 
     target_height: float = 0.0
     """Height of the targets above ground, metres."""

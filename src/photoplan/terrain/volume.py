@@ -34,14 +34,14 @@ class Sums:
     cut: float = 0.0
     fill: float = 0.0
     area: float = 0.0
-    """Where both surfaces exist."""
+    """Area in which both surfaces exist."""
     missing: float = 0.0
     """Inside the polygon, but without one of the surfaces."""
 
 
 @dataclass(frozen=True)
 class Volume:
-    """What lies between surface A and surface B inside one polygon."""
+    """Volumes between surface A and surface B inside one polygon, with their standard deviations."""
 
     cut: float
     """Volume where A lies above B, m³: what is taken away on the way from A to B."""
@@ -54,7 +54,7 @@ class Volume:
     cell: float
     """Side of the cells of the integration, metres."""
     error_cut: float
-    """How much `cut` changed when the cells were halved last, m³. For a smooth difference the error left is a third
+    """Change of `cut` when the cells were halved last, m³. For a smooth difference the error left is a third
     of it (Richardson's extrapolation of an error of second order), at breaklines up to about as much."""
     error_fill: float
     error_net: float
@@ -69,7 +69,7 @@ class Volume:
 
 @dataclass(frozen=True)
 class VolumeSettings:
-    """How finely to integrate."""
+    """Options of the integration of a volume."""
 
     cell: float
     """Side of the cells to begin with, metres; the usual choice is the finer of the two mesh widths."""
@@ -223,7 +223,7 @@ MOST_CELLS = 6_000_000
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """How the heights of one surface err."""
+    """Error model of the heights of one surface."""
 
     sigma: float | Callable[[NDArray[np.float64]], NDArray[np.float64]]
     """Standard deviation of the heights, metres: one number, or a function of map points (n, 2)."""
