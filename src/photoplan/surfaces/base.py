@@ -67,7 +67,7 @@ class Hits:
     """Unit normals of what is met, shape (n, 3): of the ground upwards, of walls and objects towards where the ray
     comes from; NaN where a ray meets nothing. A shift of heights does not count."""
     owner: NDArray[np.int64]
-    """Number of what is met, shape (n,): 0 for the ground, else of an object, from one; −1 where a ray meets nothing."""
+    """Number of what is met, shape (n,): 0 for the ground, else of an object, from one; −1 if a ray meets nothing."""
 
     @classmethod
     def none(cls, n: int) -> Hits:

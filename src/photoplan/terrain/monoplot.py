@@ -35,7 +35,7 @@ class MonoplotErrors:
     image: float = 0.5
     """Standard deviation of each image coordinate, pixels."""
     terrain: float | Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
-    """Standard deviation of terrain heights, metres: one number, or a function of map points (n, 2); None if unknown."""
+    """Standard deviation of terrain heights, metres: one number, or a function of map points (n, 2), if known."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of the projection centre, X, Y, Z, metres."""
     angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
