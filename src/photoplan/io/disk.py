@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from rasterio._err import CPLE_BaseError
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
+from photoplan.arrays import Mask
 from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
 from photoplan.kernels.raster import fill_block
 
@@ -515,7 +516,7 @@ class BlockCoder:
         """Bytes of a block's mask; 0 with a nodata value."""
         return self.side * self.side if self.nodata is None else 0
 
-    def encode(self, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> tuple[bytes | memoryview, int]:
+    def encode(self, pixels: NDArray[Any], valid: Mask | None) -> tuple[bytes | memoryview, int]:
         """Bytes of a block, and how many valid values were moved because they equalled nodata.
 
         Such a value becomes its neighbour (nodata + 1, or nodata - 1 at the upper end of the type), so that no reader
@@ -547,7 +548,7 @@ class BlockCoder:
         step = 1 if self.nodata < np.iinfo(self.dtype).max else -1
         return number(self.nodata), number(self.nodata + step)
 
-    def decode(self, payload: bytes, shape: tuple[int, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    def decode(self, payload: bytes, shape: tuple[int, int]) -> tuple[NDArray[Any], Mask]:
         """Pixels (bands, h, w) and validity (h, w) of a block's bytes; `shape` cuts a border block."""
         block = np.frombuffer(payload[: self.pixel_bytes], self.dtype).reshape(self.side, self.side, self.bands)
         pixels = np.moveaxis(block, -1, 0)[:, : shape[0], : shape[1]]

@@ -23,9 +23,9 @@ import numpy as np
 import yaml
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
-from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.crs import split_compound
 from photoplan.geometry.units import MetricSystem, metric_system
@@ -749,7 +749,7 @@ def elements(value: Any, where: str) -> list[Any]:
     return value
 
 
-def number_rows(value: Any, where: str, width: int) -> NDArray[np.float64]:
+def number_rows(value: Any, where: str, width: int) -> Floats:
     """A list of lists of `width` finite numbers, shape (n, width); None stands for an empty one."""
     rows = elements(value, where)
     try:

@@ -38,8 +38,9 @@ from typing import BinaryIO
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import is_no_fix
 from photoplan.geometry.crs import crs_step
@@ -413,7 +414,7 @@ _R_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _R_GIMBAL_CAMERA = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def rotation_from_gimbal(yaw_pitch_roll: ArrayLike) -> NDArray[np.float64]:
+def rotation_from_gimbal(yaw_pitch_roll: ArrayLike) -> Floats:
     """R_enu_camera (3, 3): camera axes to east, north, up, of yaw, pitch and roll in degrees."""
     # About z by yaw, then y by pitch, then x by roll: the order that is spelled kappa, phi, omega.
     R_ned_gimbal = rotation_from_angles(np.radians(np.asarray(yaw_pitch_roll, float)), "kpo")
@@ -493,7 +494,7 @@ def without_fix(names: Sequence[str]) -> str:
     return f"{states} latitude 0 and longitude 0, which receivers write without a position: {some}"
 
 
-def map_positions(images: Sequence[ImageMetadata], crs: str) -> NDArray[np.float64]:
+def map_positions(images: Sequence[ImageMetadata], crs: str) -> Floats:
     """Positions in a projected CRS, shape (n, 3): map coordinates, and the height as the images state it."""
     places = np.array([m.position for m in images], float).reshape(-1, 3)
     step = crs_step("EPSG:4326", crs)

@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Ints
 from photoplan.errors import InputError
 from photoplan.geometry.crs import split_compound
 from photoplan.io.files import check_plain_file, elements, finite, members, number_rows, read_head, read_json_lines
@@ -25,7 +26,7 @@ from photoplan.surfaces.polygon_faces import Rings, filled
 class ObjectFile:
     """Triangles of a file's objects, in its own coordinates."""
 
-    corners: NDArray[np.float64]
+    corners: Floats
     """X, Y, Z, shape (n, 3, 3), finite."""
     owner: NDArray[np.int32]
     """Object of each triangle, its place in `names`, shape (n,)."""
@@ -95,7 +96,7 @@ def read(path: Path, layer: str | None) -> ObjectFile:
     templates = _templates(path, data)
     transform = members(data.get("transform"), f"{path}: transform")
     types = STANDING if layer is None else (layer,)
-    polygons: list[list[NDArray[np.float64]]] = []
+    polygons: list[list[Floats]] = []
     objects: list[int] = []
     names: list[str] = []
     there: set[str] = set()
@@ -137,7 +138,7 @@ def read(path: Path, layer: str | None) -> ObjectFile:
     return from_polygons(str(path), polygons, objects, names, _crs(path, data))  # type: ignore[arg-type]
 
 
-def _vertices(path: Path, stated: Any, transform: dict[str, Any]) -> NDArray[np.float64]:
+def _vertices(path: Path, stated: Any, transform: dict[str, Any]) -> Floats:
     vertices = number_rows(stated, f"{path}: vertices", 3)
     if transform:
         scale, translate = (finite(transform.get(k), f"{path}: transform {k}", 3) for k in ("scale", "translate"))
@@ -148,7 +149,7 @@ def _vertices(path: Path, stated: Any, transform: dict[str, Any]) -> NDArray[np.
     return vertices
 
 
-_Templates = tuple[list[Any], NDArray[np.float64]]
+_Templates = tuple[list[Any], Floats]
 """Geometries that objects share, and their vertices."""
 
 
@@ -162,9 +163,7 @@ def _templates(path: Path, data: dict[str, Any]) -> _Templates:
     return templates, _vertices(path, held.get("vertices-templates"), {})
 
 
-def _faces(
-    geometries: list[Any], vertices: NDArray[np.float64], templates: _Templates
-) -> Iterator[list[NDArray[np.float64]]]:
+def _faces(geometries: list[Any], vertices: Floats, templates: _Templates) -> Iterator[list[Floats]]:
     """Surfaces, each a list of rings, of the finest geometry that has some."""
     placed = [_placed(g, vertices, templates) for g in geometries]
     usable = [each for each in placed if each[0]["type"] in _DEPTH]
@@ -177,9 +176,7 @@ def _faces(
         yield [_ring(ring, own) for ring in face]
 
 
-def _placed(
-    geometry: dict[str, Any], vertices: NDArray[np.float64], templates: _Templates
-) -> tuple[dict[str, Any], NDArray[np.float64]]:
+def _placed(geometry: dict[str, Any], vertices: Floats, templates: _Templates) -> tuple[dict[str, Any], Floats]:
     """A geometry and the vertices that it counts; an instance is its template, moved to its place."""
     if geometry["type"] != "GeometryInstance":
         return geometry, vertices
@@ -201,7 +198,7 @@ def _of_depth(items: list[Any], values: Any, depth: int, none: set[int]) -> Iter
             yield item
 
 
-def _ring(places: list[int], vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ring(places: list[int], vertices: Floats) -> Floats:
     at = np.array(places)
     if at.ndim != 1 or (len(at) and at.dtype.kind != "i"):
         raise ValueError(f"a ring {str(places)[:60]} that is no list of vertices")
@@ -256,7 +253,7 @@ def read_obj(path: Path) -> ObjectFile:
     return _mesh(path, np.concatenate(vertices), np.concatenate(faces))
 
 
-def _obj_lines(lines: list[bytes], before: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _obj_lines(lines: list[bytes], before: int) -> tuple[Floats, Ints]:
     """Vertices and triangles of some lines, with so many vertices before them."""
     of_v, of_f = (
         np.fromiter((line.startswith(words) for line in lines), bool, len(lines)) for words in (_VERTEX, _FACE)
@@ -330,7 +327,7 @@ def _header(path: Path, text: str) -> tuple[str, list[tuple[str, int, list[_Prop
     return form, elements
 
 
-def _text(path: Path, body: int, elements: list[Any]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _text(path: Path, body: int, elements: list[Any]) -> tuple[Floats, Ints]:
     found: dict[str, list[Any]] = {"vertex": [np.empty((0, 3))], "face": [np.empty((0, 3), np.int64)]}
     with path.open("rb") as file:
         file.seek(body)
@@ -346,18 +343,14 @@ def _text(path: Path, body: int, elements: list[Any]) -> tuple[NDArray[np.float6
     return np.concatenate(found["vertex"]), np.concatenate(found["face"])
 
 
-def _vertex_rows(
-    values: NDArray[np.float64], counts: NDArray[np.int64], properties: list[_Property]
-) -> NDArray[np.float64]:
+def _vertex_rows(values: Floats, counts: Ints, properties: list[_Property]) -> Floats:
     columns = [[p[0] for p in properties].index(axis) for axis in "xyz"]
     if (counts != len(properties)).any():
         raise ValueError(f"a vertex of {counts[counts != len(properties)][0]} instead of {len(properties)} numbers")
     return values.reshape(-1, len(properties))[:, columns]
 
 
-def _face_rows(
-    values: NDArray[np.float64], counts: NDArray[np.int64], properties: list[_Property]
-) -> NDArray[np.int64]:
+def _face_rows(values: Floats, counts: Ints, properties: list[_Property]) -> Ints:
     before = _before_list(properties)
     start = np.cumsum(counts) - counts
     corners = values[np.minimum(start + before, start + counts - 1)].astype(np.int64)
@@ -367,7 +360,7 @@ def _face_rows(
     return _fans(values[at].astype(np.int64), corners)
 
 
-def _binary(path: Path, body: int, order: str, elements: list[Any]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _binary(path: Path, body: int, order: str, elements: list[Any]) -> tuple[Floats, Ints]:
     raw = np.memmap(path, np.uint8, "r")
     vertices, faces, at = np.empty((0, 3)), np.empty((0, 3), np.int64), body
     for name, count, properties in elements:
@@ -397,9 +390,7 @@ def _binary(path: Path, body: int, order: str, elements: list[Any]) -> tuple[NDA
     return vertices, faces
 
 
-def _rows(
-    raw: Any, at: int, count: int, order: str, properties: list[_Property]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+def _rows(raw: Any, at: int, count: int, order: str, properties: list[_Property]) -> tuple[Ints, Ints, int]:
     """Corners of faces of several lengths, how many each has, and where they end."""
     place = _before_list(properties)
     _, kind, length = properties[place]
@@ -430,7 +421,7 @@ def _before_list(properties: list[_Property]) -> int:
     return places[0]
 
 
-def _numbers(lines: list[bytes], idle: bytes = b"") -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _numbers(lines: list[bytes], idle: bytes = b"") -> tuple[Floats, Ints]:
     """All numbers of some lines, one after the other, and how many each line has; what fits `idle` is left out."""
     text = b"\n".join(line.rstrip() for line in lines)
     text = re.sub(idle, b"", text) if idle else text
@@ -451,12 +442,12 @@ def _numbers(lines: list[bytes], idle: bytes = b"") -> tuple[NDArray[np.float64]
     return values, counts
 
 
-def _within(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _within(counts: Ints) -> Ints:
     """0, 1, 2 … for each of the counts."""
     return np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-def _fans(corners: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _fans(corners: Ints, counts: Ints) -> Ints:
     """Triangles of faces from their first corners, given all corners and how many each has; less than three: none."""
     triangles = np.maximum(counts - 2, 0)
     first = np.repeat(np.cumsum(counts) - counts, triangles)
@@ -478,7 +469,7 @@ def _refuse_many(path: Path, faces: int, vertices: int) -> None:
         )
 
 
-def _mesh(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> ObjectFile:
+def _mesh(path: Path, vertices: Floats, faces: Ints) -> ObjectFile:
     if not len(faces):
         raise InputError(f"{path}: holds no faces; a mesh is needed, not a cloud of points")
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -525,7 +516,7 @@ def read_vector(path: Path, layer: str | None) -> ObjectFile:
     roles = [
         None if "role" not in fields else _role(path, n, fields["role"][row]) for n, row in zip(names, rows.tolist())
     ]
-    polygons: list[list[NDArray[np.float64]]] = []
+    polygons: list[list[Floats]] = []
     objects: list[int] = []
     for k, row in enumerate(rows):
         for part in shapely.get_parts(shapely.get_parts(shapes[row])):
@@ -550,7 +541,7 @@ def _role(path: Path, name: str, value: Any) -> str | None:
     return text or None
 
 
-def _rings(part: Any, drawing: bool) -> list[NDArray[np.float64]] | None:
+def _rings(part: Any, drawing: bool) -> list[Floats] | None:
     """Rings of a polygon or, in a drawing, of a closed line; None: it is neither."""
     if part.geom_type == "Polygon":
         lines = [part.exterior, *part.interiors]

@@ -17,6 +17,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan import __version__
+from photoplan.arrays import Floats
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
 from photoplan.errors import InputError, UsageError, named_by
 from photoplan.geometry.bounds import odd_angles, odd_place
@@ -73,8 +74,8 @@ def read_ground_points(
 
 def _points(
     names: Sequence[str],
-    XYZ: NDArray[np.float64],
-    numbers: Callable[[str], NDArray[np.float64]],
+    XYZ: Floats,
+    numbers: Callable[[str], Floats],
     roles: Sequence[str],
     where: Callable[[int], str],
 ) -> GroundPoints:
@@ -108,7 +109,7 @@ def _points(
     return GroundPoints(tuple(names), XYZ, sigma, check)
 
 
-def _first(*columns: NDArray[np.float64]) -> NDArray[np.float64]:
+def _first(*columns: Floats) -> Floats:
     """The first of several columns that has a value, row by row."""
     out = columns[0]
     for column in columns[1:]:
@@ -116,9 +117,7 @@ def _first(*columns: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def _in_metres(
-    path: Path, XYZ: NDArray[np.float64], own: MetricSystem | None, wanted: str | None, heights: str | None
-) -> NDArray[np.float64]:
+def _in_metres(path: Path, XYZ: Floats, own: MetricSystem | None, wanted: str | None, heights: str | None) -> Floats:
     """Coordinates in metres, heights in the wanted system; a CRS other than the wanted one is refused."""
     if own is None:
         return XYZ
@@ -154,7 +153,7 @@ def _from_layer(path: Path, crs: str | None, heights: str | None) -> GroundPoint
     own_system = None if found.crs is None else metric_system(found.crs, f"{path}: CRS")
     XYZ = _in_metres(path, XYZ, own_system, crs, heights)
 
-    def numbers(role: str) -> NDArray[np.float64]:
+    def numbers(role: str) -> Floats:
         column = next((fields[n] for n in _ROLES[role] if n in fields), None)
         return np.full(len(names), np.nan) if column is None else _floats(path, role, column)
 
@@ -166,7 +165,7 @@ def _text(value: Any) -> str:
     return "" if value is None or value != value else str(value).strip()
 
 
-def _floats(path: Path, role: str, column: NDArray[Any]) -> NDArray[np.float64]:
+def _floats(path: Path, role: str, column: NDArray[Any]) -> Floats:
     try:
         return np.asarray(column, float)
     except (TypeError, ValueError):
@@ -447,17 +446,17 @@ class PositionTable:
 
     path: Path
     images: tuple[str, ...]
-    XYZ: NDArray[np.float64]
+    XYZ: Floats
     """Shape (n, 3), metres."""
-    sigma: NDArray[np.float64]
+    sigma: Floats
     """Standard deviations, shape (n, 3), metres; NaN: not stated."""
-    R_ground_camera: NDArray[np.float64] | None
+    R_ground_camera: Floats | None
     """Shape (n, 3, 3); None: the file has no attitudes."""
-    sigma_angle: NDArray[np.float64]
+    sigma_angle: Floats
     """Standard deviation of each attitude, shape (n,), radians; NaN: not stated."""
     strip: tuple[str, ...]
     """Name of each image's strip; ``"all"`` where the file states none."""
-    time: NDArray[np.float64]
+    time: Floats
     """Seconds; the running number of the line where the file states none."""
     notes: tuple[str, ...] = ()
     """Remarks on rows that were left out."""
@@ -542,7 +541,7 @@ def read_observed_positions(
     )
 
 
-def _sigma_observed_positions(table: TextTable) -> NDArray[np.float64]:
+def _sigma_observed_positions(table: TextTable) -> Floats:
     out = []
     for roles in (("sigma_x", "sigma_xy", "sigma"), ("sigma_y", "sigma_xy", "sigma"), ("sigma_z", "sigma")):
         out.append(table.first_known(*roles))
@@ -550,13 +549,13 @@ def _sigma_observed_positions(table: TextTable) -> NDArray[np.float64]:
     return np.stack(out, axis=1)
 
 
-def _positive(table: TextTable, role: str, values: NDArray[np.float64]) -> None:
+def _positive(table: TextTable, role: str, values: Floats) -> None:
     bad = np.flatnonzero(values <= 0)
     if len(bad):
         raise InputError(f"{table.where(int(bad[0]))}: {role} = {values[bad[0]]:g}; it must be positive")
 
 
-def _rotations(table: TextTable, form: TableFormat) -> NDArray[np.float64] | None:
+def _rotations(table: TextTable, form: TableFormat) -> Floats | None:
     roles = ("omega", "phi", "kappa")
     there = [role for role in roles if role in table.roles]
     if not there:
@@ -573,7 +572,7 @@ def _rotations(table: TextTable, form: TableFormat) -> NDArray[np.float64] | Non
     return R if form.direction == "camera-to-ground" else np.swapaxes(R, 1, 2)
 
 
-def _times(table: TextTable) -> NDArray[np.float64]:
+def _times(table: TextTable) -> Floats:
     if "time" not in table.roles:
         return np.arange(len(table.rows), dtype=float)
     texts = table.texts("time")

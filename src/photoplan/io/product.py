@@ -18,6 +18,7 @@ import rasterio.transform
 import rasterio.windows
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError, PhotoplanError, UsageError
 from photoplan.geometry.grid import Placement, Window
 from photoplan.io.disk import (
@@ -129,7 +130,7 @@ def check_product(
     path: Path,
     profile: dict[str, Any],
     samples: Sequence[Window],
-    expected: Callable[[Window], tuple[NDArray[Any], NDArray[np.bool_]]],
+    expected: Callable[[Window], tuple[NDArray[Any], Mask]],
     *,
     lossy: bool,
     overviews: bool,
@@ -158,9 +159,7 @@ def check_product(
             _compare(path, dataset, window, *expected(window), lossy=lossy)
 
 
-def _compare(
-    path: Path, dataset: Any, window: Window, wanted: NDArray[Any], seen: NDArray[np.bool_], *, lossy: bool
-) -> None:
+def _compare(path: Path, dataset: Any, window: Window, wanted: NDArray[Any], seen: Mask, *, lossy: bool) -> None:
     """Compare one window of a file with what was computed."""
     area = rasterio.windows.Window(window.col, window.row, window.width, window.height)
     pixels, valid = dataset.read(window=area), (dataset.read_masks(window=area) > 0).any(axis=0)
@@ -173,7 +172,7 @@ def _compare(
         raise PhotoplanError(f"{path}: {window} is not what was computed; the disk or a library is at fault, run again")
 
 
-def _block_means(pixels: NDArray[Any]) -> NDArray[np.float64]:
+def _block_means(pixels: NDArray[Any]) -> Floats:
     """Means over blocks of 16 × 16 pixels, shape (bands, rows, columns) of blocks; the last ones are smaller."""
     rows, cols = (np.arange(0, length, _SIDE) for length in pixels.shape[1:])
     sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float64), rows, axis=1), cols, axis=2)
@@ -355,11 +354,7 @@ class ProductFile:
         return self._file.log.figures(index)
 
     def append(
-        self,
-        index: int,
-        pixels: ArrayLike,
-        valid: NDArray[np.bool_] | None = None,
-        record: Mapping[str, Any] | None = None,
+        self, index: int, pixels: ArrayLike, valid: Mask | None = None, record: Mapping[str, Any] | None = None
     ) -> None:
         """Add a finished tile."""
         pixels = np.asarray(pixels)
@@ -454,7 +449,7 @@ class ProductFile:
         step = max(1, -(-len(stored) // _SAMPLES))
         samples = {self._windows[i]: i for i in stored[::step]}
 
-        def expected(window: Window) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        def expected(window: Window) -> tuple[NDArray[Any], Mask]:
             return self._coder.decode(log.read(samples[window]), (window.height, window.width))
 
         check_product(
@@ -709,7 +704,7 @@ def _look(path: Path, dataset: Any, width: int, height: int) -> NDArray[np.uint8
     return np.concatenate([np.broadcast_to(pixels, (3, height, width)) * valid, alpha[None]]).astype(np.uint8)
 
 
-def _stretched(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _stretched(pixels: NDArray[Any], valid: Mask) -> NDArray[np.uint8]:
     """Values from the second to the ninety-eighth percentile of all bands, as bytes."""
     values = pixels[:, valid].astype(np.float64)
     values = values[np.isfinite(values)]

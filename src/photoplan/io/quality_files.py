@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import Entry, Name, NotNegative, Number, Pair, Pixels, Positive
@@ -236,7 +236,7 @@ _HEADER = """\
 class KernelEntry:
     """One kernel of a file; see `photoplan.quality.restoration.restorer.FilterKernel`."""
 
-    values: NDArray[np.float64]
+    values: Floats
     """Rows and columns of finite numbers."""
     at: tuple[float, float] | None = None
     """Column and row."""
@@ -352,7 +352,7 @@ def _kernel(entry: Any, where: str) -> KernelEntry:
     return KernelEntry(_odd(numbers, where), at, band)
 
 
-def _odd(rows: list[list[float]], where: str) -> NDArray[np.float64]:
+def _odd(rows: list[list[float]], where: str) -> Floats:
     """Rows as an array, whose sides must have a middle."""
     values = np.array(rows, np.float64)
     if values.ndim != 2 or values.shape[0] % 2 == 0 or values.shape[1] % 2 == 0:
@@ -362,7 +362,7 @@ def _odd(rows: list[list[float]], where: str) -> NDArray[np.float64]:
     return values
 
 
-def _matrix(path: Path) -> NDArray[np.float64]:
+def _matrix(path: Path) -> Floats:
     """One kernel of rows of numbers, separated by blanks, tabs, commas or semicolons; `#` begins a comment."""
     rows: list[list[float]] = []
     for number, line in enumerate(read_text(path, MOST_BYTES).split("\n"), 1):
@@ -396,14 +396,14 @@ _LARGEST = 1.5
 class MtfTable:
     """Modulation at some frequencies."""
 
-    frequency: NDArray[np.float64]
+    frequency: Floats
     """Increasing, above or at 0, shape (n,)."""
-    modulation: NDArray[np.float64]
+    modulation: Floats
     """0 to 1.5, shape (n,)."""
     unit: Literal["px", "mm"]
     """Frequencies are cycles per pixel, or per millimetre on the sensor."""
 
-    def per_pixel(self, pixel_um: float | None) -> NDArray[np.float64]:
+    def per_pixel(self, pixel_um: float | None) -> Floats:
         """Frequencies in cycles per pixel."""
         if self.unit == "px":
             return self.frequency
@@ -471,7 +471,7 @@ class MatrixFile:
         object.__setattr__(self, "info", info)
         object.__setattr__(self, "description", text)
 
-    def read(self, window: Window) -> NDArray[np.float64]:
+    def read(self, window: Window) -> Floats:
         """All bands of a window, shape (9, height, width); NaN: sky."""
         pixels, valid = read_pixels(self.info, window)
         return np.where(True if valid is None else valid, pixels, np.nan)

@@ -22,6 +22,7 @@ import rasterio.shutil
 import rasterio.windows
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Floats32, Mask
 from photoplan.errors import InputError, PhotoplanError, UsageError
 from photoplan.geometry.grid import FullSize, Pixels, Window, level_size, means, reduced
 from photoplan.geometry.units import MetricSystem, agreed_metres, metres_in, metric_system, unit_label
@@ -91,7 +92,7 @@ USUAL_NODATA = (-9999.0, -32768.0, -32767.0, -99999.0)
 _LOWEST_FLOAT = float(np.finfo(np.float32).min)
 
 
-def not_nodata(pixels: NDArray[Any], nodata: float | None) -> NDArray[np.bool_] | None:
+def not_nodata(pixels: NDArray[Any], nodata: float | None) -> Mask | None:
     """Where not all bands of `pixels` (bands, h, w) equal `nodata`; None if that is everywhere.
 
     A nodata value that the type cannot hold (-9999 for bytes) is never met.
@@ -111,7 +112,7 @@ def not_nodata(pixels: NDArray[Any], nodata: float | None) -> NDArray[np.bool_] 
     return ~empty if empty.any() else None
 
 
-def refuse_undeclared(path: Path, window: Window, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> None:
+def refuse_undeclared(path: Path, window: Window, pixels: NDArray[Any], valid: Mask | None) -> None:
     """Refuse valid pixels (bands, h, w) of signed type that are one of the usual nodata values in all bands.
 
     Resampled as grey values they would spoil their surroundings without a word.
@@ -132,7 +133,7 @@ def refuse_undeclared(path: Path, window: Window, pixels: NDArray[Any], valid: N
             )
 
 
-def finite(pixels: NDArray[Any]) -> NDArray[np.bool_] | None:
+def finite(pixels: NDArray[Any]) -> Mask | None:
     """Where all bands of `pixels` (bands, h, w) are finite; None if that is everywhere."""
     if pixels.dtype.kind != "f":
         return None
@@ -146,10 +147,10 @@ class MissingBlocks:
 
     block: tuple[int, int]
     """Width and height of a block."""
-    gone: NDArray[np.bool_]
+    gone: Mask
     """True = never written; shape (rows, columns) of blocks."""
 
-    def written(self, window: Window) -> NDArray[np.bool_] | None:
+    def written(self, window: Window) -> Mask | None:
         """Where the pixels of a window lie in written blocks; None if that is everywhere."""
         rows = np.arange(window.row, window.row + window.height) // self.block[1]
         cols = np.arange(window.col, window.col + window.width) // self.block[0]
@@ -169,7 +170,7 @@ class _Blocks:
     """The blocks of one file."""
 
     layout: TiffLayout
-    todo: NDArray[np.bool_]
+    todo: Mask
     """Which blocks have not been checked, (planes, rows, columns). Two threads may check one block: no harm."""
 
 
@@ -334,7 +335,7 @@ def read_pixels(
     window: Window,
     missing: MissingBlocks | None = None,
     overview: tuple[int, tuple[int, int]] | None = None,
-) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+) -> tuple[NDArray[Any], Mask | None]:
     """Stored values of the bands without alpha, shape (bands, h, w), and the validity by the one rule (None: all)."""
     size = info.size if overview is None else overview[1]
     if window.size == 0 or window.col < 0 or window.row < 0 or np.any(np.array(window.stop) > size):
@@ -358,9 +359,7 @@ def read_pixels(
     return pixels, None if valid is None or valid.all() else valid
 
 
-def _from_file(
-    info: RasterInfo, window: Window, overview: int | None = None
-) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+def _from_file(info: RasterInfo, window: Window, overview: int | None = None) -> tuple[NDArray[Any], Mask | None]:
     """Colour bands, then alpha bands, shape (bands, h, w), and the mask of the file (None: there is none)."""
     area = rasterio.windows.Window(window.col, window.row, window.width, window.height)
     band, mask = "all", None
@@ -397,7 +396,7 @@ def _decode(info: RasterInfo) -> DecodedPicture:
     return picture
 
 
-def both(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+def both(a: Mask | None, b: Mask | None) -> Mask | None:
     """Both masks hold; None stands for "everywhere"."""
     if a is None or b is None:
         return b if a is None else a
@@ -493,7 +492,7 @@ class RasterReader:
         """Type of the pixels."""
         return np.dtype(self.info.dtype)
 
-    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], Mask | None]:
         """Pixels of a window and their validity, see `engine.base.Reader`; from the file's overviews where it can."""
         if level:
             overview = best_overview(self.info, level)
@@ -624,7 +623,7 @@ def _check_image(info: RasterInfo) -> None:
         raise InputError(f"{path}: a colour table beside other bands; {advice} `gdal_translate -expand rgb`")
 
 
-def _expand(info: RasterInfo, index: NDArray[Any]) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+def _expand(info: RasterInfo, index: NDArray[Any]) -> tuple[NDArray[np.uint8], Mask | None]:
     """Colours (3, h, w) that the indices of a palette stand for, and where they are opaque."""
     with gdal_settings():
         table = handle(info.path, info.driver).colormap(info.colour_bands[0])
@@ -859,7 +858,7 @@ class TerrainReader:
         """Columns and rows of the grid."""
         return self.info.size
 
-    def read(self, window: Window) -> NDArray[np.float32]:
+    def read(self, window: Window) -> Floats32:
         """Heights of a window inside the grid, shape (height, width), metres; NaN where there is none."""
         width, height = self.info.size
         right, bottom = window.stop
@@ -890,7 +889,7 @@ class TerrainReader:
             return width, height
         return self.info.size[0], max(height, min(_BLOCK, max(1, _BLOCK * _BLOCK // self.info.size[0])))
 
-    def _load(self, window: Window) -> NDArray[np.float32]:
+    def _load(self, window: Window) -> Floats32:
         """Read and check a block."""
         pixels, valid = read_pixels(self.info, window, self._missing)
         stored = pixels[0]
@@ -906,9 +905,7 @@ class TerrainReader:
         heights[void] = np.nan
         return heights.astype(np.float32)
 
-    def _check_range(
-        self, stored: NDArray[Any], heights: NDArray[np.float64], void: NDArray[np.bool_], window: Window
-    ) -> None:
+    def _check_range(self, stored: NDArray[Any], heights: Floats, void: Mask, window: Window) -> None:
         """Refuse values that are no heights."""
         wrong = ~void & ((heights < LOWEST) | (heights > HIGHEST))
         if self.info.nodata is None:

@@ -15,6 +15,7 @@ import rasterio
 import rasterio.enums
 from numpy.typing import NDArray
 
+from photoplan.arrays import Mask
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label, same_crs, split_compound
 from photoplan.geometry.grid import Placement
@@ -90,7 +91,7 @@ class TiffLayout:
         return -(-self.size[0] // self.block[0]), -(-self.size[1] // self.block[1])
 
     @property
-    def present(self) -> NDArray[np.bool_]:
+    def present(self) -> Mask:
         """Which blocks are stored, shape (planes, rows, columns) of blocks."""
         across, down = self.grid
         return ((self.counts > 0) & (self.offsets > 0)).reshape(-1, down, across)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, Strict, field_validator, model_validator
 
+from photoplan.arrays import Mask
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import Entry, Name, Number, Positive
@@ -948,7 +949,7 @@ def split(pixels: NDArray[Any], plane: Plane, window: Window) -> NDArray[Any]:
     return pixels[plane.band, row :: plane.step, col :: plane.step]
 
 
-def plane_mask(group: SeriesGroup, plane: Plane) -> NDArray[np.bool_] | None:
+def plane_mask(group: SeriesGroup, plane: Plane) -> Mask | None:
     """Which pixels of a plane count by the group's mask, shape as `plane_pixels`; None: all of them."""
     if group.mask is None:
         return None

@@ -33,9 +33,9 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 import rasterio
 import rasterio.windows
-from numpy.typing import NDArray
 
 from photoplan import __version__
+from photoplan.arrays import Floats32
 from photoplan.codec import NotData, decode, encode
 from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
 from photoplan.geometry.grid import Window
@@ -714,13 +714,13 @@ class ResultLog:
                 f"{self._path}: a kept result is not what this version writes ({error}); delete the file, run again"
             ) from error
 
-    def keep(self, values: NDArray[np.float32]) -> int:
+    def keep(self, values: Floats32) -> int:
         """Keep an array of float32; where it is, also in a later run. Called by workers."""
         index = next(self._arrays)
         self._open.append(index, np.ascontiguousarray(values, np.float32).data)
         return index
 
-    def rows(self, at: int, shape: tuple[int, int, int], first: int, last: int) -> NDArray[np.float32]:
+    def rows(self, at: int, shape: tuple[int, int, int], first: int, last: int) -> Floats32:
         """Rows from `first` to before `last` of an array of a shape (rows, columns, n) that is kept."""
         row = shape[1] * shape[2] * _BYTES
         try:

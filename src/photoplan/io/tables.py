@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats
 from photoplan.codec import storable
 from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import disk_error, make_parents
@@ -244,7 +244,7 @@ class TextTable:
             return self.texts(role)
         return [form.format(row=k + 1, line=line) for k, line in enumerate(self.lines)]
 
-    def numbers(self, *roles: str, empty: bool = False) -> NDArray[np.float64]:
+    def numbers(self, *roles: str, empty: bool = False) -> Floats:
         """Numbers of a role, shape (n,), or of several, (n, roles).
 
         NaN where the field is empty (if `empty`) or there is no such column.
@@ -252,14 +252,14 @@ class TextTable:
         found = [self._numbers(role, empty) for role in roles]
         return found[0] if len(found) == 1 else np.stack(found, axis=1)
 
-    def first_known(self, *roles: str) -> NDArray[np.float64]:
+    def first_known(self, *roles: str) -> Floats:
         """Numbers of the first of several roles that has one, shape (n,); NaN where none has; raises as `numbers`."""
         found = self.numbers(roles[0], empty=True)
         for role in roles[1:]:
             found = np.where(np.isnan(found), self.numbers(role, empty=True), found)
         return found
 
-    def _numbers(self, role: str, empty: bool) -> NDArray[np.float64]:
+    def _numbers(self, role: str, empty: bool) -> Floats:
         if role not in self.roles:
             return np.full(len(self.rows), np.nan)
         at, comma = self.roles[role], self.decimal_comma

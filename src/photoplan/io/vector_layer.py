@@ -23,6 +23,7 @@ import shapely
 from numpy.typing import NDArray
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
 
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label, same_crs, split_compound
@@ -223,13 +224,13 @@ class DrawnFeatures:
     """Features of one layer, taken apart into points and lines; of polygons the outlines."""
 
     path: Path
-    XYZ: NDArray[np.float64]
+    XYZ: Floats
     """Vertices of all in the units of the file, shape (n, 3); NaN height: none is stated."""
-    part: NDArray[np.int64]
+    part: Ints
     """Number of the point or line of each vertex, ascending, shape (n,)."""
-    is_point: NDArray[np.bool_]
+    is_point: Mask
     """Of each part."""
-    row: NDArray[np.int64]
+    row: Ints
     """Feature of each part, from 0."""
     fields: dict[str, NDArray[Any]]
     """Attributes by name in small letters, one value for each feature."""
@@ -333,7 +334,7 @@ class PointLayer:
     """A layer of points in space."""
 
     name: str
-    XYZ: NDArray[np.float64]
+    XYZ: Floats
     """(n, 3), metres."""
     columns: Mapping[str, NDArray[Any]]
     """Values of each field, (n,)."""
@@ -351,18 +352,13 @@ def write_point_layers(path: Path, layers: Sequence[PointLayer], crs: str) -> No
 
 
 def write_residuals(
-    path: Path,
-    points: ImagePoints,
-    residuals: NDArray[np.float64],
-    normalised: NDArray[np.float64],
-    redundancies: NDArray[np.float64],
-    rejected: NDArray[np.bool_],
+    path: Path, points: ImagePoints, residuals: Floats, normalised: Floats, redundancies: Floats, rejected: Mask
 ) -> None:
     """Write measurements with their residuals as a table that `photoplan adjust` reads again as image points."""
     pairs = ("residual", "normalised", "redundancy")
     names = [f"{name}_{axis}" for name in pairs for axis in "xy"]
     rows = []
-    used: NDArray[np.bool_] = np.asarray(np.isfinite(residuals).all(axis=1))
+    used: Mask = np.asarray(np.isfinite(residuals).all(axis=1))
     for k in range(len(points)):
         numbers = [*(f"{v:.10g}" for v in points.xy[k]), *(f"{v:.6g}" for v in points.sigma[k])]
         for values in (residuals[k], normalised[k], redundancies[k]):
@@ -582,7 +578,7 @@ BATCH = 500_000
 class ContourRow:
     """One contour."""
 
-    xy: NDArray[np.float64]
+    xy: Floats
     """Vertices, shape (n, 2), metres; of a closed line the last is the first."""
     height: float
     index: bool
@@ -780,15 +776,15 @@ class PlanTables:
     """Settings, products, inputs with fingerprints: all that executing needs; JSON values only."""
     tiles: dict[str, NDArray[Any]]
     """Columns of the layer `tiles`: product, index, sources, cells, residual, col, row, width, height, source_*."""
-    tile_bounds: NDArray[np.float64]
+    tile_bounds: Floats
     """Outer edges of each tile, shape (n, 4), in the product's CRS."""
     footprints: dict[str, NDArray[Any]]
     """Columns of the layer `footprints`: image, product, columns, rows, resolution."""
-    outlines: list[NDArray[np.float64]]
+    outlines: list[Floats]
     """Footprint of each image, shape (k, 2), in the product's CRS."""
     crs: str
     """CRS of all layers."""
-    squares: tuple[NDArray[np.float64], dict[str, NDArray[Any]]] | None = None
+    squares: tuple[Floats, dict[str, NDArray[Any]]] | None = None
     """Outer edges (n, 4) and columns of the layer `quadtree`; None: there is none."""
 
 

@@ -21,6 +21,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from photoplan.adjustment.least_squares import cauchy, solve
+from photoplan.arrays import Floats, Floats32, Ints, Mask
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Lens
 from photoplan.codec import storable
@@ -41,7 +42,7 @@ class GreyPixels(Protocol):
         """Width and height in pixels."""
         ...
 
-    def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    def read(self, window: Window) -> tuple[NDArray[Any], Mask | None]:
         """Pixels of a window inside the image, shape (bands, height, width), and their validity; None: all."""
         ...
 
@@ -54,7 +55,7 @@ class Grey(Protocol):
         """Width and height in pixels."""
         ...
 
-    def read(self, window: Window) -> NDArray[np.float32]:
+    def read(self, window: Window) -> Floats32:
         """Grey values, shape (height, width); NaN where there are none."""
         ...
 
@@ -74,7 +75,7 @@ class GreyImage:
         """Width and height in pixels."""
         return self.pixels.size
 
-    def read(self, window: Window) -> NDArray[np.float32]:
+    def read(self, window: Window) -> Floats32:
         """Grey values of any window, shape (height, width); NaN outside the image and its area, and where not valid."""
         out = np.full((window.height, window.width), np.nan, np.float32)
         inside = window & Window(0, 0, *self.size)
@@ -93,7 +94,7 @@ class GreyImage:
         out[row : row + inside.height, col : col + inside.width] = grey
         return out
 
-    def reduced(self, window: Window, factor: int) -> NDArray[np.float32]:
+    def reduced(self, window: Window, factor: int) -> Floats32:
         """Means of `factor` × `factor` pixels; `window` counts in such means. NaN where one of them is."""
         if factor == 1:
             return self.read(window)
@@ -133,19 +134,19 @@ class ReducedImage:
         width, height = self.image.size
         return width // self.factor, height // self.factor
 
-    def read(self, window: Window) -> NDArray[np.float32]:
+    def read(self, window: Window) -> Floats32:
         """Grey values of any window, shape (height, width); NaN where a pixel has none."""
         return self.image.reduced(window, self.factor)
 
 
-def _grey(pixels: NDArray[Any]) -> NDArray[np.float32]:
+def _grey(pixels: NDArray[Any]) -> Floats32:
     if len(pixels) == 1:
         return pixels[0].astype(np.float32)
     weights = np.array(_LUMINANCE if len(pixels) == 3 else [1 / len(pixels)] * len(pixels), np.float32)
     return np.einsum("b,bij->ij", weights, pixels, dtype=np.float32, casting="unsafe")
 
 
-def to_bytes(grey: NDArray[np.float32], low: float, high: float) -> NDArray[np.uint8]:
+def to_bytes(grey: Floats32, low: float, high: float) -> NDArray[np.uint8]:
     """Grey values from `low` to `high` as 0 to 255; what has none becomes the mean of the rest."""
     scaled = np.clip((grey - low) * (255.0 / (high - low)), 0, 255)
     known = np.isfinite(scaled)
@@ -154,7 +155,7 @@ def to_bytes(grey: NDArray[np.float32], low: float, high: float) -> NDArray[np.u
     return np.rint(scaled).astype(np.uint8)
 
 
-def patches_at(image: Grey, corner: NDArray[np.int64], side: int) -> NDArray[np.float32]:
+def patches_at(image: Grey, corner: Ints, side: int) -> Floats32:
     """Square windows of grey values, shape (n, side, side); NaN where there are none.
 
     The image is read once, in tiles that hold the windows; what is in memory is a tile and the result.
@@ -204,13 +205,13 @@ class FeatureSettings:
 class Features:
     """Features of one image."""
 
-    xy: NDArray[np.float64]
+    xy: Floats
     """Column and row, shape (n, 2), pixels of the full image."""
-    scale: NDArray[np.float64]
+    scale: Floats
     """Standard deviation of the Gaussian at which the feature was found, (n,), pixels of the full image."""
-    angle: NDArray[np.float64]
+    angle: Floats
     """Direction of the strongest slope, (n,), radians from the column axis towards the row axis."""
-    strength: NDArray[np.float64]
+    strength: Floats
     """Contrast, (n,)."""
     descriptors: NDArray[np.uint8]
     """Root-SIFT, shape (n, 128), in `DESCRIPTOR_UNIT`."""
@@ -341,7 +342,7 @@ _ROWS = 1024
 class Guide:
     """Where features of the first image are to be expected in the second one."""
 
-    xy: NDArray[np.float64]
+    xy: Floats
     """Column and row, shape (n, 2), pixels; NaN: not to be expected anywhere."""
     radius: float
     """How far from there they may be, pixels."""
@@ -352,7 +353,7 @@ def all_pairs(count: int) -> list[Pair]:
     return list(itertools.combinations(range(count), 2))
 
 
-def pairs_by_footprints(footprints: Sequence[NDArray[np.float64]]) -> list[Pair]:
+def pairs_by_footprints(footprints: Sequence[Floats]) -> list[Pair]:
     """Pairs whose footprints share at least 5 % of the smaller one."""
     areas = [shapely.convex_hull(shapely.MultiPoint(f)) for f in footprints]
     tree = shapely.STRtree(areas)
@@ -365,7 +366,7 @@ def pairs_by_footprints(footprints: Sequence[NDArray[np.float64]]) -> list[Pair]
     return found
 
 
-def pairs_by_distance(positions: NDArray[np.float64]) -> list[Pair]:
+def pairs_by_distance(positions: Floats) -> list[Pair]:
     """Each image with its 20 nearest ones, as far as six times the median distance to the nearest one."""
     n = len(positions)
     if n < 2:
@@ -395,7 +396,7 @@ def pairs_by_likeness(coarse: Sequence[Features]) -> list[Pair]:
     return sorted(found)
 
 
-def match_features(a: Features, b: Features, guide: Guide | None = None) -> NDArray[np.int64]:
+def match_features(a: Features, b: Features, guide: Guide | None = None) -> Ints:
     """Features that are each other's most similar one, and clearly more similar than the next.
 
     Second best are features at other places only: one place may have several directions.
@@ -432,14 +433,14 @@ def match_features(a: Features, b: Features, guide: Guide | None = None) -> NDAr
     return np.stack([i, best[i]], axis=1)
 
 
-def _far(guide: Guide, rows: slice, b: Features) -> NDArray[np.bool_]:
+def _far(guide: Guide, rows: slice, b: Features) -> Mask:
     expected, there = guide.xy[rows].astype(np.float32), b.xy.astype(np.float32)
     dx = expected[:, None, 0] - there[None, :, 0]
     dy = expected[:, None, 1] - there[None, :, 1]
     return ~(dx * dx + dy * dy <= np.float32(guide.radius**2))
 
 
-def _clear_best(likeness: NDArray[np.float32], b: Features) -> NDArray[np.int64]:
+def _clear_best(likeness: Floats32, b: Features) -> Ints:
     """Column of the best of each row, −1 where the second best is nearly as good or nothing may be compared."""
     rows = np.arange(len(likeness))
     few = min(4, likeness.shape[1])
@@ -463,7 +464,7 @@ class Calibration:
     interior: Interior
     lens: Lens
 
-    def tangents(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def tangents(self, xy: Floats) -> Floats:
         """Image points (n, 2) as ideal tangent coordinates (n, 2); NaN where the lens has none."""
         return self.lens.undistort(self.interior.tangent_to_pixel.inverse(xy))
 
@@ -493,7 +494,7 @@ class PairMatches:
     first: int
     second: int
     """Indices of the images."""
-    features: NDArray[np.int64]
+    features: Ints
     """Indices of features in first and second image, shape (n, 2)."""
     tried: int
     """Matches before verification."""
@@ -503,10 +504,8 @@ class PairMatches:
 
 
 def verify_pair(
-    xy: tuple[NDArray[np.float64], NDArray[np.float64]],
-    calibrations: tuple[Calibration | None, Calibration | None],
-    settings: VerifySettings,
-) -> NDArray[np.bool_]:
+    xy: tuple[Floats, Floats], calibrations: tuple[Calibration | None, Calibration | None], settings: VerifySettings
+) -> Mask:
     """Which matches fit one geometry of the pair; none of them if it is not verified.
 
     With both cameras known the geometry is the essential matrix of the tangents (Nistér 2004), else the fundamental
@@ -537,10 +536,10 @@ def verify_pair(
     return fits if enough else none
 
 
-def _essential(t: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: float) -> NDArray[np.bool_]:
+def _essential(t: tuple[Floats, Floats], threshold: float) -> Mask:
     cv2 = opencv()
-    known: NDArray[np.bool_] = np.asarray(np.isfinite(np.concatenate(t, axis=1)).all(axis=1), np.bool_)
-    fits: NDArray[np.bool_] = np.zeros(len(known), np.bool_)
+    known: Mask = np.asarray(np.isfinite(np.concatenate(t, axis=1)).all(axis=1), np.bool_)
+    fits: Mask = np.zeros(len(known), np.bool_)
     p, q = t[0][known], t[1][known]
     if len(p) < 6:
         return fits
@@ -553,9 +552,7 @@ def _essential(t: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: fl
     return fits
 
 
-def _adjusted(
-    cv2: Any, E: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64], threshold: float
-) -> NDArray[np.float64]:
+def _adjusted(cv2: Any, E: Floats, p: Floats, q: Floats, threshold: float) -> Floats:
     """Essential matrix of all matches that fit: five unknowns, weights that fall with the distance (Cauchy).
 
     A sample of five matches gives a solution through their noise, which loses part of the right ones.
@@ -563,7 +560,7 @@ def _adjusted(
     R, _, base = cv2.decomposeEssentialMat(E)
     base = base.ravel()
 
-    def distances(E: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distances(E: Floats) -> Floats:
         return _signed(E, p, q)
 
     step = 1e-6
@@ -584,10 +581,10 @@ def _adjusted(
     return better if fit[1] >= fit[0] else E
 
 
-def _fundamental(xy: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: float) -> NDArray[np.bool_]:
+def _fundamental(xy: tuple[Floats, Floats], threshold: float) -> Mask:
     cv2 = opencv()
     p, q = (np.ascontiguousarray(v) for v in xy)
-    fits: NDArray[np.bool_] = np.zeros(len(p), np.bool_)
+    fits: Mask = np.zeros(len(p), np.bool_)
     F, _ = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, threshold, 0.9999, 10000)
     if F is not None and F.shape == (3, 3):
         fits = _sampson(F, p, q) <= threshold
@@ -601,12 +598,12 @@ def _fundamental(xy: tuple[NDArray[np.float64], NDArray[np.float64]], threshold:
     return fits
 
 
-def _sampson(F: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sampson(F: Floats, p: Floats, q: Floats) -> Floats:
     """Distance of matches from their epipolar lines, to first order (Hartley and Zisserman 2004, eq. 11.9)."""
     return np.abs(_signed(F, p, q))
 
 
-def _signed(F: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+def _signed(F: Floats, p: Floats, q: Floats) -> Floats:
     """The same with a sign."""
     one = np.ones((len(p), 1))
     a, b = np.concatenate([p, one], axis=1), np.concatenate([q, one], axis=1)
@@ -625,17 +622,17 @@ SAME_PLACE = 1.5
 class Tracks:
     """Image points and the track that each belongs to; a track has one point in an image."""
 
-    track: NDArray[np.int64]
+    track: Ints
     """Track of each image point, (n,); numbers from 0 without gaps, points of one track side by side."""
-    image: NDArray[np.int64]
+    image: Ints
     """Index of its image, (n,)."""
-    xy: NDArray[np.float64]
+    xy: Floats
     """Column and row, (n, 2), pixels."""
-    scale: NDArray[np.float64]
+    scale: Floats
     """Scale of the feature, (n,), pixels."""
-    angle: NDArray[np.float64]
+    angle: Floats
     """Direction of the feature, (n,), radians from column towards row axis."""
-    sigma: NDArray[np.float64]
+    sigma: Floats
     """Standard deviation of column and row, (n, 2), pixels; NaN: not known."""
 
     def __len__(self) -> int:
@@ -647,7 +644,7 @@ class Tracks:
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
     @property
-    def rays(self) -> NDArray[np.int64]:
+    def rays(self) -> Ints:
         """Image points of each track."""
         return np.bincount(self.track, minlength=self.count)
 
@@ -660,7 +657,7 @@ class Tracks:
         rest = (getattr(self, n)[keep] for n in ("image", "xy", "scale", "angle", "sigma"))
         return Tracks(track.reshape(-1).astype(np.int64), *rest)
 
-    def of_tracks(self, keep: NDArray[np.bool_]) -> Tracks:
+    def of_tracks(self, keep: Mask) -> Tracks:
         """The tracks where `keep` (one per track) is true."""
         return self.where(keep[self.track])
 
@@ -768,7 +765,7 @@ CELLS = 5
 GRUBER = 3
 
 
-def thin_tracks(tracks: Tracks, sizes: Sequence[tuple[int, int]], per_image: int) -> NDArray[np.bool_]:
+def thin_tracks(tracks: Tracks, sizes: Sequence[tuple[int, int]], per_image: int) -> Mask:
     """Tracks to keep.
 
     Long tracks come first, of equally long ones those with the smaller standard deviation (or the finer feature). A
@@ -802,12 +799,12 @@ def thin_tracks(tracks: Tracks, sizes: Sequence[tuple[int, int]], per_image: int
     return keep
 
 
-def _cells(tracks: Tracks, sizes: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
+def _cells(tracks: Tracks, sizes: Sequence[tuple[int, int]]) -> Ints:
     part = (tracks.xy + 0.5) / np.array(sizes, float).reshape(-1, 2)[tracks.image] * CELLS
     return np.clip(part.astype(np.int64), 0, CELLS - 1) @ np.array([1, CELLS])
 
 
-def _order(tracks: Tracks) -> NDArray[np.int64]:
+def _order(tracks: Tracks) -> Ints:
     """Tracks from the best to the worst."""
     worst = np.zeros(tracks.count)
     quality = np.where(np.isfinite(tracks.sigma[:, 0]), tracks.sigma.max(axis=1), tracks.scale)
@@ -815,7 +812,7 @@ def _order(tracks: Tracks) -> NDArray[np.int64]:
     return np.lexsort((np.arange(tracks.count), worst, -tracks.rays))
 
 
-def _fill_overlaps(tracks: Tracks, start: NDArray[np.int64], order: NDArray[np.int64], keep: NDArray[np.bool_]) -> None:
+def _fill_overlaps(tracks: Tracks, start: Ints, order: Ints, keep: Mask) -> None:
     """Keep further tracks where a part of an overlap holds too few; `keep` is changed."""
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
@@ -841,8 +838,6 @@ def _fill_overlaps(tracks: Tracks, start: NDArray[np.int64], order: NDArray[np.i
                 keep[spare[np.argsort(rank[spare])[:missing]]] = True
 
 
-_Floats = NDArray[np.float64]
-
 #: Width of the derivative that finds edges, pixels.
 SIGMA = 1.5
 #: What a change of grey values is full evidence of an edge, in parts of the strong ones (99th percentile).
@@ -856,7 +851,7 @@ _NEVER = 1e6
 _SHOULDER = 4
 
 
-def edge_strength(grey: NDArray[np.floating]) -> _Floats:
+def edge_strength(grey: NDArray[np.floating]) -> Floats:
     """How much grey values (height, width) change downwards in each pixel, same shape; 0 near pixels without value."""
     known = np.isfinite(grey)
     even = np.where(known, grey, 0.0).astype(float)
@@ -867,7 +862,7 @@ def edge_strength(grey: NDArray[np.floating]) -> _Floats:
     return np.asarray(gaussian_filter1d(change, SIGMA / 2, axis=1, mode="nearest"))
 
 
-def sky_edge(strength: NDArray[np.floating], low: NDArray[np.integer], high: NDArray[np.integer]) -> _Floats:
+def sky_edge(strength: NDArray[np.floating], low: NDArray[np.integer], high: NDArray[np.integer]) -> Floats:
     """Rows of the edge in every column, to a part of a pixel, shape (width,); NaN: there is none."""
     height, width = strength.shape
     row = np.arange(height)[:, None]
@@ -893,7 +888,7 @@ def sky_edge(strength: NDArray[np.floating], low: NDArray[np.integer], high: NDA
     return out
 
 
-def _cheapest(cost: _Floats) -> NDArray[np.int64]:
+def _cheapest(cost: Floats) -> Ints:
     """The row of each column of (height, width) with the least sum of costs, steps between them included."""
     height, width = cost.shape
     slope = _STEP * np.arange(height)

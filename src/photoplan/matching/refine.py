@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from photoplan.adjustment.least_squares import MEDIAN_2D
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.codec import storable
 from photoplan.events import Map
 from photoplan.kernels.matching import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
@@ -48,13 +48,13 @@ class RefineSettings:
 class Matched:
     """Results of matching n patches between two images."""
 
-    xy: NDArray[np.float64]
+    xy: Floats
     """Column and row in the second image, (n, 2); NaN where the patch was not found."""
-    affine: NDArray[np.float64]
+    affine: Floats
     """From offsets in the first to offsets in the second image, (n, 2, 2)."""
-    correlation: NDArray[np.float64]
+    correlation: Floats
     """(n,)."""
-    covariance: NDArray[np.float64]
+    covariance: Floats
     """Of `xy` as the fit has it, (n, 2, 2), square pixels."""
 
 
@@ -79,12 +79,12 @@ class _Pair:
 
     a: int
     b: int
-    first: NDArray[np.int64]
+    first: Ints
     """Rows of the points in the one, (n,)."""
-    second: NDArray[np.int64]
+    second: Ints
 
 
-def disc(radius: int) -> NDArray[np.float64]:
+def disc(radius: int) -> Floats:
     """Weights of a round patch, shape (2 radius + 1, 2 radius + 1)."""
     v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     return (u * u + v * v <= (radius + 0.5) ** 2).astype(float)
@@ -92,10 +92,10 @@ def disc(radius: int) -> NDArray[np.float64]:
 
 def match_between(
     images: tuple[Grey, Grey],
-    at: NDArray[np.int64],
-    start: tuple[NDArray[np.float64], NDArray[np.float64]],
+    at: Ints,
+    start: tuple[Floats, Floats],
     settings: RefineSettings,
-    weights: NDArray[np.float64] | None = None,
+    weights: Floats | None = None,
 ) -> Matched:
     """Match patches round whole pixels of the first image in the second image.
 
@@ -142,13 +142,13 @@ def match_between(
     )
 
 
-def _near(affine: NDArray[np.float64], start: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _near(affine: Floats, start: Floats) -> Mask:
     """Whether mappings are still like those that they started from."""
     change = np.linalg.inv(start) @ np.nan_to_num(affine, nan=9.0) - np.eye(2)
     return np.asarray(np.linalg.norm(change, axis=(1, 2), ord=2) < _BENT, np.bool_)
 
 
-def _on_known(known: NDArray[np.bool_], found: NDArray[np.float64], radius: int) -> NDArray[np.bool_]:
+def _on_known(known: Mask, found: Floats, radius: int) -> Mask:
     """Whether the middle and the rim of the matched patches lie on pixels that have a value."""
     turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     rim = (radius + 2) * np.stack([np.cos(turn), np.sin(turn)])
@@ -160,7 +160,7 @@ def _on_known(known: NDArray[np.bool_], found: NDArray[np.float64], radius: int)
     return (inside & known[np.arange(len(found))[:, None], row, col]).all(axis=1)
 
 
-def reference_points(tracks: Tracks, sizes: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
+def reference_points(tracks: Tracks, sizes: Sequence[tuple[int, int]]) -> Ints:
     """Row of the reference point of each track: of the images in which it is seen finest, the most central one.
 
     A feature's scale in pixels is larger in an image of finer resolution.
@@ -174,7 +174,7 @@ def reference_points(tracks: Tracks, sizes: Sequence[tuple[int, int]]) -> NDArra
     return order[np.searchsorted(tracks.track[order], np.arange(tracks.count))]
 
 
-def local_affines(tracks: Tracks, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:
+def local_affines(tracks: Tracks, first: Ints, second: Ints) -> Floats:
     """How the second image is turned and scaled against the first one at points of both, shape (n, 2, 2).
 
     A single feature's direction and scale are rough; medians over the neighbours are taken.
@@ -227,7 +227,7 @@ def refine_tracks(
     return _accepted(tracks, reference, xy, variance, correlation, settings)
 
 
-def _image_pairs(tracks: Tracks, reference: NDArray[np.int64]) -> Iterator[_Pair]:
+def _image_pairs(tracks: Tracks, reference: Ints) -> Iterator[_Pair]:
     other = np.setdiff1d(np.arange(len(tracks)), reference)
     first = reference[tracks.track[other]]
     key = np.stack([tracks.image[first], tracks.image[other]], axis=1)
@@ -239,12 +239,7 @@ def _image_pairs(tracks: Tracks, reference: NDArray[np.int64]) -> Iterator[_Pair
 
 
 def _accepted(
-    tracks: Tracks,
-    reference: NDArray[np.int64],
-    xy: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    correlation: NDArray[np.float64],
-    settings: RefineSettings,
+    tracks: Tracks, reference: Ints, xy: Floats, variance: Floats, correlation: Floats, settings: RefineSettings
 ) -> Refined:
     is_reference = np.zeros(len(tracks), bool)
     is_reference[reference] = True
@@ -298,7 +293,7 @@ class Loops:
         return self.count >= LEAST
 
 
-def latin_weights(radius: int, affine: NDArray[np.float64], part: int) -> NDArray[np.float64]:
+def latin_weights(radius: int, affine: Floats, part: int) -> Floats:
     """Weights of the pixels that belong to one of the three parts of a patch."""
     v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1].astype(float)
     there = np.einsum("nij,jrc->nirc", affine, np.stack([u, v]))
@@ -308,7 +303,7 @@ def latin_weights(radius: int, affine: NDArray[np.float64], part: int) -> NDArra
 
 
 def close_loops(
-    tracks: Tracks, reference: NDArray[np.int64], images: Sequence[Grey], settings: RefineSettings, run: Map = map
+    tracks: Tracks, reference: Ints, images: Sequence[Grey], settings: RefineSettings, run: Map = map
 ) -> Loops:
     """Measure the factor on some of the tracks with three rays or more.
 
@@ -340,9 +335,7 @@ def close_loops(
     return Loops(max(1.0, factor), int(good.sum()))
 
 
-def _close(
-    tracks: Tracks, images: Sequence[Grey], rows: NDArray[np.int64], settings: RefineSettings
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _close(tracks: Tracks, images: Sequence[Grey], rows: Ints, settings: RefineSettings) -> tuple[Floats, Floats]:
     """Closures (n, 2) and their covariances (n, 2, 2) in the first image; NaN where a step failed."""
     a, b, c = rows.T
     begin = np.rint(tracks.xy[a])
@@ -357,16 +350,16 @@ def _close(
 def _step(
     tracks: Tracks,
     pair: tuple[Grey, Grey],
-    rows: tuple[NDArray[np.int64], NDArray[np.int64]],
-    state: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    rows: tuple[Ints, Ints],
+    state: tuple[Floats, Floats, Floats],
     settings: RefineSettings,
     part: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats, Floats]:
     """Position, affine to the loop's first image and covariance, carried into the next image."""
     at, to_first, covariance = state
     first, second = rows
     affine = local_affines(tracks, first, second)
-    known: NDArray[np.bool_] = np.asarray(np.isfinite(at).all(axis=1), np.bool_)
+    known: Mask = np.asarray(np.isfinite(at).all(axis=1), np.bool_)
     whole = np.rint(np.where(known[:, None], at, 0.0)).astype(np.int64)
     near = tracks.xy[second] + np.einsum("nij,nj->ni", affine, whole - tracks.xy[first])
     weights = latin_weights(settings.radius, np.where(known[:, None, None], to_first, np.eye(2)), part)
@@ -383,7 +376,7 @@ def _step(
     return position, to_first @ back, carried
 
 
-def _liked(found: Matched, known: NDArray[np.bool_], settings: RefineSettings) -> Matched:
+def _liked(found: Matched, known: Mask, settings: RefineSettings) -> Matched:
     """Without the results that refinement would not take."""
     bad = ~(known & (found.correlation >= settings.correlation))
     xy, affine, covariance = found.xy.copy(), found.affine.copy(), found.covariance.copy()

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from photoplan.adjustment.least_squares import MEDIAN_2D, cauchy, huber, solve, spread
+from photoplan.arrays import Floats, Floats32, Ints, Mask
 from photoplan.cameras.base import CentralCamera, project
 from photoplan.codec import storable
 from photoplan.geometry.grid import Placement, Window
@@ -29,15 +30,13 @@ from photoplan.matching.features import Grey, GreyImage, patches_at
 from photoplan.matching.refine import RefineSettings, disc, match_between
 from photoplan.plain import pick
 
-_Floats = NDArray[np.float64]
-
 #: Distances at which noise may be alike, pixels.
 REACH = 4
 #: The noise that is expected counts as so many patches.
 _EXPECTED = 10.0
 
 
-def noise_factors(columns: _Floats, observed: _Floats, mask: NDArray[np.bool_], expected: _Floats) -> _Floats:
+def noise_factors(columns: Floats, observed: Floats, mask: Mask, expected: Floats) -> Floats:
     """Factors f of the standard deviations of the first two unknowns of every patch, (n, 2)."""
     n, side, _, unknowns = columns.shape
     flat = (columns * mask[..., None]).reshape(n, -1, unknowns)
@@ -65,7 +64,7 @@ def noise_factors(columns: _Floats, observed: _Floats, mask: NDArray[np.bool_], 
     return np.maximum(out, 1.0)
 
 
-def _products(values: _Floats) -> _Floats:
+def _products(values: Floats) -> Floats:
     """Sums of products of pixels at distances up to `REACH`, row by row of distances, (n, (2 REACH + 1)²)."""
     size = values.shape[1] + REACH
     power = np.abs(np.fft.rfft2(values, (size, size))) ** 2
@@ -108,7 +107,7 @@ class PixelTransfer:
         return cls((a, b, c, d), (float(t[0]), float(t[1])))
 
     @property
-    def L(self) -> _Floats:
+    def L(self) -> Floats:
         """(2, 2)."""
         return np.array(self.linear).reshape(2, 2)
 
@@ -126,7 +125,7 @@ class PixelTransfer:
         high = np.minimum(np.ceil(np.clip(back.max(axis=0), -1, 1e9)) + 1, first).astype(int)
         return None if (high <= low).any() else Window(int(low[0]), int(low[1]), *(high - low).tolist())
 
-    def __call__(self, xy: ArrayLike) -> _Floats:
+    def __call__(self, xy: ArrayLike) -> Floats:
         """Points (..., 2) of the second image."""
         return np.asarray(np.asarray(xy, float) @ self.L.T + np.array(self.shift))
 
@@ -155,20 +154,20 @@ class PatchSettings:
 class PatchDisplacements:
     """Patches and where they were found."""
 
-    at: NDArray[np.int64]
+    at: Ints
     """Middle in the first image, column and row, (n, 2)."""
-    moved: _Floats
+    moved: Floats
     """Found minus expected place, pixels of the first image, (n, 2); NaN where it was not found."""
-    covariance: _Floats
+    covariance: Floats
     """Of it, (n, 2, 2)."""
-    correlation: _Floats
+    correlation: Floats
     state: NDArray[np.uint8]
     """See `STATES`."""
-    factor: _Floats
+    factor: Floats
     """By which the fit's standard deviations were multiplied, (n, 2)."""
 
     @property
-    def sigma(self) -> _Floats:
+    def sigma(self) -> Floats:
         """Standard deviations, (n, 2)."""
         return np.sqrt(self.covariance[:, [0, 1], [0, 1]])
 
@@ -184,7 +183,7 @@ class SmoothedImage:
         """Width and height in pixels."""
         return self.image.size
 
-    def read(self, window: Window) -> NDArray[np.float32]:
+    def read(self, window: Window) -> Floats32:
         """Grey values of any window, shape (height, width); NaN where a pixel or a neighbour has none."""
         v = self.image.read(Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2))
         a, b, c = _SMOOTHING.astype(np.float32)
@@ -193,7 +192,7 @@ class SmoothedImage:
 
 
 def match_grid(
-    pair: tuple[Grey, Grey], transfer: PixelTransfer, at: NDArray[np.int64], settings: PatchSettings
+    pair: tuple[Grey, Grey], transfer: PixelTransfer, at: Ints, settings: PatchSettings
 ) -> PatchDisplacements:
     """Find patches of the first image in the second one.
 
@@ -222,7 +221,7 @@ def match_grid(
     start = transfer(at[some] + offset[some]), np.broadcast_to(transfer.L, (len(some), 2, 2)).copy()
     found = match_between(images, at[some], start, settings.refine)
     inverse = np.linalg.inv(transfer.L)
-    off: _Floats = np.asarray((found.xy - transfer(at[some])) @ inverse.T)
+    off: Floats = np.asarray((found.xy - transfer(at[some])) @ inverse.T)
     correlation[some] = found.correlation
     far = ~(np.abs(off).max(axis=1, initial=0.0) <= settings.search)
     bad = ~(found.correlation >= settings.correlation) | far
@@ -242,7 +241,7 @@ def match_grid(
     )
 
 
-def _promised(templates: _Floats, round_patch: NDArray[np.bool_]) -> _Floats:
+def _promised(templates: Floats, round_patch: Mask) -> Floats:
     """Standard deviation that matching will have along the worst direction, from slopes and noise of patches, (n,).
 
     Noise from the second mixed difference (Immerkær 1996), of the quieter patches; its part in the slopes is taken off.
@@ -265,16 +264,16 @@ def _promised(templates: _Floats, round_patch: NDArray[np.bool_]) -> _Floats:
 class _Tile:
     """A part of the second image: as a spline, and at the pixels of the first one."""
 
-    low: NDArray[np.int64]
+    low: Ints
     """First pixel of the first image."""
-    values: _Floats
+    values: Floats
     """At its pixels; NaN where there are none."""
-    coefficients: _Floats
-    corner: NDArray[np.int64]
+    coefficients: Floats
+    corner: Ints
     """First pixel of the spline in the second image."""
 
     @classmethod
-    def of(cls, other: Grey, transfer: PixelTransfer, at: NDArray[np.int64], around: int) -> _Tile:
+    def of(cls, other: Grey, transfer: PixelTransfer, at: Ints, around: int) -> _Tile:
         """The part around patches."""
         low, high = at.min(axis=0) - around, at.max(axis=0) + around + 1
         x, y = np.arange(low[0], high[0], dtype=float), np.arange(low[1], high[1], dtype=float)
@@ -291,7 +290,7 @@ class _Tile:
         out[~known[near[..., 1], near[..., 0]]] = np.nan
         return cls(low, out, coefficients[0], corner)
 
-    def sample(self, xy: _Floats) -> _Floats:
+    def sample(self, xy: Floats) -> Floats:
         """Grey values at points (..., 2) of the second image; NaN outside."""
         local = np.ascontiguousarray((xy - self.corner).reshape(-1, 2))
         out = np.empty(len(local))
@@ -299,9 +298,7 @@ class _Tile:
         return out.reshape(xy.shape[:-1])
 
 
-def _whole_pixels(
-    picture: _Tile, at: NDArray[np.int64], templates: _Floats, settings: PatchSettings
-) -> tuple[_Floats, NDArray[np.bool_]]:
+def _whole_pixels(picture: _Tile, at: Ints, templates: Floats, settings: PatchSettings) -> tuple[Floats, Mask]:
     """Displacement of best correlation, whole pixels (n, 2), NaN: none; and whether the expected place has pixels."""
     r, s = settings.radius, int(np.ceil(settings.search))
     offset, seen = np.full((len(at), 2), np.nan), np.zeros(len(at), bool)
@@ -319,9 +316,7 @@ def _whole_pixels(
     return offset, seen
 
 
-def _factors(
-    picture: _Tile, templates: _Floats, found: tuple[_Floats, _Floats], round_patch: NDArray[np.bool_]
-) -> _Floats:
+def _factors(picture: _Tile, templates: Floats, found: tuple[Floats, Floats], round_patch: Mask) -> Floats:
     """By how much the errors of patches are larger than their fits say, (n, 2)."""
     r = len(round_patch) // 2
     v, u = np.mgrid[-r : r + 1, -r : r + 1].astype(float)
@@ -341,7 +336,7 @@ def contradicting(found: PatchDisplacements, shape: tuple[int, int]) -> PatchDis
     return replace(found, state=state)
 
 
-def _apart(found: PatchDisplacements, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _apart(found: PatchDisplacements, shape: tuple[int, int]) -> Mask:
     """Which vectors contradict their neighbours, (n,)."""
     rows, columns = shape
     apart = np.zeros((rows, columns), bool)
@@ -374,14 +369,14 @@ class SmoothModel:
     kind: str
     middle: tuple[float, float]
     """Pixels of the first image."""
-    unknowns: _Floats
+    unknowns: Floats
     """d0 and, of an affine mapping, the derivatives along columns and rows; a row for dx, one for dy, (2, u)."""
-    covariances: _Floats
+    covariances: Floats
     """Of each row, (2, u, u)."""
     rms: tuple[float, float]
     """Residuals of dx and of dy, pixels."""
 
-    def __call__(self, at: _Floats) -> _Floats:
+    def __call__(self, at: Floats) -> Floats:
         """Displacements at pixels (n, 2)."""
         return np.asarray(_columns(at, self.middle, self.unknowns.shape[1]) @ self.unknowns.T)
 
@@ -400,7 +395,7 @@ class SmoothModel:
         return {**pick(self, "kind", "middle", rms_px="rms"), **axes}
 
 
-def _columns(at: _Floats, middle: tuple[float, float], unknowns: int) -> _Floats:
+def _columns(at: Floats, middle: tuple[float, float], unknowns: int) -> Floats:
     off = np.asarray(at, float) - np.array(middle)
     return np.column_stack([np.ones(len(off)), off])[:, :unknowns]
 
@@ -444,8 +439,6 @@ def fit_smooth(found: PatchDisplacements, kind: str, overlap: float) -> SmoothMo
     )
 
 
-Array = NDArray[np.float64]
-
 #: Part of a patch that must have values.
 FILLED = 0.5
 #: A second peak of the correlation must stay below this part of the first one, so many cells away from it.
@@ -467,7 +460,7 @@ class FoundPatch:
 
     at: tuple[float, float]
     """Column and row."""
-    covariance: Array
+    covariance: Floats
     """Of column and row as the fit has it, (2, 2)."""
     correlation: float
 
@@ -476,9 +469,9 @@ class FoundPatch:
 class AgreeingPoints:
     """Which points of an image agree with one correction of its orientation."""
 
-    keep: NDArray[np.bool_]
+    keep: Mask
     """(n,)."""
-    residuals: Array
+    residuals: Floats
     """Measured minus computed after the correction, (n, 2), pixels."""
     shift: tuple[float, float]
     """Median of measured minus computed position before, pixels."""
@@ -486,7 +479,7 @@ class AgreeingPoints:
     """By which standard deviations of the fit are to be multiplied, 2 or more."""
 
 
-def best_place(values: NDArray[np.float32], radius: int, border: int) -> tuple[int, int] | None:
+def best_place(values: Floats32, radius: int, border: int) -> tuple[int, int] | None:
     """Column and row where a patch has most texture in all directions; None if none has enough values.
 
     The measure is the smaller eigenvalue of the mean products of slopes over the patch (Förstner and Gülch 1987).
@@ -512,7 +505,7 @@ def best_place(values: NDArray[np.float32], radius: int, border: int) -> tuple[i
     return (int(col), int(row)) if score[row, col] > 0 else None
 
 
-def correlation_scores(patch: Array, picture: Array) -> Array:
+def correlation_scores(patch: Floats, picture: Floats) -> Floats:
     """Correlation coefficient of a patch with every part of a larger picture, over the cells that both have.
 
     Normalised with means and norms of the common cells (Padfield 2012, eq. 27 and 28).
@@ -522,12 +515,12 @@ def correlation_scores(patch: Array, picture: Array) -> Array:
     f = np.where(mask_f, picture - picture[mask_f].mean(), 0.0)
     shape = [fft.next_fast_len(s) for s in picture.shape]
 
-    def forward(a: Array) -> NDArray[np.complex128]:
+    def forward(a: Floats) -> NDArray[np.complex128]:
         return np.asarray(fft.rfft2(a, shape))
 
     out = tuple(slice(0, n - m + 1) for n, m in zip(picture.shape, patch.shape))
 
-    def against(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> Array:
+    def against(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> Floats:
         return np.asarray(fft.irfft2(np.conj(a) * b, shape))[out]
 
     T, T2, Mt = forward(t), forward(t * t), forward(mask_t.astype(float))
@@ -542,7 +535,7 @@ def correlation_scores(patch: Array, picture: Array) -> Array:
         return np.where(enough, np.clip(above / np.sqrt(np.maximum(var_t * var_f, 1e-30)), -1, 1), -1.0)
 
 
-def find_patch(patch: Array, picture: Array, least: float = 0.7) -> FoundPatch | str:
+def find_patch(patch: Floats, picture: Floats, least: float = 0.7) -> FoundPatch | str:
     """Find a patch in a picture of the same scale and direction that is larger on all sides.
 
     The best whole cell by correlation, then least-squares matching.
@@ -590,7 +583,7 @@ def find_patch(patch: Array, picture: Array, least: float = 0.7) -> FoundPatch |
 
 
 def agree(
-    camera: CentralCamera, XYZ: Array, xy: Array, covariances: tuple[Array, Array], reach: float
+    camera: CentralCamera, XYZ: Floats, xy: Floats, covariances: tuple[Floats, Floats], reach: float
 ) -> AgreeingPoints:
     """Which points obey one small change of the camera's position and direction.
 
@@ -626,7 +619,7 @@ def agree(
     return AgreeingPoints(keep, residual, (float(middle[0]), float(middle[1])), factor)
 
 
-def _moved(camera: CentralCamera, XYZ: Array, delta: Array) -> tuple[Array, Array]:
+def _moved(camera: CentralCamera, XYZ: Floats, delta: Floats) -> tuple[Floats, Floats]:
     """Points as a camera sees them that is moved by delta[:3] and turned by delta[3:], and ∂(x, y)/∂delta (n, 2, 6)."""
     v = (XYZ - camera.center - delta[:3]) @ small_rotations(delta[3:])
     moved = camera.center + v
@@ -636,7 +629,7 @@ def _moved(camera: CentralCamera, XYZ: Array, delta: Array) -> tuple[Array, Arra
 
 
 def _factor(
-    camera: CentralCamera, XYZ: Array, residual: Array, covariances: tuple[Array, Array], keep: NDArray[np.bool_]
+    camera: CentralCamera, XYZ: Floats, residual: Floats, covariances: tuple[Floats, Floats], keep: Mask
 ) -> float:
     """Factor of the fits' standard deviations with which the residuals, as a whole, are as large as expected."""
     J = camera.derivatives(XYZ[keep])
@@ -678,7 +671,7 @@ class Photo:
 class OrthoPatch:
     """A patch of an orthophoto and its ground."""
 
-    values: NDArray[np.float64]
+    values: Floats
     """(m, m), rows from north to south; NaN: no value."""
     XYZ: tuple[float, float, float]
     """Its middle, on the plane through its ground, metres: what is matched is the patch as a whole."""
@@ -688,9 +681,7 @@ class OrthoPatch:
     """Root mean square of the ground's heights against the plane, metres."""
 
 
-def patch_on(
-    values: NDArray[np.float64], at: tuple[float, float], Z: NDArray[np.float64], side: float
-) -> OrthoPatch | None:
+def patch_on(values: Floats, at: tuple[float, float], Z: Floats, side: float) -> OrthoPatch | None:
     """A patch with the plane through its ground; None where its middle has no height."""
     radius = len(values) // 2
     if not np.isfinite(Z[radius, radius]):
@@ -707,7 +698,7 @@ def patch_on(
     return OrthoPatch(values, (at[0], at[1], level), (slope[0], slope[1]), float(np.sqrt(np.mean(off**2))))
 
 
-def ground_covariances(patches: Sequence[OrthoPatch], plane: float, height: float) -> NDArray[np.float64]:
+def ground_covariances(patches: Sequence[OrthoPatch], plane: float, height: float) -> Floats:
     """(n, 3, 3): an error of the place changes the height that is read there, by the slope of the ground.
 
     plane, height: standard deviations of X and Y in the orthophoto, and of the heights; metres.
@@ -744,11 +735,11 @@ class ImageControl:
     tried: int
     """Patches that it may show."""
     matched: int
-    points: NDArray[np.int64]
+    points: Ints
     """Numbers of the patches that agree."""
-    xy: NDArray[np.float64]
+    xy: Floats
     """Where they are, (n, 2), pixels."""
-    sigma: NDArray[np.float64]
+    sigma: Floats
     """(n, 2), pixels."""
     shift: tuple[float, float]
     """Median of measured minus computed position by the approximate orientation, pixels; NaN: too few points."""
@@ -761,7 +752,7 @@ class ImageControl:
 
 
 def control_of_image(
-    name: str, photo: Photo, patches: Sequence[OrthoPatch], covariances: NDArray[np.float64], settings: Settings
+    name: str, photo: Photo, patches: Sequence[OrthoPatch], covariances: Floats, settings: Settings
 ) -> ImageControl:
     """Find the patches in a photo and keep those that agree on a correction of its orientation.
 
@@ -819,7 +810,7 @@ def control_of_image(
     )
 
 
-def _find(photo: Photo, patch: OrthoPatch, settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]] | str:
+def _find(photo: Photo, patch: OrthoPatch, settings: Settings) -> tuple[Floats, Floats] | str:
     """Position in the photo and its covariance by the fit, or why there is none."""
     J = photo.camera.derivatives(np.array(patch.XYZ))
     gsd = float(1 / np.sqrt(abs(np.linalg.det(J[:, :2]))))
@@ -838,9 +829,7 @@ def _find(photo: Photo, patch: OrthoPatch, settings: Settings) -> tuple[NDArray[
     return _in_photo(photo, patch, found, half, settings)
 
 
-def _on_plane(
-    patch: OrthoPatch, col: NDArray[np.float64], row: NDArray[np.float64], side: float
-) -> NDArray[np.float64]:
+def _on_plane(patch: OrthoPatch, col: Floats, row: Floats, side: float) -> Floats:
     """Ground points of cells counted from the patch's middle."""
     east, north = np.asarray(col) * side, -np.asarray(row) * side
     X, Y, level = patch.XYZ
@@ -848,11 +837,11 @@ def _on_plane(
     return np.stack([X + east, Y + north, Z], axis=-1)
 
 
-def _resampled(photo: Photo, at: NDArray[np.float64], factor: int) -> NDArray[np.float64] | None:
+def _resampled(photo: Photo, at: Floats, factor: int) -> Floats | None:
     """Grey values of the photo (means of factor × factor pixels) at image points; NaN outside."""
     small = (at + 0.5) / factor - 0.5
     size = np.array(photo.camera.size) // factor
-    known: NDArray[np.bool_] = np.asarray(np.isfinite(small).all(axis=-1), np.bool_)
+    known: Mask = np.asarray(np.isfinite(small).all(axis=-1), np.bool_)
     if not known.any():
         return None
     low = np.maximum(np.floor(small[known].min(axis=0)).astype(int) - 3, 0)
@@ -877,7 +866,7 @@ def _resampled(photo: Photo, at: NDArray[np.float64], factor: int) -> NDArray[np
 
 def _in_photo(
     photo: Photo, patch: OrthoPatch, found: FoundPatch, half: int, settings: Settings
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     col, row = (v - half for v in found.at)
     step = 0.5
     around = np.array([[0.0, 0.0], [step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])

@@ -14,8 +14,8 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Ints
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Lens
 from photoplan.cameras.observed import GroundPoints, ImagePoints
@@ -85,14 +85,14 @@ class StatedPoses:
     """Orientations as a file states them, the meaning of the numbers left open; or as matrices."""
 
     names: tuple[str, ...]
-    centers: NDArray[np.float64]
+    centers: Floats
     """Projection centres, shape (n, 3), metres."""
-    angles: NDArray[np.float64] | None = None
+    angles: Floats | None = None
     """Numbers called ω, φ, κ, shape (n, 3), in this order whatever the order of rotations."""
-    matrices: NDArray[np.float64] | None = None
+    matrices: Floats | None = None
     """Rotation matrices, shape (n, 3, 3), where the file states these; units and orders are then without meaning."""
 
-    def rotations(self, unit: str, order: str) -> NDArray[np.float64]:
+    def rotations(self, unit: str, order: str) -> Floats:
         """Matrices of the angles, shape (n, 3, 3)."""
         if self.matrices is not None:
             return self.matrices
@@ -105,13 +105,13 @@ class StatedPoses:
 class Sights:
     """Measured directions to known points."""
 
-    image: NDArray[np.int64]
+    image: Ints
     """Index of the image in the poses, shape (m,)."""
-    XYZ: NDArray[np.float64]
+    XYZ: Floats
     """Ground points, shape (m, 3), metres, in the system of the projection centres."""
-    tangents: NDArray[np.float64]
+    tangents: Floats
     """Ideal image coordinates divided by the camera constant, shape (m, 2), x right, y up, free of distortion."""
-    focal: NDArray[np.float64]
+    focal: Floats
     """Camera constant in pixels, shape (m,)."""
 
 
@@ -171,13 +171,13 @@ def fitting(results: Sequence[FittedReading]) -> tuple[FittedReading, ...]:
     return tuple(r for r in results if r.worse < CLEAR and r.median <= FACTOR * results[0].median + 1e-6)
 
 
-def _cost(off: NDArray[np.float64], best: NDArray[np.float64]) -> float:
+def _cost(off: Floats, best: Floats) -> float:
     """Mean of the squared distances, gross ones cut, in units of the best median."""
     unit = max(float(np.median(best)), 1e-9)
     return float(np.mean(np.minimum(off / unit, CUT) ** 2))
 
 
-def _worse(off: NDArray[np.float64], best: NDArray[np.float64], image: NDArray[np.int64]) -> float:
+def _worse(off: Floats, best: Floats, image: Ints) -> float:
     unit = max(float(np.median(best)), 1e-9)
     difference = np.minimum(off / unit, CUT) ** 2 - np.minimum(best / unit, CUT) ** 2
     count = np.bincount(image)
@@ -188,7 +188,7 @@ def _worse(off: NDArray[np.float64], best: NDArray[np.float64], image: NDArray[n
     return float(mean.mean()) / error if error > 1e-9 else 0.0
 
 
-def turn_matrix(camera_axes: str, turned: int) -> NDArray[np.float64]:
+def turn_matrix(camera_axes: str, turned: int) -> Floats:
     """Matrix (3, 3) that takes camera axes as a file means them to x right, y up, z towards the viewer."""
     c, s = {0: (1.0, 0.0), 90: (0.0, 1.0), 180: (-1.0, 0.0), 270: (0.0, -1.0)}[turned]
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -196,7 +196,7 @@ def turn_matrix(camera_axes: str, turned: int) -> NDArray[np.float64]:
     return turn @ flip
 
 
-def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Reading, NDArray[np.float64]]]:
+def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Reading, Floats]]:
     """Every reading with the components of the rays along the axes of the camera that the file means."""
     conventions = [("deg", "opk")] if poses.matrices is not None else list(product(ANGLE_UNITS, ROTATION_ORDERS))
     others = list(product(CAMERA_AXES, TURNS, (False, True)))
@@ -219,20 +219,18 @@ def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Reading, NDA
                 )
 
 
-def _components(poses: StatedPoses, sights: Sights, reading: Reading) -> NDArray[np.float64]:
+def _components(poses: StatedPoses, sights: Sights, reading: Reading) -> Floats:
     R = poses.rotations(reading.angle_unit, reading.rotation)
     return _along(R, poses.centers, sights, reading.direction, reading.swapped)
 
 
-def _along(
-    R: NDArray[np.float64], centers: NDArray[np.float64], sights: Sights, direction: str, swapped: bool
-) -> NDArray[np.float64]:
+def _along(R: Floats, centers: Floats, sights: Sights, direction: str, swapped: bool) -> Floats:
     d = sights.XYZ - (centers[:, [1, 0, 2]] if swapped else centers)[sights.image]
     paths = "mji,mj->mi" if direction == DIRECTIONS[0] else "mij,mj->mi"
     return np.asarray(np.einsum(paths, R[sights.image], d), np.float64)
 
 
-def _distances(q: NDArray[np.float64], sights: Sights, reading: Reading) -> NDArray[np.float64]:
+def _distances(q: Floats, sights: Sights, reading: Reading) -> Floats:
     """Distances of measured and predicted points (m,), pixels; infinite behind the camera."""
     p = q @ turn_matrix(reading.camera_axes, reading.turned).T
     depth = -p[:, 2]
@@ -320,9 +318,7 @@ class OtherReading:
             parts.append("X and Y of the projection centres look exchanged")
         return parts
 
-    def apply(
-        self, center: NDArray[np.float64], angles: NDArray[np.float64], order: str
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def apply(self, center: Floats, angles: Floats, order: str) -> tuple[Floats, Floats]:
         """Projection centre (3,) and R_ground_camera (3, 3) of declared numbers (radians) under this reading."""
         if self.unit is not None:
             angles = angles * (ANGLE_UNITS[self.declared] / ANGLE_UNITS[self.unit])
@@ -360,7 +356,7 @@ def readings(order: str, unit: str = "deg") -> list[OtherReading]:
     return one + two
 
 
-Heights = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Heights = Callable[[Floats], Floats]
 
 #: Images that are looked at under other readings.
 SAMPLE_PLAUSIBILITY = 12
@@ -383,13 +379,13 @@ class JudgedView:
     """Data of an image that the check requires."""
 
     name: str
-    center: NDArray[np.float64]
+    center: Floats
     """Projection centre (3,) in the terrain's CRS and height system."""
-    angles: NDArray[np.float64]
+    angles: Floats
     """Three angles (3,) in radians, in the sequence of `order`."""
     order: str
     """Rotation order that is declared."""
-    tangents: NDArray[np.float64]
+    tangents: Floats
     """Ideal directions (n, 2) of points spread over the image, x right, y up; the first is the image's middle."""
     pixel: float
     """Angle of a pixel in the middle, radians."""
@@ -399,7 +395,7 @@ class JudgedView:
     """True if the camera is stated to be scanned through the back of its film."""
 
     @property
-    def R_ground_camera(self) -> NDArray[np.float64]:
+    def R_ground_camera(self) -> Floats:
         """Rotation matrix as declared."""
         return rotation_from_angles(self.angles, self.order)
 
@@ -427,7 +423,7 @@ class ImagePlausibility:
     """True if the image shows the horizon, and its middle lies near or above it: much of it cannot show terrain."""
 
 
-def look(view: JudgedView, heights: Heights, objects: NDArray[np.float64] | None = None) -> ImagePlausibility:
+def look(view: JudgedView, heights: Heights, objects: Floats | None = None) -> ImagePlausibility:
     """Look at one image as its orientation is declared; `objects` (n, 3, 3) are triangles that it may show."""
     found = _look(view, view.center, view.R_ground_camera, heights)
     if found.level and found.on_terrain == 0 and objects is not None and _shows(view, objects):
@@ -435,7 +431,7 @@ def look(view: JudgedView, heights: Heights, objects: NDArray[np.float64] | None
     return found
 
 
-def _shows(view: JudgedView, triangles: NDArray[np.float64]) -> bool:
+def _shows(view: JudgedView, triangles: Floats) -> bool:
     """Return whether the ray of any of the view's points meets one of the triangles (n, 3, 3)."""
     a, b, c = np.moveaxis((triangles - view.center) @ view.R_ground_camera, 1, 0)
     # A ray lies inside the three planes through the camera and the sides of a triangle.
@@ -449,7 +445,7 @@ def _shows(view: JudgedView, triangles: NDArray[np.float64]) -> bool:
     return False
 
 
-def _look(view: JudgedView, center: NDArray[np.float64], R: NDArray[np.float64], heights: Heights) -> ImagePlausibility:
+def _look(view: JudgedView, center: Floats, R: Floats, heights: Heights) -> ImagePlausibility:
     axis = -R[:, 2]
     tilt = float(np.degrees(np.arccos(np.clip(-axis[2], -1, 1))))
     azimuth = float(np.degrees(np.arctan2(axis[0], axis[1])) % 360) if tilt > 1e-9 else 0.0
@@ -485,9 +481,7 @@ def _look(view: JudgedView, center: NDArray[np.float64], R: NDArray[np.float64],
     )
 
 
-def _footprint(
-    center: NDArray[np.float64], R: NDArray[np.float64], tangents: NDArray[np.float64], below: float, heights: Heights
-) -> NDArray[np.float64]:
+def _footprint(center: Floats, R: Floats, tangents: Floats, below: float, heights: Heights) -> Floats:
     """Terrain points (n, 3) that the tangents see, to some metres; NaN where they see none."""
     d = np.column_stack([tangents, -np.ones(len(tangents))]) @ R.T
     d[~(d[:, 2] < 0)] = np.nan
@@ -509,7 +503,7 @@ def _footprint(
     return points
 
 
-def _ground(heights: Heights, XY: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ground(heights: Heights, XY: Floats) -> Floats:
     """Heights at points that may lie far apart: asked for cell by cell, so that no large window is ever read."""
     out = np.full(len(XY), np.nan)
     cells, of = np.unique(np.floor(XY / CELL), axis=0, return_inverse=True)
@@ -519,7 +513,7 @@ def _ground(heights: Heights, XY: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def _level_near(center: NDArray[np.float64], d: NDArray[np.float64], heights: Heights) -> float:
+def _level_near(center: Floats, d: Floats, heights: Heights) -> float:
     """A terrain height under the rays, for a camera that does not stand over the terrain; NaN if there is none."""
     flat = d[np.isfinite(d[:, 2])]
     if not len(flat):
@@ -710,8 +704,6 @@ def _sentence(
     return f"{what}: {', '.join(told)}{where}"
 
 
-_Floats = NDArray[np.float64]
-
 #: Height below ground that no error of the ground explains, as part of the distance to it, and metres: a vault is seen
 #: from below, a landscape is not.
 _BELOW, _LEAST = 0.05, 30.0
@@ -731,10 +723,10 @@ FOOT = 0.3048
 class Evidence:
     """What is known of an orientation that was computed."""
 
-    center: _Floats
+    center: Floats
     """(3,), metres."""
-    R_ground_camera: _Floats
-    ground: _Floats
+    R_ground_camera: Floats
+    ground: Floats
     """Ground points that it was computed from, (n, 3)."""
     rejected: int
     """How many points were taken out."""

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.adjustment.least_squares import Equations, bisquare, by_differences, levenberg, spread
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.resection import bearings
-
-Array = NDArray[np.float64]
 
 #: Why a point has no coordinates, by its code in `Intersected.reason`.
 REASONS = ("", "fewer than two rays", "rays nearly parallel", "behind a camera", "rays do not meet")
@@ -28,13 +27,13 @@ _MANY = 12
 class MeasuredRays:
     """Measurements of points in oriented images."""
 
-    image: NDArray[np.int64]
+    image: Ints
     """Image of each ray, (m,), an index into the poses."""
-    point: NDArray[np.int64]
+    point: Ints
     """Point of each ray, (m,), from 0."""
-    tangents: Array
+    tangents: Floats
     """Ideal tangent coordinates (x, y) / c, (m, 2), x right, y up; NaN: the ray is not used."""
-    sigma: Array
+    sigma: Floats
     """Standard deviations of these, (m, 2)."""
 
     def __post_init__(self) -> None:
@@ -56,13 +55,13 @@ class MeasuredRays:
 class Intersected:
     """Result of `intersect`."""
 
-    XYZ: Array
+    XYZ: Floats
     """(n, 3), metres; NaN where a point is not determined."""
-    covariance: Array
+    covariance: Floats
     """(n, 3, 3), m², from the rays' stated standard deviations, poses taken as free of error; NaN as XYZ."""
-    rays: NDArray[np.int64]
+    rays: Ints
     """Rays that take part, (n,)."""
-    used: NDArray[np.bool_]
+    used: Mask
     """Which rays take part, (m,)."""
     reason: NDArray[np.int8]
     """Index into `REASONS`, (n,); 0: the point is determined."""
@@ -76,8 +75,8 @@ class Intersected:
 class _Cameras:
     """Poses as arrays, with coordinates about their middle."""
 
-    R: Array
-    centers: Array
+    R: Floats
+    centers: Floats
 
 
 def intersect(
@@ -163,9 +162,7 @@ def _cleaned(cameras: _Cameras, rays: MeasuredRays, n: int, critical: float, min
     return replace(found, used=used)
 
 
-def _leaving(
-    cameras: _Cameras, rays: MeasuredRays, worst: Array, critical: float, min_angle: float
-) -> NDArray[np.bool_]:
+def _leaving(cameras: _Cameras, rays: MeasuredRays, worst: Floats, critical: float, min_angle: float) -> Mask:
     """Which rays of points that do not fit have to leave: none or one of each point."""
     leaving = np.zeros(len(rays.point), bool)
     _, first, count = np.unique(rays.point, return_index=True, return_counts=True)
@@ -195,7 +192,7 @@ def _leaving(
     return leaving
 
 
-def _solved(cameras: _Cameras, rays: MeasuredRays, n: int, min_angle: float) -> tuple[Intersected, Array, Array]:
+def _solved(cameras: _Cameras, rays: MeasuredRays, n: int, min_angle: float) -> tuple[Intersected, Floats, Floats]:
     """Points (n,), largest normalised residual of each ray (m,) and of each point (n,)."""
     R, C = cameras.R[rays.image], cameras.centers[rays.image]
     at = rays.point
@@ -233,7 +230,7 @@ def _solved(cameras: _Cameras, rays: MeasuredRays, n: int, min_angle: float) -> 
     )
 
 
-def _nearest(R: Array, C: Array, rays: MeasuredRays, n: int, number: NDArray[np.int64]) -> tuple[Array, Array]:
+def _nearest(R: Floats, C: Floats, rays: MeasuredRays, n: int, number: Ints) -> tuple[Floats, Floats]:
     """Points nearest to all their rays (n, 3), and the smallest eigenvalue of the rays' spread (n,)."""
     d = np.einsum("mij,mj->mi", R, bearings(rays.tangents))
     across = np.eye(3) - d[:, :, None] * d[:, None, :]
@@ -244,7 +241,7 @@ def _nearest(R: Array, C: Array, rays: MeasuredRays, n: int, number: NDArray[np.
     return X, np.asarray(spread, float)
 
 
-def _residuals(R: Array, C: Array, rays: MeasuredRays, X: Array) -> tuple[Array, Array, Array]:
+def _residuals(R: Floats, C: Floats, rays: MeasuredRays, X: Floats) -> tuple[Floats, Floats, Floats]:
     """Computed minus measured tangents (m, 2) and derivatives (m, 2, 3) in units of σ, and depths (m,)."""
     p = np.einsum("mji,mj->mi", R, X[rays.point] - C)
     depth = -p[:, 2]
@@ -253,14 +250,14 @@ def _residuals(R: Array, C: Array, rays: MeasuredRays, X: Array) -> tuple[Array,
     return (t - rays.tangents) / rays.sigma, J / rays.sigma[:, :, None], depth
 
 
-def _sums(values: Array, at: NDArray[np.int64], n: int) -> Array:
+def _sums(values: Floats, at: Ints, n: int) -> Floats:
     """Sums (n, …) of values (m, …) by index."""
     flat = values.reshape(len(values), -1)
     columns = [np.asarray(np.bincount(at, flat[:, k], minlength=n), float) for k in range(flat.shape[1])]
     return np.stack(columns, axis=-1).reshape(n, *values.shape[1:])
 
 
-def _inverse_times(N: Array, rhs: Array) -> tuple[Array, Array]:
+def _inverse_times(N: Floats, rhs: Floats) -> tuple[Floats, Floats]:
     """N⁻¹ rhs (n, 3) and N⁻¹ (n, 3, 3) of symmetric matrices, by cofactors; NaN or infinite where singular."""
     a, b, c = N[:, 0], N[:, 1], N[:, 2]
     cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
@@ -324,7 +321,7 @@ class CheckAccuracy:
         return tuple(out)
 
 
-def check_accuracy(residuals: NDArray[np.float64], sigma: NDArray[np.float64]) -> CheckAccuracy:
+def check_accuracy(residuals: Floats, sigma: Floats) -> CheckAccuracy:
     """Accuracy at check points."""
     known = np.isfinite(residuals)
     plane = known[:, :2].all(axis=1)
@@ -351,11 +348,9 @@ def check_accuracy(residuals: NDArray[np.float64], sigma: NDArray[np.float64]) -
     )
 
 
-def _rms(values: NDArray[np.float64]) -> float:
+def _rms(values: Floats) -> float:
     return float(np.sqrt((values**2).mean())) if values.size else float("nan")
 
-
-_Floats = NDArray[np.float64]
 
 #: Unknowns: small turns about the camera's axes x (right), y (up) and z (backwards), radians, and the logarithm of a
 #: factor of the camera constant.
@@ -378,9 +373,9 @@ _RESTORED, _MOST_TAKEN = 6, 0.3
 class SkylineFit:
     """What the skyline says of a camera."""
 
-    step: _Floats
+    step: Floats
     """Change of the unknowns, by `UNKNOWNS`, (3,) or (4,)."""
-    covariance: _Floats
+    covariance: Floats
     """Of them; neighbouring columns resemble each other, which counts."""
     used: int
     """Columns whose weight is above zero."""
@@ -390,7 +385,7 @@ class SkylineFit:
     """Columns that say no more than one: 1 where neighbours err independently."""
 
 
-def fit_skyline(pixels: Callable[[_Floats], _Floats], distance: _Floats, edge: _Floats, unknowns: int) -> SkylineFit:
+def fit_skyline(pixels: Callable[[Floats], Floats], distance: Floats, edge: Floats, unknowns: int) -> SkylineFit:
     """Robust least squares of distances between a skyline and an edge, measured across the skyline.
 
     Neighbouring columns of terrain and photograph err together: the covariance has the autocorrelation of the
@@ -404,14 +399,14 @@ def fit_skyline(pixels: Callable[[_Floats], _Floats], distance: _Floats, edge: _
             f"{len(where)} columns show skyline and edge; {10 * unknowns} are needed for {unknowns} angles"
         )
 
-    def rows(step: _Floats) -> _Floats:
+    def rows(step: Floats) -> Floats:
         xy = pixels(step)
         order = np.argsort(xy[:, 0], kind="stable")
         return np.asarray(np.interp(where, xy[order, 0], xy[order, 1]))
 
     across = 1.0 / np.hypot(1.0, np.gradient(rows(start), where))
 
-    def distances(step: _Floats) -> _Floats:
+    def distances(step: Floats) -> Floats:
         return np.asarray((rows(step) - edge[where]) * across)
 
     first = pixels(start)[:, 0]
@@ -432,7 +427,7 @@ def fit_skyline(pixels: Callable[[_Floats], _Floats], distance: _Floats, edge: _
     )
 
 
-def _columns(xy: _Floats, edge: _Floats) -> NDArray[np.int64]:
+def _columns(xy: Floats, edge: Floats) -> Ints:
     """Columns with an edge between points of the skyline that are neighbours."""
     x = np.sort(xy[np.isfinite(xy[:, 0]), 0])
     at = np.flatnonzero(np.isfinite(edge))
@@ -442,7 +437,7 @@ def _columns(xy: _Floats, edge: _Floats) -> NDArray[np.int64]:
     return np.asarray(at[x[right] - x[right - 1] <= _GAP])
 
 
-def _sizes(v: _Floats, nearness: _Floats) -> _Floats:
+def _sizes(v: Floats, nearness: Floats) -> Floats:
     """Sizes of errors up to a factor: of the edge, the same everywhere, and of heights, larger where they are near.
 
     The mixture that makes the residuals most likely (with Laplace's density, which gross errors hardly move).
@@ -457,14 +452,14 @@ def _sizes(v: _Floats, nearness: _Floats) -> _Floats:
     return best[1]
 
 
-def _round(distances: Callable[[_Floats], _Floats], start: _Floats, root: _Floats) -> Equations[_Floats]:
-    def equations(step: _Floats) -> tuple[_Floats, _Floats]:
+def _round(distances: Callable[[Floats], Floats], start: Floats, root: Floats) -> Equations[Floats]:
+    def equations(step: Floats) -> tuple[Floats, Floats]:
         return by_differences(distances, step, _STEP) * root[:, None], distances(step) * root
 
     return levenberg(start, equations, lambda state, step: state + step)
 
 
-def _covariance(A: _Floats, v: _Floats, weight: _Floats, where: NDArray[np.int64]) -> tuple[_Floats, float]:
+def _covariance(A: Floats, v: Floats, weight: Floats, where: Ints) -> tuple[Floats, float]:
     """Covariance (u, u) with the autocorrelation of the residuals, and its length in columns."""
     span = int(where[-1] - where[0]) + 1
     B, e, w = np.zeros((span, A.shape[1])), np.zeros(span), np.zeros(span)
@@ -495,7 +490,7 @@ def _covariance(A: _Floats, v: _Floats, weight: _Floats, where: NDArray[np.int64
     return np.asarray(out * (weight.sum() / max(float(slope.sum()), 0.3 * float(weight.sum()))) ** 2), correlated
 
 
-def _restored(square: _Floats, unknowns: int, count: float) -> tuple[_Floats, float]:
+def _restored(square: Floats, unknowns: int, count: float) -> tuple[Floats, float]:
     """Autocovariances of errors, as far as positive, and the columns that err together, from those of residuals.
 
     A fit takes out of them what unknowns can follow, which is slow: as much in each lag as unknowns times columns that
@@ -511,7 +506,7 @@ def _restored(square: _Floats, unknowns: int, count: float) -> tuple[_Floats, fl
     return errors[: max(stop, 1)], correlated
 
 
-def _refuse_undetermined(covariance: _Floats) -> None:
+def _refuse_undetermined(covariance: Floats) -> None:
     sigma = np.sqrt(np.diag(covariance))
     weak = [name for name, value in zip(UNKNOWNS, sigma) if not value <= _UNDETERMINED]
     if weak:

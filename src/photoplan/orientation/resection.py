@@ -8,10 +8,11 @@ from itertools import combinations, islice, product
 from math import comb
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from photoplan.adjustment.least_squares import levenberg, spread
 from photoplan.adjustment.statistics import reach_t
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.cameras.base import Camera, project
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
@@ -20,8 +21,6 @@ from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.pose import UNKNOWNS, Pose, skew, small_rotations
 from photoplan.orientation.bundle.equations import by_coefficient
 from photoplan.orientation.bundle.model import PARAMETERS, CameraState
-
-Array = NDArray[np.float64]
 
 #: Parameters of the camera that can be unknowns.
 FREE = PARAMETERS
@@ -32,13 +31,13 @@ class MeasuredPoints:
     """Points of one image with their ground coordinates."""
 
     names: tuple[str, ...]
-    xy: Array
+    xy: Floats
     """Measured column and row, (n, 2), pixels."""
-    sigma: Array
+    sigma: Floats
     """Their standard deviations, (n, 2), pixels."""
-    XYZ: Array
+    XYZ: Floats
     """Ground coordinates, (n, 3), metres."""
-    covariance: Array
+    covariance: Floats
     """Of those, (n, 3, 3), m²; zero: free of error."""
 
     def __post_init__(self) -> None:
@@ -84,18 +83,18 @@ class Resected:
     interior: Interior
     """As given, or with the parameters that were free."""
     lens: Lens
-    covariance: Array
+    covariance: Floats
     """(6 + k, 6 + k): projection centre in metres, small rotations about the camera's x, y, z axes in radians
     (R ← R · exp[δ]×), then the free parameters in the unit of the image plane."""
     free: tuple[str, ...]
-    residuals: Array
+    residuals: Floats
     """Computed minus measured position of every point, (n, 2), pixels (column, row); of rejected points too."""
-    redundancies: Array
+    redundancies: Floats
     """Redundancy numbers of the measurements, (n, 2); NaN for rejected points."""
-    normalised: Array
+    normalised: Floats
     """Residuals divided by their standard deviations (those before the adjustment, without sigma0), (n, 2); NaN where
     no other point controls the measurement."""
-    rejected: NDArray[np.bool_]
+    rejected: Mask
     """Points taken out as gross errors, (n,)."""
     sigma0: float
     """Standard deviation of unit weight; 1 without redundancy."""
@@ -134,7 +133,7 @@ class ResectionUnknowns:
 
     where: str
     """Begin of messages: "image 'a': its 5 control points"."""
-    units: Array
+    units: Floats
     """Natural size of each unknown, (u,)."""
     free: tuple[str, ...]
     """Names of those after the pose."""
@@ -142,7 +141,7 @@ class ResectionUnknowns:
     """Standard deviation of a measurement, pixels."""
 
 
-def refuse_undetermined(A: Array, sigma0: float, unknowns: ResectionUnknowns) -> Array:
+def refuse_undetermined(A: Floats, sigma0: float, unknowns: ResectionUnknowns) -> Floats:
     """Inverse normal equations of whitened equations (m, u) in natural units."""
     s, Vt = np.linalg.svd(A, full_matrices=False)[1:]
     worst = Vt[-1]
@@ -151,7 +150,7 @@ def refuse_undetermined(A: Array, sigma0: float, unknowns: ResectionUnknowns) ->
     raise GeometryError(f"{unknowns.where} do not determine {_spelled(worst, float(s[-1]), unknowns)}")
 
 
-def _spelled(direction: Array, singular: float, unknowns: ResectionUnknowns) -> str:
+def _spelled(direction: Floats, singular: float, unknowns: ResectionUnknowns) -> str:
     """A combination of unknowns that leaves the image as it is, in numbers."""
     share = np.abs(direction)
     parts = [int(k) for k in np.argsort(-share) if share[k] > 0.1 * share.max()]
@@ -182,14 +181,14 @@ _POLISH = 3
 _TURNS = (0.0, 0.7, 1.9)
 
 
-def bearings(tangents: ArrayLike) -> Array:
+def bearings(tangents: ArrayLike) -> Floats:
     """Unit directions in camera axes, shape (..., 3), of tangent coordinates (..., 2), x right, y up."""
     t = np.asarray(tangents, float)
     d = np.concatenate([t, np.full((*t.shape[:-1], 1), -1.0)], axis=-1)
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def three_point_poses(tangents: ArrayLike, XYZ: ArrayLike) -> tuple[Array, Array]:
+def three_point_poses(tangents: ArrayLike, XYZ: ArrayLike) -> tuple[Floats, Floats]:
     """All poses from which three points are seen as they are.
 
     The three law-of-cosines equations for the distances (Grunert 1841) are two conics in the ratios of the distances.
@@ -212,7 +211,7 @@ def three_point_poses(tangents: ArrayLike, XYZ: ArrayLike) -> tuple[Array, Array
     return R, center
 
 
-def _triad(points: Array) -> Array:
+def _triad(points: Floats) -> Floats:
     """Orthonormal axes (…, 3, 3), as columns, that three points (…, 3, 3) span; NaN for points on a line."""
     a, b = points[..., 1, :] - points[..., 0, :], points[..., 2, :] - points[..., 0, :]
     normal = np.cross(a, b)
@@ -223,7 +222,7 @@ def _triad(points: Array) -> Array:
     return np.stack([first, np.cross(third, first), third], axis=-1)
 
 
-def _distances(j: Array, X: Array) -> Array:
+def _distances(j: Floats, X: Floats) -> Floats:
     """Distances to the three points, (n, 4, 3); NaN where there is no solution."""
     pairs = ((0, 1), (0, 2), (1, 2))
     cos = np.stack([(j[:, a] * j[:, b]).sum(-1) for a, b in pairs], axis=-1)
@@ -248,7 +247,7 @@ def _distances(j: Array, X: Array) -> Array:
     return np.where(good[..., None], distances, np.nan) * unit[..., None]
 
 
-def _degenerate(D1: Array, D2: Array) -> tuple[Array, Array]:
+def _degenerate(D1: Floats, D2: Floats) -> tuple[Floats, Floats]:
     """Pairs of lines of the pencil as two vectors each (n, 2, 3), and a conic (n, 3, 3) that is not degenerate."""
     D1 = D1 / np.linalg.norm(D1, axis=(1, 2), keepdims=True)
     D2 = D2 / np.linalg.norm(D2, axis=(1, 2), keepdims=True)
@@ -287,17 +286,17 @@ def _degenerate(D1: Array, D2: Array) -> tuple[Array, Array]:
     return lines, other / np.linalg.norm(other, axis=(1, 2), keepdims=True)
 
 
-def _adjugate(A: Array) -> Array:
+def _adjugate(A: Floats) -> Floats:
     """adj(A) of matrices (n, 3, 3): A adj(A) = det(A) I."""
     a, b, c = A[:, 0], A[:, 1], A[:, 2]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
 
 
-def _trace(A: Array) -> Array:
+def _trace(A: Floats) -> Floats:
     return np.asarray(np.trace(A, axis1=1, axis2=2), float)
 
 
-def _meet(lines: Array, conic: Array) -> Array:
+def _meet(lines: Floats, conic: Floats) -> Floats:
     """Points (n, 4, 3), up to their length, in which two lines (n, 2, 3) meet a conic (n, 3, 3); NaN if they do not."""
     axis = np.eye(3)[np.abs(np.where(np.isfinite(lines), lines, 0.0)).argmin(axis=-1)]
     p = np.cross(lines, axis)
@@ -317,7 +316,7 @@ def _meet(lines: Array, conic: Array) -> Array:
     return points / np.linalg.norm(points, axis=-1, keepdims=True)
 
 
-def _polished(distances: Array, cos: Array, square: Array) -> Array:
+def _polished(distances: Floats, cos: Floats, square: Floats) -> Floats:
     """Distances after Newton's method on the three law-of-cosines equations; NaN where it does not converge."""
     c12, c13, c23 = (cos[:, None, k] for k in range(3))
     s = distances
@@ -360,7 +359,7 @@ class DirectPose:
     """Result of `resect_direct`."""
 
     pose: Pose
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     """Points that agree with the pose, (n,)."""
     scale: float
     """Standard deviation of a tangent coordinate of these."""
@@ -415,7 +414,7 @@ def resect_direct(
     return _finished(pose, t, X, sigma, origin)
 
 
-def _refuse_line(X: Array) -> None:
+def _refuse_line(X: Floats) -> None:
     extent = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if extent[1] <= _COLLINEAR * extent[0]:
         raise GeometryError(
@@ -424,7 +423,7 @@ def _refuse_line(X: Array) -> None:
         )
 
 
-def _candidates(t: Array, X: Array, judges: NDArray[np.int64], sigma: float, seed: int) -> tuple[Array, Array]:
+def _candidates(t: Floats, X: Floats, judges: Ints, sigma: float, seed: int) -> tuple[Floats, Floats]:
     """Poses of triples, until enough of them have been tried."""
     Rs, Cs, tried, needed = [], [], 0, _TRIPLES
     for triples in _triples(len(t), seed):
@@ -444,7 +443,7 @@ def _candidates(t: Array, X: Array, judges: NDArray[np.int64], sigma: float, see
     return np.concatenate(Rs), np.concatenate(Cs)
 
 
-def _triples(n: int, seed: int) -> list[NDArray[np.int64]]:
+def _triples(n: int, seed: int) -> list[Ints]:
     """Batches of triples of point numbers."""
     if comb(n, 3) <= _TRIPLES:
         chosen = np.array(list(islice(combinations(range(n), 3), _TRIPLES)), np.int64)
@@ -457,20 +456,20 @@ def _triples(n: int, seed: int) -> list[NDArray[np.int64]]:
     return [chosen[k : k + _BATCH] for k in range(0, len(chosen), _BATCH)]
 
 
-def reprojected(R: Array, centers: Array, X: Array) -> Array:
+def reprojected(R: Floats, centers: Floats, X: Floats) -> Floats:
     """Tangent coordinates (k, n, 2) of points (n, 3) by poses (k, 3, 3), (k, 3); NaN behind the camera."""
     p = np.einsum("knj,kji->kni", X[None] - centers[:, None], R)
     with np.errstate(all="ignore"):
         return p[..., :2] / np.where(p[..., 2:] < 0, -p[..., 2:], np.nan)
 
 
-def _distances_direct(R: Array, centers: Array, t: Array, X: Array) -> Array:
+def _distances_direct(R: Floats, centers: Floats, t: Floats, X: Floats) -> Floats:
     """Distances (k, n) of reprojected from measured points; infinite behind the camera."""
     r = np.linalg.norm(reprojected(R, centers, X) - t, axis=-1)
     return np.where(np.isfinite(r), r, np.inf)
 
 
-def _median_scale(r: Array) -> float:
+def _median_scale(r: Floats) -> float:
     """Standard deviation of a coordinate by the best pose's median distance; a little more than half of the points."""
     n = r.shape[1]
     h = min(n, max(4, n // 2 + 1))
@@ -481,7 +480,9 @@ def _median_scale(r: Array) -> float:
     return least / float(np.sqrt(-2.0 * np.log1p(-share))) if np.isfinite(least) else 0.0
 
 
-def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, near: Pose | None, sure: bool) -> Pose:
+def _best(
+    R: Floats, centers: Floats, points: tuple[Floats, Floats], scale: float, near: Pose | None, sure: bool
+) -> Pose:
     """The pose that fits best, of candidates in the order of their cost.
 
     Where the noise is known (`sure`) and the points are few, several poses may see all of them as they were measured:
@@ -530,7 +531,7 @@ def _apart(a: Pose, b: Pose, size: float) -> float:
     return float(np.linalg.norm(a.center - b.center) / size + turn)
 
 
-def _finished(pose: Pose, t: Array, X: Array, sigma: float, origin: Array) -> DirectPose:
+def _finished(pose: Pose, t: Floats, X: Floats, sigma: float, origin: Floats) -> DirectPose:
     """The pose by all points that agree with it, back in ground coordinates."""
     inside = np.zeros(len(t), bool)
     scale = sigma
@@ -545,7 +546,7 @@ def _finished(pose: Pose, t: Array, X: Array, sigma: float, origin: Array) -> Di
     return DirectPose(Pose(pose.center + origin, pose.R_ground_camera), inside, float(scale))
 
 
-def tangent_derivatives(pose: Pose, X: Array) -> tuple[Array, Array, Array, Array]:
+def tangent_derivatives(pose: Pose, X: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Tangent coordinates (n, 2), their derivatives (n, 2, 6) by the pose and (n, 2, 3) by the points, depth (n,).
 
     The pose changes by its centre and by small rotations about the camera's axes, R ← R · exp[δ]×.
@@ -562,18 +563,18 @@ def tangent_derivatives(pose: Pose, X: Array) -> tuple[Array, Array, Array, Arra
     return t, np.concatenate([-by_X, by_p @ skew(p)], axis=2), by_X, depth
 
 
-def polished_pose(pose: Pose, t: Array, X: Array, use: NDArray[np.bool_], iterations: int = 8) -> Pose:
+def polished_pose(pose: Pose, t: Floats, X: Floats, use: Mask, iterations: int = 8) -> Pose:
     """Least squares over some points, all of one weight; the pose itself where that gets worse."""
     t, X = t[use], X[use]
 
-    def equations(pose: Pose) -> tuple[Array, Array] | None:
+    def equations(pose: Pose) -> tuple[Floats, Floats] | None:
         computed, A, _, depth = tangent_derivatives(pose, X)
         return (A.reshape(-1, 6), (computed - t).ravel()) if (depth > 0).all() else None
 
     return levenberg(pose, equations, moved, iterations).state if equations(pose) is not None else pose
 
 
-def moved(pose: Pose, step: Array) -> Pose:
+def moved(pose: Pose, step: Floats) -> Pose:
     """Pose after a step (6,): centre, then small rotations about the camera's axes."""
     return Pose(pose.center + step[:3], pose.R_ground_camera @ small_rotations(step[3:6]))
 
@@ -585,7 +586,7 @@ _ITERATIONS = 60
 _UNCONTROLLED = 1e-6
 
 
-def tangents_of(interior: Interior, lens: Lens, xy: Array) -> Array:
+def tangents_of(interior: Interior, lens: Lens, xy: Floats) -> Floats:
     """Ideal tangent coordinates (n, 2) of measured positions in pixels; NaN where the lens has no solution."""
     return field_limited(lens, interior).undistort(interior.tangent_to_pixel.inverse(xy))
 
@@ -614,15 +615,15 @@ class _State:
 class _Equations:
     """Whitened observation equations at a state: v = A·step + misclosure."""
 
-    A: Array
+    A: Floats
     """(n, 2, u)."""
-    v: Array
+    v: Floats
     """Whitened residuals (n, 2)."""
-    root: Array
+    root: Floats
     """Cholesky factors of the covariances of the measurements, control included, (n, 2, 2)."""
-    residuals: Array
+    residuals: Floats
     """In pixels, (n, 2)."""
-    units: Array
+    units: Floats
     """Natural size of each unknown, (u,): distance, radian, camera constant."""
     sound: bool = field(default=True)
     """Whether all points lie in front of the camera."""
@@ -682,7 +683,7 @@ def resect(
     return _cleaned(task, state, inliers)
 
 
-def _start(task: _Task, interior: Interior, near: Pose | None) -> tuple[_State, NDArray[np.bool_]]:
+def _start(task: _Task, interior: Interior, near: Pose | None) -> tuple[_State, Mask]:
     """State and inliers of the direct solution."""
     if task.settings.camera_constant_known:
         found = _direct(task, interior, near)
@@ -730,7 +731,7 @@ def _pixels_per_unit(interior: Interior) -> float:
     return float(np.sqrt(abs(np.linalg.det(J))))
 
 
-def _pixels(task: _Task, state: _State) -> Array:
+def _pixels(task: _Task, state: _State) -> Floats:
     """Residuals without covariances: computed minus measured, (n, 2)."""
     frame = oriented_camera(state.interior, state.lens, state.pose)
     camera = frame if task.camera_of is None else task.camera_of(state.interior, state.lens, state.pose)
@@ -777,10 +778,10 @@ def _equations(task: _Task, state: _State) -> _Equations:
     )
 
 
-def _adjusted(task: _Task, state: _State, use: NDArray[np.bool_]) -> tuple[_State, _Equations]:
+def _adjusted(task: _Task, state: _State, use: Mask) -> tuple[_State, _Equations]:
     """Least squares over the points `use`."""
 
-    def equations(state: _State) -> tuple[Array, Array]:
+    def equations(state: _State) -> tuple[Floats, Floats]:
         found = _equations(task, state)
         return found.A[use].reshape(-1, found.A.shape[2]), found.v[use].ravel()
 
@@ -788,7 +789,7 @@ def _adjusted(task: _Task, state: _State, use: NDArray[np.bool_]) -> tuple[_Stat
     return state, _equations(task, state)
 
 
-def _stepped(task: _Task, state: _State, step: Array) -> _State | None:
+def _stepped(task: _Task, state: _State, step: Floats) -> _State | None:
     """The state after a step; None if it makes no camera."""
     interior, lens = state.interior, state.lens
     if task.settings.free:
@@ -808,7 +809,7 @@ def _camera_state(task: _Task, state: _State) -> CameraState:
     return CameraState(interior.c, *interior.principal_point, state.lens, task.settings.free)
 
 
-def _cleaned(task: _Task, state: _State, use: NDArray[np.bool_]) -> Resected:
+def _cleaned(task: _Task, state: _State, use: Mask) -> Resected:
     """Adjustment with data snooping: points leave one by one, and come back when they fit."""
     u = 6 + len(task.settings.free)
     seen: set[bytes] = set()
@@ -833,7 +834,7 @@ def _cleaned(task: _Task, state: _State, use: NDArray[np.bool_]) -> Resected:
     return _result(task, state, equations, use, tests)
 
 
-def _why_not(task: _Task, state: _State, use: NDArray[np.bool_]) -> str:
+def _why_not(task: _Task, state: _State, use: Mask) -> str:
     """Why an adjustment ended with points that have no image."""
     lost = use & ~np.isfinite(_pixels(task, state)).all(axis=1)
     central = project(oriented_camera(state.interior, task.lens, state.pose), task.points.XYZ)
@@ -853,16 +854,16 @@ def _why_not(task: _Task, state: _State, use: NDArray[np.bool_]) -> str:
 class _Tests:
     """What residuals say about the observations."""
 
-    cofactor: Array
+    cofactor: Floats
     """Inverse normal equations (u, u)."""
-    normalised: Array
-    redundancies: Array
+    normalised: Floats
+    redundancies: Floats
     scale: float
     """Robust standard deviation of unit weight, at least 1."""
     sigma0: float
 
 
-def _tested(task: _Task, equations: _Equations, use: NDArray[np.bool_]) -> _Tests:
+def _tested(task: _Task, equations: _Equations, use: Mask) -> _Tests:
     """Normalised residuals of all points; those that are not used are compared with their prediction."""
     A = equations.A * equations.units
     u = A.shape[2]
@@ -897,7 +898,7 @@ def _unknowns(task: _Task, equations: _Equations) -> ResectionUnknowns:
     return ResectionUnknowns(where, equations.units, task.settings.free, float(np.median(task.points.sigma)))
 
 
-def _result(task: _Task, state: _State, equations: _Equations, use: NDArray[np.bool_], tests: _Tests) -> Resected:
+def _result(task: _Task, state: _State, equations: _Equations, use: Mask, tests: _Tests) -> Resected:
     redundancy = 2 * int(use.sum()) - len(equations.units)
     notes = []
     largest = np.nan_to_num(np.abs(tests.normalised[use]), nan=0.0).max(initial=0.0)

@@ -10,9 +10,10 @@ from math import comb
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from photoplan.adjustment.least_squares import huber, solve
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.cameras.fiducials import Affine2D, Bilinear2D
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedPositions
 from photoplan.errors import GeometryError
@@ -20,8 +21,6 @@ from photoplan.geometry.pose import Pose, small_rotations
 from photoplan.orientation.bundle.model import BlockCamera
 from photoplan.orientation.intersection import MeasuredRays, intersect
 from photoplan.orientation.resection import polished_pose, reprojected, resect_direct
-
-Array = NDArray[np.float64]
 
 _BATCH = 100
 _SAMPLES = 2000
@@ -48,9 +47,9 @@ class RelativeOrientation:
 
     pose: Pose
     """Projection centre (a unit vector) and rotation of the second image."""
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     """Points that agree, (n,)."""
-    points: Array
+    points: Floats
     """Model coordinates of these, (n, 3); NaN for the others."""
     angle: float
     """Median angle under which the two rays of a point meet, radians."""
@@ -95,7 +94,7 @@ def relate(first: ArrayLike, second: ArrayLike, sigma: float = 1e-4) -> Relative
     return _completed(pose, a, b, inliers, sigma)
 
 
-def _candidates(a: Array, b: Array, judges: NDArray[np.int64], limit: float, rng: np.random.Generator) -> Array:
+def _candidates(a: Floats, b: Floats, judges: Ints, limit: float, rng: np.random.Generator) -> Floats:
     """Essential matrices (k, 3, 3), the best first."""
     kept, costs, needed, tried = [], [], _SAMPLES, 0
     while tried < max(_BATCH, needed):
@@ -114,7 +113,7 @@ def _candidates(a: Array, b: Array, judges: NDArray[np.int64], limit: float, rng
     return np.concatenate(kept)[order[:_FINALISTS]]
 
 
-def _misses(E: Array, a: Array, b: Array) -> Array:
+def _misses(E: Floats, a: Floats, b: Floats) -> Floats:
     """Sampson's distances (k, n) of points from the epipolar lines of essential matrices (k, 3, 3)."""
     in_second = np.einsum("kij,nj->kni", E, a)
     in_first = np.einsum("kji,nj->kni", E, b)
@@ -122,7 +121,7 @@ def _misses(E: Array, a: Array, b: Array) -> Array:
     return np.abs((b * in_second).sum(-1)) / np.sqrt(square + 1e-300)
 
 
-def _poses(E: Array) -> list[Pose]:
+def _poses(E: Floats) -> list[Pose]:
     """The four poses of an essential matrix E = Rᵀ [base]×."""
     U, _, Vt = np.linalg.svd(E)
     U, Vt = U * np.sign(np.linalg.det(U)), Vt * np.sign(np.linalg.det(Vt))
@@ -130,12 +129,12 @@ def _poses(E: Array) -> list[Pose]:
     return [Pose(side * Vt[2], (U @ turn @ Vt).T) for turn in (W, W.T) for side in (1.0, -1.0)]
 
 
-def _essential(pose: Pose) -> Array:
+def _essential(pose: Pose) -> Floats:
     x, y, z = pose.center
     return np.asarray(pose.R_ground_camera.T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), float)
 
 
-def _in_front(pose: Pose, a: Array, b: Array) -> NDArray[np.bool_]:
+def _in_front(pose: Pose, a: Floats, b: Floats) -> Mask:
     """Whether the rays of points (n, 3) approach each other in front of both images."""
     other = b @ pose.R_ground_camera.T
     aa, bb, ab = (a * a).sum(1), (other * other).sum(1), (a * other).sum(1)
@@ -144,10 +143,10 @@ def _in_front(pose: Pose, a: Array, b: Array) -> NDArray[np.bool_]:
     return np.asarray(((bb * at - ab * bt) * np.sign(det) > 0) & ((ab * at - aa * bt) * np.sign(det) > 0))
 
 
-def _finalist(candidates: Array, a: Array, b: Array, limit: float) -> Pose:
+def _finalist(candidates: Floats, a: Floats, b: Floats, limit: float) -> Pose:
     """The pose with the least cost where points behind an image count as wrong; of equal ones the least tilted."""
 
-    def cost(pose: Pose) -> tuple[float, NDArray[np.bool_]]:
+    def cost(pose: Pose) -> tuple[float, Mask]:
         front = _in_front(pose, a, b)
         r = _misses(_essential(pose)[None], a, b)[0]
         return float(np.where(front, np.minimum((r / limit) ** 2, 1.0), 1.0).sum()), front & (r < limit)
@@ -163,16 +162,16 @@ def _finalist(candidates: Array, a: Array, b: Array, limit: float) -> Pose:
     return min((item for item in judged if item[0] <= 1.02 * least + 0.5), key=lambda item: item[1])[2]
 
 
-def _refined(pose: Pose, a: Array, b: Array, limit: float) -> Pose:
+def _refined(pose: Pose, a: Floats, b: Floats, limit: float) -> Pose:
     """Least squares of the distances from epipolar lines, the base of length one: five unknowns."""
 
-    def signed(p: Pose) -> Array:
+    def signed(p: Pose) -> Floats:
         E = _essential(p)
         in_second, in_first = a @ E.T, b @ E
         square = (in_second[:, :2] ** 2).sum(1) + (in_first[:, :2] ** 2).sum(1)
         return np.asarray((b * in_second).sum(1) / np.sqrt(square), float)
 
-    def stepped(p: Pose, step: Array) -> Pose:
+    def stepped(p: Pose, step: Floats) -> Pose:
         side = np.linalg.svd(p.center[None])[2][1:]
         base = p.center + step[:2] @ side
         turn = small_rotations(step[2:])
@@ -195,7 +194,7 @@ def _refined(pose: Pose, a: Array, b: Array, limit: float) -> Pose:
     return pose
 
 
-def _completed(pose: Pose, a: Array, b: Array, inliers: NDArray[np.bool_], sigma: float) -> RelativeOrientation:
+def _completed(pose: Pose, a: Floats, b: Floats, inliers: Mask, sigma: float) -> RelativeOrientation:
     """Result with the points of the model."""
     n = len(a)
     rays = MeasuredRays(
@@ -218,7 +217,7 @@ def _completed(pose: Pose, a: Array, b: Array, inliers: NDArray[np.bool_], sigma
     return RelativeOrientation(pose=pose, inliers=inliers, points=XYZ, angle=angle, rms=float(np.sqrt((r * r).mean())))
 
 
-def five_point_essentials(first: ArrayLike, second: ArrayLike) -> Array:
+def five_point_essentials(first: ArrayLike, second: ArrayLike) -> Floats:
     """Essential matrices E with dᵀ₂ E d₁ = 0 for five pairs of directions.
 
     E lies in the four-dimensional null space of the five linear equations; det E = 0 and 2 E Eᵀ E − tr(E Eᵀ) E = 0 are
@@ -254,7 +253,7 @@ def five_point_essentials(first: ArrayLike, second: ArrayLike) -> Array:
         return np.asarray(found / np.linalg.norm(found, axis=(2, 3), keepdims=True), float)
 
 
-def _constraints(E: Array) -> Array:
+def _constraints(E: Floats) -> Floats:
     """Coefficients (n, 10, 20) of the ten cubic equations, of entries (n, 3, 3, 4)."""
     square = _sum([_product(E[:, :, None, k], E[:, None, :, k], 1) for k in range(3)])
     trace = square[:, 0, 0] + square[:, 1, 1] + square[:, 2, 2]
@@ -269,11 +268,11 @@ def _constraints(E: Array) -> Array:
     return np.concatenate([first.reshape(len(E), 9, 20), determinant[:, None]], axis=1)
 
 
-def _sum(terms: list[Array]) -> Array:
+def _sum(terms: list[Floats]) -> Floats:
     return np.asarray(np.sum(terms, axis=0), float)
 
 
-def _eliminated(equations: Array) -> Array:
+def _eliminated(equations: Floats) -> Floats:
     """Cubic monomials by the basis: rows of G in cubic + G · basis = 0, (n, 10, 10); NaN where that fails."""
     left, right = equations[:, :, :10], equations[:, :, 10:]
     sound = np.abs(np.linalg.det(left / np.abs(left).max(axis=(1, 2), keepdims=True))) > 1e-40
@@ -281,14 +280,14 @@ def _eliminated(equations: Array) -> Array:
     return np.where(sound[:, None, None], G, np.nan)
 
 
-def _product(a: Array, b: Array, degree: int) -> Array:
+def _product(a: Floats, b: Floats, degree: int) -> Floats:
     """Product of a polynomial of the given degree and a linear one, coefficients in the last axis."""
     table = _table(degree)
     return np.einsum("...i,...j,ijk->...k", a, b, table, optimize=True)
 
 
 @cache
-def _table(degree: int) -> Array:
+def _table(degree: int) -> Floats:
     left = _LINEAR if degree == 1 else _QUADRATIC
     out = _QUADRATIC if degree == 1 else _CUBIC + _BASIS
     table = np.zeros((len(left), 4, len(out)))
@@ -316,7 +315,7 @@ class StartModel:
     """Poses and points in one system; both are filled while the model grows."""
 
     poses: dict[int, Pose]
-    XYZ: Array
+    XYZ: Floats
     """(p, 3); NaN: not known."""
 
 
@@ -433,7 +432,7 @@ def _intersected(net: Net, model: StartModel, loose: float, fixed: bool) -> None
     model.XYZ[free] = found.XYZ[free]
 
 
-def _known(net: Net, model: StartModel, k: int) -> tuple[Array, Array, float]:
+def _known(net: Net, model: StartModel, k: int) -> tuple[Floats, Floats, float]:
     mine = net.of_image[k]
     mine = mine[np.isfinite(model.XYZ[net.point[mine], 0])]
     return net.tangents[mine], model.XYZ[net.point[mine]], float(np.median(net.sigma[mine]))
@@ -475,17 +474,17 @@ class Net:
     """Number of images."""
     points: tuple[str, ...]
     """Names of the points, (p,)."""
-    image: NDArray[np.int64]
+    image: Ints
     """(m,), an index into the images."""
-    point: NDArray[np.int64]
+    point: Ints
     """(m,), an index into `points`."""
-    tangents: Array
+    tangents: Floats
     """(m, 2)."""
-    sigma: Array
+    sigma: Floats
     """Standard deviation of a tangent coordinate, (m,)."""
-    control: Array
+    control: Floats
     """(p, 3); NaN where a point is no control point with three coordinates."""
-    of_image: tuple[NDArray[np.int64], ...]
+    of_image: tuple[Ints, ...]
     """Measurements of each image."""
 
 
@@ -543,10 +542,10 @@ class Similarity:
     """X' = scale · R X + shift."""
 
     scale: float
-    R: Array
-    shift: Array
+    R: Floats
+    shift: Floats
 
-    def __call__(self, XYZ: ArrayLike) -> Array:
+    def __call__(self, XYZ: ArrayLike) -> Floats:
         """Points (..., 3) in the target system."""
         return self.scale * (np.asarray(XYZ, float) @ self.R.T) + self.shift
 
@@ -585,7 +584,7 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
     return Similarity(scale, R, mb - scale * R @ ma)
 
 
-def robust_similarity(source: ArrayLike, target: ArrayLike, tolerance: float) -> tuple[Similarity, NDArray[np.bool_]]:
+def robust_similarity(source: ArrayLike, target: ArrayLike, tolerance: float) -> tuple[Similarity, Mask]:
     """Similarity that less than half of the points being wrong does not disturb, and the points that agree (n,).
 
     Three points each make a transformation; the one with the least median of distances decides which points agree.
@@ -737,7 +736,7 @@ def _placed(
     target = [block.XYZ[tied]]
     kind = f"{int(control.sum())} control points"
     # Observed positions take part where points alone are too few.
-    seen: list[tuple[Array, Array]] = []
+    seen: list[tuple[Floats, Floats]] = []
     if positions is not None:
         at = {name: k for k, name in enumerate(positions.images)}
         seen = [(p.center, positions.XYZ[at[images[k].name]]) for k, p in model.poses.items() if images[k].name in at]

@@ -12,10 +12,10 @@ import scipy  # loads its parts when they are used: a restored image needs none 
 from numpy.typing import NDArray
 
 from photoplan.adjustment.least_squares import Equations, Fit, levenberg, solve, spread
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.edges.find import EdgeRegion
 
-_Array = NDArray[np.float64]
 Term = tuple[int, int, float, float]
 """Powers i of u and j of v, and coefficients of the displacement along x and y."""
 
@@ -55,13 +55,13 @@ KINDS: dict[str, tuple[tuple[Term, ...], ...]] = {
 class Displacements:
     """Measured displacements of a band against the reference: one number along one direction each."""
 
-    place: _Array
+    place: Floats
     """Column and row in the reference band, shape (n, 2)."""
-    direction: _Array
+    direction: Floats
     """Unit vectors along which it was measured, shape (n, 2): both axes for a disc, the normal for an edge."""
-    value: _Array
+    value: Floats
     """Displacement along it, pixels: where the band is minus where the reference is, shape (n,)."""
-    sigma: _Array
+    sigma: Floats
     """Standard deviations, shape (n,)."""
     group: NDArray[np.int_]
     """Number of the disc or edge that each belongs to, shape (n,)."""
@@ -144,7 +144,7 @@ class ChromaticModel:
         """Unit of u and v, pixels."""
         return hypot(*self.size) / 2.0
 
-    def displacement(self, band: int, x: _Array, y: _Array) -> tuple[_Array, _Array]:
+    def displacement(self, band: int, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Return the place of a band against the reference at columns x and rows y (which broadcast): dx and dy,
         pixels."""
         mine = [each for each in self.bands if each.band == band]
@@ -211,11 +211,11 @@ def fit_band(band: int, size: tuple[int, int], measured: Displacements, kind: st
 @dataclass(frozen=True, eq=False)
 class _Solved:
     kind: str
-    unknowns: _Array
-    cofactors: _Array
-    residual: _Array
+    unknowns: Floats
+    cofactors: Floats
+    residual: Floats
     rms: float
-    errors: _Array
+    errors: Floats
     """Squared errors of prediction of each group that was left out, in units of its variance."""
     scale: float
     """Standard deviation of a displacement, root mean square, pixels."""
@@ -225,7 +225,7 @@ class _Solved:
         return self.scale * float(np.sqrt(self.errors.mean()))
 
 
-def _columns(kind: str, size: tuple[int, int], measured: Displacements) -> _Array:
+def _columns(kind: str, size: tuple[int, int], measured: Displacements) -> Floats:
     """Design matrix, shape (n, unknowns)."""
     half = hypot(*size) / 2.0
     u = (measured.place[:, 0] - (size[0] - 1) / 2.0) / half
@@ -237,7 +237,7 @@ def _columns(kind: str, size: tuple[int, int], measured: Displacements) -> _Arra
     return out
 
 
-def _solve(kind: str, size: tuple[int, int], measured: Displacements, kept: NDArray[np.bool_]) -> _Solved | None:
+def _solve(kind: str, size: tuple[int, int], measured: Displacements, kept: Mask) -> _Solved | None:
     """Weighted least squares of one kind; None: it is not determined, or leaves too little to test it by."""
     columns = _columns(kind, size, measured)
     matrix = columns / measured.sigma[:, None]
@@ -266,9 +266,7 @@ def _solve(kind: str, size: tuple[int, int], measured: Displacements, kept: NDAr
     )
 
 
-def _without_gross(
-    size: tuple[int, int], measured: Displacements, kind: str | None
-) -> tuple[NDArray[np.bool_], list[_Solved]]:
+def _without_gross(size: tuple[int, int], measured: Displacements, kind: str | None) -> tuple[Mask, list[_Solved]]:
     """Rows that are no gross errors against the best kind, and all kinds fitted to these."""
     kept = np.ones(measured.value.size, bool)
     for _ in range(5):
@@ -298,7 +296,7 @@ def _chosen(tried: list[_Solved]) -> str:
     return best.kind
 
 
-def _terms(kind: str, unknowns: _Array, cofactors: _Array) -> tuple[tuple[Term, ...], tuple[tuple[float, float], ...]]:
+def _terms(kind: str, unknowns: Floats, cofactors: Floats) -> tuple[tuple[Term, ...], tuple[tuple[float, float], ...]]:
     """A fitted kind as polynomials, with standard deviations of the coefficients."""
     value: dict[tuple[int, int], list[float]] = {}
     variance: dict[tuple[int, int], list[float]] = {}
@@ -382,7 +380,7 @@ def find_discs(
     return tuple(found)
 
 
-def _even(values: _Array, planes: NDArray[np.int_]) -> _Array:
+def _even(values: Floats, planes: NDArray[np.int_]) -> Floats:
     """An image to look for spots in: the planes of a mosaic brought to one level, gaps filled by their neighbours."""
     out = np.full(values.shape, np.nan)
     for plane in np.unique(planes[planes >= 0]):
@@ -399,7 +397,7 @@ def _even(values: _Array, planes: NDArray[np.int_]) -> _Array:
     return np.asarray(smooth / np.maximum(weight, 1e-9))
 
 
-def _spots(even: _Array) -> Iterator[tuple[float, float, float]]:
+def _spots(even: Floats) -> Iterator[tuple[float, float, float]]:
     """Centre and radius of round spots: connected parts beyond the middle between ground and disc."""
     low, high = np.percentile(even, [1, 99])
     # Discs cover less of the image than the ground.
@@ -428,7 +426,7 @@ def _spots(even: _Array) -> Iterator[tuple[float, float, float]]:
             yield x + box[1].start, y + box[0].start, radius
 
 
-def _blocks(picture: _Array, side: int) -> _Array:
+def _blocks(picture: Floats, side: int) -> Floats:
     """Level of the ground in blocks: what three quarters of the pixels stay below."""
     rows, columns = max(1, picture.shape[0] // side), max(1, picture.shape[1] // side)
     return np.array(
@@ -439,7 +437,7 @@ def _blocks(picture: _Array, side: int) -> _Array:
     )
 
 
-def _located(values: _Array, planes: NDArray[np.int_], start: tuple[float, float, float]) -> Disc | str:
+def _located(values: Floats, planes: NDArray[np.int_], start: tuple[float, float, float]) -> Disc | str:
     """The disc at a place, or why it is none."""
     x0, y0, radius = start
     reach = _REACH * radius + 2.0
@@ -467,7 +465,7 @@ class _DiscFit:
     Unknown: centre, size, two of the shape, blur, and per plane the grey of the ground with its slopes and the step.
     """
 
-    def __init__(self, x: _Array, y: _Array, grey: _Array, plane: NDArray[np.int_], planes: int) -> None:
+    def __init__(self, x: Floats, y: Floats, grey: Floats, plane: NDArray[np.int_], planes: int) -> None:
         self.x, self.y, self.grey, self.plane, self.planes = x, y, grey, plane, planes
         self.share = np.stack([plane == k for k in range(planes)], 1).astype(float)
 
@@ -479,7 +477,7 @@ class _DiscFit:
         )
         return self._disc(found, start)
 
-    def _cover(self, shape: _Array) -> _Array:
+    def _cover(self, shape: Floats) -> Floats:
         """Share of the disc in each pixel: the normal distribution of the distance from the ellipse."""
         u, v = self.x - shape[0], self.y - shape[1]
         radius, p, q = np.exp(shape[2]), shape[3], shape[4]
@@ -489,14 +487,14 @@ class _DiscFit:
         distance = (length - radius) * length / np.maximum(gradient, 1e-9)
         return np.asarray(scipy.special.ndtr(-distance / np.exp(shape[5])))
 
-    def _basis(self, cover: _Array) -> _Array:
+    def _basis(self, cover: Floats) -> Floats:
         """Columns of what enters linearly: ground, its slopes relative to it, and step, for every plane."""
         ground = self.share
         slopes = np.concatenate([ground * self.x[:, None], ground * self.y[:, None]], 1)
         # Light that falls unevenly is as uneven inside the disc; a share of a slope there is left to the noise.
         return np.concatenate([ground, slopes * (1.0 - cover)[:, None], ground * cover[:, None]], 1)
 
-    def _equations(self, shape: _Array) -> tuple[_Array, _Array]:
+    def _equations(self, shape: Floats) -> tuple[Floats, Floats]:
         """Derivatives by the shape and by the grey values that fit best to it, and residuals."""
         basis = self._basis(self._cover(shape))
         fit = solve(basis, self.grey)
@@ -507,7 +505,7 @@ class _DiscFit:
             columns.append((self._basis(self._cover(moved)) - basis) @ fit.unknowns / 1e-5)
         return np.column_stack([*columns, basis]), fit.residuals
 
-    def _disc(self, found: Equations[_Array], start: tuple[float, float, float]) -> Disc | str:
+    def _disc(self, found: Equations[Floats], start: tuple[float, float, float]) -> Disc | str:
         shape, noise = found.state, found.sigma0
         if found.redundancy < 10:
             return "too few pixels"
@@ -543,11 +541,11 @@ class _DiscFit:
         )
 
 
-def _whole(grey: _Array) -> bool:
+def _whole(grey: Floats) -> bool:
     return bool((grey == np.round(grey)).all())
 
 
-def _bounds(radius: float) -> tuple[_Array, _Array]:
+def _bounds(radius: float) -> tuple[Floats, Floats]:
     """Steps that one round may go at most."""
     most = np.array([0.3 * radius, 0.3 * radius, 0.2, 0.2, 0.2, 0.5])
     return -most, most
@@ -600,7 +598,7 @@ _FLOOR_DISPLACEMENTS = 0.005
 
 
 def edge_displacements(
-    reference: _Array, band: _Array, edges: Sequence[EdgeRegion], saturation: float = float("inf")
+    reference: Floats, band: Floats, edges: Sequence[EdgeRegion], saturation: float = float("inf")
 ) -> Displacements:
     """Displacements of a band along the normals of edges that were found in the reference.
 
@@ -641,24 +639,24 @@ def edge_displacements(
     )
 
 
-def _step(along: _Array, across: _Array, grey: _Array, slope: float | None) -> tuple[float, float, float] | None:
+def _step(along: Floats, across: Floats, grey: Floats, slope: float | None) -> tuple[float, float, float] | None:
     """Position of a blurred step across, its standard deviation, and the slope of its line; None: no clear step."""
     unknown = 3 if slope is None else 2
 
-    def shares(at: _Array) -> _Array:
+    def shares(at: Floats) -> Floats:
         return np.asarray(scipy.special.ndtr((across - at[0] - at[2] * along) / np.exp(at[1])))
 
-    def levels(at: _Array) -> Fit:
+    def levels(at: Floats) -> Fit:
         return solve(np.stack([np.ones(grey.size), shares(at)], 1), grey)
 
-    def equations(at: _Array) -> tuple[_Array, _Array]:
+    def equations(at: Floats) -> tuple[Floats, Floats]:
         """Derivatives of the grey values by position, blur, slope of the line and both levels, and residuals."""
         fit = levels(at)
         moved = [at + 1e-5 * np.eye(3)[k] for k in range(unknown)]
         columns = [fit.unknowns[1] * (shares(there) - fit.A[:, 1]) / 1e-5 for there in moved]
         return np.column_stack([*columns, fit.A]), fit.residuals
 
-    def moved(at: _Array, step: _Array) -> _Array | None:
+    def moved(at: Floats, step: Floats) -> Floats | None:
         trial = at + np.pad(np.clip(step[:unknown], -1.0, 1.0), (0, 3 - unknown))
         return trial if abs(trial[1]) <= 4.0 else None
 
@@ -689,7 +687,7 @@ _MARGIN = 6
 
 
 def patch_displacements(
-    reference: _Array, band: _Array, saturation: float = float("inf"), most: int = 400
+    reference: Floats, band: Floats, saturation: float = float("inf"), most: int = 400
 ) -> Displacements:
     """Displacements of a band in windows, by least squares matching with brightness and contrast as unknowns.
 
@@ -729,7 +727,7 @@ def patch_displacements(
     )
 
 
-def _matched(here: _Array, there: _Array) -> tuple[float, float, float, float] | None:
+def _matched(here: Floats, there: Floats) -> tuple[float, float, float, float] | None:
     """Displacement along x and y and their standard deviations; None: the windows do not match."""
     inner = (slice(_MARGIN, -_MARGIN), slice(_MARGIN, -_MARGIN))
     spline = scipy.ndimage.spline_filter(there, order=3)

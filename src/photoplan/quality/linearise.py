@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 
 #: Pixels that are looked at.
@@ -49,9 +50,9 @@ class Linearisation:
 
     kind: Literal["linear", "srgb", "table"] = "linear"
     """``linear``: they are already; ``srgb``: IEC 61966-2-1, of the full scale; ``table``: by a table."""
-    grey: NDArray[np.float64] | None = None
+    grey: Floats | None = None
     """Grey values of a table, increasing, shape (n,)."""
-    light: NDArray[np.float64] | None = None
+    light: Floats | None = None
     """Light of a table, strictly monotone, shape (n, bands): one column is for all bands."""
 
     def __post_init__(self) -> None:
@@ -70,7 +71,7 @@ class Linearisation:
         object.__setattr__(self, "light", light)
 
     @classmethod
-    def from_table(cls, rows: NDArray[np.float64] | list[list[float]]) -> Linearisation:
+    def from_table(cls, rows: Floats | list[list[float]]) -> Linearisation:
         """Linearisation of a table as its file holds it.
 
         Parameters
@@ -112,7 +113,7 @@ class Linearisation:
             return 1.0
         raise InputError(f"an image of type {kind} has no grey values; allowed are integers and floating point")
 
-    def to_linear(self, values: NDArray[np.generic], band: int = 1) -> NDArray[np.float64]:
+    def to_linear(self, values: NDArray[np.generic], band: int = 1) -> Floats:
         """Light of grey values, same shape, NaN stays; ``srgb`` gives light of 0 to full scale in 0 to full scale.
 
         Parameters
@@ -139,9 +140,7 @@ class Linearisation:
             )
         return np.interp(grey, table, light)
 
-    def to_values(
-        self, light: NDArray[np.float64], dtype: DTypeLike = np.float64, band: int = 1
-    ) -> NDArray[np.float64]:
+    def to_values(self, light: Floats, dtype: DTypeLike = np.float64, band: int = 1) -> Floats:
         """Grey values (not rounded, not clipped to the type) of light: the inverse of `to_linear` for that type.
 
         A table is not continued: light beyond its ends becomes its first or last grey value.
@@ -173,7 +172,7 @@ class Linearisation:
         assert self.grey is not None and self.light is not None
         return f"table of {self.grey.size} grey values, {self.light.shape[1]} column(s)"
 
-    def _column(self, band: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _column(self, band: int) -> tuple[Floats, Floats]:
         assert self.grey is not None and self.light is not None
         columns = self.light.shape[1]
         if columns > 1 and not 1 <= band <= columns:
@@ -181,9 +180,7 @@ class Linearisation:
         return self.grey, self.light[:, 0 if columns == 1 else band - 1]
 
 
-def _checked_table(
-    grey: NDArray[np.float64] | None, light: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _checked_table(grey: Floats | None, light: Floats | None) -> tuple[Floats, Floats]:
     if grey is None or light is None:
         raise InputError("a linearisation by a table needs grey values and their light")
     first, second = np.array(grey, np.float64), np.array(light, np.float64)
@@ -211,13 +208,13 @@ def _checked_table(
     return first, second
 
 
-def _srgb_to_light(value: NDArray[np.float64]) -> NDArray[np.float64]:
+def _srgb_to_light(value: Floats) -> Floats:
     """IEC 61966-2-1, eq. 5 and 6, of values 0 to 1; odd for negative ones, continued above 1."""
     amount = np.abs(value)
     return np.sign(value) * np.where(amount <= 0.04045, amount / 12.92, ((amount + 0.055) / 1.055) ** 2.4)
 
 
-def _light_to_srgb(light: NDArray[np.float64]) -> NDArray[np.float64]:
+def _light_to_srgb(light: Floats) -> Floats:
     """IEC 61966-2-1, eq. 9 and 10: the inverse; the border is the image of 0.04045 so that both are exact inverses."""
     amount = np.abs(light)
     low = amount <= 0.04045 / 12.92

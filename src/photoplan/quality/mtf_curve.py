@@ -10,19 +10,18 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 
-_Array = NDArray[np.float64]
 
-
-def disc_transfer(radius: float, f: _Array) -> _Array:
+def disc_transfer(radius: float, f: Floats) -> Floats:
     """Transfer function of an even disc: 2 J1(2π r f) / (2π r f)."""
     z = 2.0 * pi * radius * f
     small = z < 1e-6
     return np.where(small, 1.0, 2.0 * scipy.special.j1(z) / np.where(small, 1.0, z))
 
 
-def pupil_transfer(part: _Array) -> _Array:
+def pupil_transfer(part: Floats) -> Floats:
     """Transfer function of a circular pupil without aberrations, in incoherent light, at a part v of its limit.
 
     2/π (arccos v − v √(1 − v²)), the autocorrelation of a disc (Goodman, Introduction to Fourier Optics, chapter 6);
@@ -36,11 +35,11 @@ def pupil_transfer(part: _Array) -> _Array:
 class MtfCurve:
     """Modulation against spatial frequency."""
 
-    frequency: NDArray[np.float64]
+    frequency: Floats
     """Cycles per pixel, increasing from 0, shape (n,)."""
-    modulation: NDArray[np.float64]
+    modulation: Floats
     """Modulation transfer, 1 at frequency 0, shape (n,)."""
-    sigma: NDArray[np.float64] | None = None
+    sigma: Floats | None = None
     """Standard deviations of the modulation, shape (n,); None if unknown."""
 
     def __post_init__(self) -> None:
@@ -107,9 +106,9 @@ class SpreadFunction:
     The image is the object convolved with it (Kölbl 2006, eq. 1 and 2); Kölbl's Z, A, B are the values at 0, 1, 2.
     """
 
-    values: NDArray[np.float64]
+    values: Floats
     """Shares from -half to +half pixels, an odd number of values, sum 1."""
-    sigma: NDArray[np.float64] | None = None
+    sigma: Floats | None = None
     """Their standard deviations; None if unknown."""
 
     def __post_init__(self) -> None:
@@ -128,7 +127,7 @@ class SpreadFunction:
         object.__setattr__(self, "values", values)
 
     @classmethod
-    def normalised(cls, values: NDArray[np.float64] | list[float]) -> SpreadFunction:
+    def normalised(cls, values: Floats | list[float]) -> SpreadFunction:
         """Spread function of values that are divided by their sum."""
         numbers = np.array(values, np.float64)
         total = float(numbers.sum())
@@ -137,7 +136,7 @@ class SpreadFunction:
         return cls(numbers / total)
 
     @classmethod
-    def symmetric(cls, half: NDArray[np.float64] | list[float]) -> SpreadFunction:
+    def symmetric(cls, half: Floats | list[float]) -> SpreadFunction:
         """Spread function from its centre Z and the values A, B, … on one side; divided by their sum."""
         side = np.asarray(half, np.float64)
         return cls.normalised(np.concatenate([side[:0:-1], side]))
@@ -152,12 +151,12 @@ class SpreadFunction:
         """Half the sum of the differences between both sides: 0 if symmetric."""
         return float(np.abs(self.values - self.values[::-1]).sum() / 4.0)
 
-    def side(self) -> NDArray[np.float64]:
+    def side(self) -> Floats:
         """Centre Z and the means of both sides A, B, …, shape (half + 1,)."""
         both = (self.values + self.values[::-1]) / 2.0
         return both[self.half :]
 
-    def transfer(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def transfer(self, frequency: Floats) -> NDArray[np.complex128]:
         """Optical transfer function at frequencies in cycles per pixel, same shape, 1 at 0."""
         offsets = np.arange(-self.half, self.half + 1)
         return np.exp(-2j * pi * np.multiply.outer(np.asarray(frequency, float), offsets)) @ self.values
@@ -170,7 +169,7 @@ class SpreadFunction:
         return GAUSSIAN_WIDTH * sqrt(variance) if variance >= 0.0 else float("nan")
 
 
-def gaussian_modulation(fwhm: float, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+def gaussian_modulation(fwhm: float, frequency: Floats) -> Floats:
     """Modulation of a Gaussian spread function of a full width at half maximum in pixels, at cycles per pixel."""
     sigma = fwhm / GAUSSIAN_WIDTH
     return np.asarray(np.exp(-2.0 * (pi * sigma * np.asarray(frequency, float)) ** 2))
@@ -185,7 +184,7 @@ _LEAST = 3
 _ROUNDS = 30
 
 
-def detail_energies(grey: NDArray[np.float64]) -> NDArray[np.float64]:
+def detail_energies(grey: Floats) -> Floats:
     """Mean squares of fine and of coarser detail in blocks of a patch, shape (2, rows, cols)."""
     once = _smooth(grey)
     twice = _smooth(once)
@@ -195,14 +194,14 @@ def detail_energies(grey: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(parts.reshape(2, rows, BLOCK, cols, BLOCK).mean(axis=(2, 4)))
 
 
-def _smooth(grey: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smooth(grey: Floats) -> Floats:
     """Binomial means of five pixels along both axes; two pixels less on every side."""
     for _ in range(2):
         grey = (grey[:-4] + grey[4:] + 4 * (grey[1:-3] + grey[3:-1]) + 6 * grey[2:-2]).T / 16
     return grey
 
 
-def detail_quotients(energies: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def detail_quotients(energies: Sequence[Floats]) -> Floats:
     """Logarithms (n,), base 2, of the quotients of amplitudes of fine and coarser detail in patches of one image.
 
     Energies are those of `detail_energies`; NaN where a patch shows no more than noise.
@@ -215,7 +214,7 @@ def detail_quotients(energies: Sequence[NDArray[np.float64]]) -> NDArray[np.floa
         return np.where((fine > 0) & (coarse > 0), 0.5 * np.log2(fine / coarse), np.nan)
 
 
-def blur_of(quotients: NDArray[np.float64]) -> NDArray[np.float64]:
+def blur_of(quotients: Floats) -> Floats:
     """Blur of images (n,) from logarithms of quotients of patches and images (m, n); NaN where a patch is not shown."""
     seen = np.isfinite(quotients)
     # A patch that one image shows tells nothing of others.

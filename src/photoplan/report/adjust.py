@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats
 from photoplan.findings import with_sigma
 from photoplan.orientation.intersection import CheckAccuracy
 from photoplan.plain import two_figures
@@ -202,7 +202,7 @@ def _ground(axes: Any, ground: Sequence[GroundFigures], size: float = 38.0) -> N
         )
 
 
-def _ellipse(axes: Any, at: tuple[float, float], covariance: NDArray[np.float64], scale: float) -> None:
+def _ellipse(axes: Any, at: tuple[float, float], covariance: Floats, scale: float) -> None:
     if not np.isfinite(covariance).all():
         return
     values, vectors = np.linalg.eigh(covariance)
@@ -286,7 +286,7 @@ def _metres(value: float) -> str:
     return f"{value * 1000:g} mm" if value < 0.01 else f"{value * 100:g} cm" if value < 1 else f"{value:g} m"
 
 
-def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
+def _limits(values: Floats) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     if not len(known):
         return 0.0, 1.0
@@ -548,7 +548,7 @@ def correction_parts(corrections: tuple[CorrectionFigures, ...]) -> list[str]:
 
 
 @styled
-def _angles_of(angles: tuple[NDArray[np.float64], NDArray[np.float64]]) -> bytes:
+def _angles_of(angles: tuple[Floats, Floats]) -> bytes:
     fig = figure_of(7.2, 4.6)
     panels = fig.subplots(3, 1, sharex=True)
     for axes, name, colour, values in zip(panels, ("ω °", "φ °", "κ °"), (BLUE, GREEN, RED), angles[1].T):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Floats32
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.mtf.edges import LightImage
@@ -193,8 +194,6 @@ def _small(image: ImageMtf) -> NDArray[np.uint8]:
     return (255 * np.clip((np.nan_to_num(grey, nan=low) - low) / max(high - low, 1e-12), 0, 1)).astype(np.uint8)
 
 
-Array = NDArray[np.float64]
-
 _WIDTH = 7.2
 _COLOURS = (BLUE, RED, GREEN, PURPLE, ORANGE, SKY)
 #: Curves of single edges that are drawn.
@@ -330,7 +329,7 @@ def _label(group: EdgeGroup) -> str:
     return f"{name}{flight}: MTF50 {number(group.mtf50.value, 3)}"
 
 
-def _extent(at: Array, value: Array) -> float:
+def _extent(at: Floats, value: Floats) -> float:
     """Return the distance to which a line spread function is drawn, pixels."""
     large = np.abs(at[np.abs(value) > 0.02 * np.abs(value).max()])
     return float(np.clip(1.6 * large.max(initial=1.0), 3.0, float(np.abs(at).max())))
@@ -394,7 +393,7 @@ def draw_polar(star: StarMtf) -> bytes:
     return png(fig)
 
 
-def draw_picture(result: PatternResult, light: NDArray[np.float32]) -> bytes:
+def draw_picture(result: PatternResult, light: Floats32) -> bytes:
     """The light of the pattern's window, thinned, and what was found in it."""
     rows, columns = light.shape
     step = _thinning(result.window)
@@ -442,7 +441,7 @@ def _pattern_page(made: PatternReport) -> str:
     return page("Test patterns", f"Modulation and contrast transfer of images; linearisation: {kind}", parts)
 
 
-def _curves(result: PatternResult) -> list[tuple[str, str, tuple[Array, Array, Array]]]:
+def _curves(result: PatternResult) -> list[tuple[str, str, tuple[Floats, Floats, Floats]]]:
     """Curves over all directions: name, ``mtf`` or ``contrast``, and frequency, value and standard deviation."""
     found = result.found
     if not isinstance(found, UsafResult):
@@ -467,7 +466,7 @@ def _marks(result: PatternResult) -> list[tuple[tuple[float, float], str, bool]]
     return [(found.centre, "centre", True)] if isinstance(found, StarMtf) else []
 
 
-def _light(result: PatternResult, linearisation: Linearisation) -> NDArray[np.float32]:
+def _light(result: PatternResult, linearisation: Linearisation) -> Floats32:
     """Light of the pattern's window, one of some pixels."""
     image = LightImage.open(result.file, linearisation)
     step = _thinning(result.window)

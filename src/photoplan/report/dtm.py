@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Floats32, Ints
 from photoplan.errors import PhotoplanWarning, UsageError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.grid import MapGrid
@@ -66,20 +67,20 @@ _MATERN_HALF = 1.6783469900166605
 class CovarianceTest:
     """Covariance over distance: what was fitted, and what the data show."""
 
-    distance: NDArray[np.float64]
+    distance: Floats
     """Shape (n,), metres, from 0."""
-    whole: NDArray[np.float64]
+    whole: Floats
     """The function of the whole area, shape (n,), m²."""
-    low: NDArray[np.float64]
+    low: Floats
     """The tenth and the ninetieth of a hundred units at each distance, shape (n,), m²."""
-    high: NDArray[np.float64]
-    classes: NDArray[np.float64]
+    high: Floats
+    classes: Floats
     """Mean distance of the pairs of each class, shape (k,), metres."""
-    empirical: NDArray[np.float64]
+    empirical: Floats
     """Mean product of the pairs' residuals from a plane, shape (k,), m²; NaN: no pairs."""
-    expected: NDArray[np.float64]
+    expected: Floats
     """Expectations of these means by the fitted functions, shape (k,), m²."""
-    pairs: NDArray[np.int64]
+    pairs: Ints
     """Pairs in each class, shape (k,)."""
 
     noise: float = 0.0
@@ -107,7 +108,7 @@ class CovarianceTest:
         )
 
 
-def correlation_at(family: str, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def correlation_at(family: str, t: Floats) -> Floats:
     """Correlation at distances in half-value distances: ½ at 1."""
     if family == "gaussian":
         return np.asarray(np.exp(-np.log(2) * t**2))
@@ -139,7 +140,7 @@ def covariance_test(fit: TerrainFit) -> CovarianceTest:
     number = np.clip((d / edge * _CLASSES).astype(int), 0, _CLASSES)
     count = np.bincount(number, minlength=_CLASSES + 1)[:_CLASSES]
 
-    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def mean(values: Floats) -> Floats:
         with np.errstate(invalid="ignore"):
             return np.asarray(np.bincount(number, values, minlength=_CLASSES + 1)[:_CLASSES] / count)
 
@@ -156,7 +157,7 @@ def covariance_test(fit: TerrainFit) -> CovarianceTest:
     )
 
 
-def _curve(covariance: Covariance, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _curve(covariance: Covariance, distance: Floats) -> Floats:
     return covariance.variance * correlation_at(covariance.name, distance / covariance.length)
 
 
@@ -167,7 +168,7 @@ def _leaves(fit: TerrainFit) -> list[int]:
     return [leaf for first in range(min(step, _ROUNDS)) for leaf in rich[first::step].tolist()]
 
 
-def _block(fit: TerrainFit, leaf: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _block(fit: TerrainFit, leaf: int) -> tuple[Floats, Floats, Floats]:
     """Distances of all pairs of a neighbourhood's points, products of their residuals, and these products' means."""
     seen = fit.seen
     tree = fit.neighbours.near[0]
@@ -190,7 +191,7 @@ def _block(fit: TerrainFit, leaf: int) -> tuple[NDArray[np.float64], NDArray[np.
     return d, r[first] * r[second], expected[first, second]
 
 
-def _apart(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def _apart(fit: TerrainFit, xy: Floats) -> Floats:
     """Squared differences of the side coordinates of places (n, 2): not zero where breaklines part them."""
     vertices, start = near_lines(fit.seen, xy.min(axis=0), xy.max(axis=0))
     sides = np.zeros((len(xy), max(1, len(start) - 1)))
@@ -199,7 +200,7 @@ def _apart(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(((sides[:, None] - sides[None]) ** 2).sum(axis=2))
 
 
-def _matrix(fit: TerrainFit, leaf: int, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def _matrix(fit: TerrainFit, leaf: int, xy: Floats) -> Floats:
     """Covariances of the signal at places (n, 2), by the functions that the leaf's patch uses."""
     d2 = ((xy[:, None] - xy[None]) ** 2).sum(axis=2)
     apart = _apart(fit, xy)
@@ -321,11 +322,11 @@ class ReportMap:
     """Y of the outer upper edge, metres."""
     resolution: float
     """Side of a pixel, metres."""
-    heights: NDArray[np.float32]
+    heights: Floats32
     """Shape (rows, columns), row 0 in the north, metres; NaN: no surface."""
-    sigmas: NDArray[np.float32]
+    sigmas: Floats32
     """Standard deviations, the same shape."""
-    lines: tuple[tuple[str, NDArray[np.float64]], ...] = ()
+    lines: tuple[tuple[str, Floats], ...] = ()
     """Kind and vertices (n, 2) of lines, metres."""
 
     @property
@@ -345,9 +346,9 @@ class FilterEffect:
     """Members of the class, of which `xy` may be a part."""
     sigma: float
     """Filter value, metres; NaN: differs within the class."""
-    xy: NDArray[np.float64]
+    xy: Floats
     """Places, shape (n, 2), metres."""
-    differences: NDArray[np.float64]
+    differences: Floats
     """Shape (n,), metres; NaN: no surface there."""
 
 
@@ -371,7 +372,7 @@ class BuildSamples:
     """Contents of the report besides the model's own figures: a map, and samples if there is much."""
 
     map: ReportMap
-    normalised: NDArray[np.float64]
+    normalised: Floats
     """Normalised residuals of points that were used, or a sample of them."""
     spread: float
     """Spread of all of them; NaN if there are too few points."""
@@ -425,7 +426,7 @@ def _map(built: Built, surface: HybridSurface) -> ReportMap:
     )
 
 
-def _lines(built: Built, resolution: float) -> tuple[tuple[str, NDArray[np.float64]], ...]:
+def _lines(built: Built, resolution: float) -> tuple[tuple[str, Floats], ...]:
     """Lines for the map; where there are very many vertices, every so-manieth."""
     vertices = sum(len(line.xyz) for line in built.lines)
     step = max(1, -(-vertices // _VERTICES))
@@ -466,7 +467,7 @@ def _line_effects(built: Built) -> list[FilterEffect]:
     """The same for vertices of lines that have heights."""
     lines = built.plan.seen.lines
     origin = built.plan.seen.origin
-    parts: dict[str, list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = {}
+    parts: dict[str, list[tuple[Floats, Floats]]] = {}
     for k, element in enumerate(built.lines):
         part = slice(lines.start[k], lines.start[k + 1])
         xyz = lines.xyz[part] + origin
@@ -500,23 +501,19 @@ def _line_sigma(built: Built) -> dict[str, float]:
     return found
 
 
-def _along(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+def _along(xyz: Floats) -> Floats:
     """Distance along a line up to each vertex, as a part of the whole."""
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
     return length / max(float(length[-1]), 1e-12)
 
 
-def _one(sigma: NDArray[np.float64]) -> float:
+def _one(sigma: Floats) -> float:
     """The value, if all have the same; NaN otherwise."""
     return float(sigma[0]) if len(sigma) and np.ptp(sigma) <= 1e-9 * sigma[0] else np.nan
 
 
 def _errors(
-    built: Built,
-    measured: MeasuredTerrain,
-    surface: HybridSurface,
-    some: NDArray[np.int64],
-    residuals: NDArray[np.float64],
+    built: Built, measured: MeasuredTerrain, surface: HybridSurface, some: Ints, residuals: Floats
 ) -> tuple[PlottedError, ...]:
     if not len(some):
         return ()
@@ -689,7 +686,7 @@ def _lines_plots(axes: Any, area: ReportMap) -> None:
         axes.figure.legend(loc="outside lower center", ncols=4)
 
 
-def _limits(values: NDArray[np.float32], percent: float) -> tuple[float, float]:
+def _limits(values: Floats32, percent: float) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     if not known.size:
         return 0.0, 1.0
@@ -703,7 +700,7 @@ def _reach(effects: Sequence[FilterEffect]) -> float:
     return max(float(np.nanpercentile(every, 99.5)), 1e-4)
 
 
-def _shade(area: ReportMap) -> NDArray[np.float64]:
+def _shade(area: ReportMap) -> Floats:
     """Brightness of the surface lit from the north-west at 45°, relative to level ground; 1 where it is unknown."""
     z = area.heights.astype(float)
     if min(z.shape) < 2:

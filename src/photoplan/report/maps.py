@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats
 from photoplan.io.product import read_reduced
 from photoplan.io.store import write_atomically
 from photoplan.products.seams import SeamsReport
@@ -121,7 +121,7 @@ def regions_picture(shapes: Mapping[str, Any], title: str) -> bytes:
     return png(fig)
 
 
-def draw_squares(path: Path, bounds: NDArray[np.float64], title: str) -> Path:
+def draw_squares(path: Path, bounds: Floats, title: str) -> Path:
     """Draw squares by their outer edges xmin, ymin, xmax, ymax, shape (n, 4), as a PNG; replaces an older one."""
     load_matplotlib("a picture of the squares", "leave `show_quadtree` out")
     (left, bottom), (right, top) = bounds[:, :2].min(axis=0).tolist(), bounds[:, 2:].max(axis=0).tolist()
@@ -191,14 +191,12 @@ def draw_surface(heights: Path, coordinates: tuple[str, str] = ("X", "Y")) -> by
         return png(fig)
 
 
-def _most(values: NDArray[np.float64], percent: float) -> tuple[float, float]:
+def _most(values: Floats, percent: float) -> tuple[float, float]:
     """Return between what values lie but so many percent on either side; 1 and 2 if there are none."""
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, (percent, 100 - percent)) if known.size else (1.0, 2.0)
     return float(low), float(max(high, low + 1e-9))
 
-
-_Doubles = NDArray[np.float64]
 
 #: Longest side of what is drawn and counted, pixels; classes of texture; residuals that are drawn at most.
 _SURFACE_SIDE, _CLASSES, _PICTURES = 1200, 4, 12
@@ -248,7 +246,7 @@ def surface_page(result: SurfaceResult) -> str:
     return page(f"Surface {plan.settings.name}", f"{result.path.name}: {over}{', '.join(plan.images)}", parts)
 
 
-def _texture(grey: _Doubles, shape: tuple[int, int]) -> _Doubles:
+def _texture(grey: Floats, shape: tuple[int, int]) -> Floats:
     """Spread of grey values around each height, brought to the pixels of the heights."""
     rows, columns = ((np.arange(n) * m) // n for n, m in zip(shape, grey.shape))
     dy, dx = (np.abs(np.diff(grey, axis=axis, append=np.nan)) for axis in (0, 1))
@@ -259,7 +257,7 @@ def _texture(grey: _Doubles, shape: tuple[int, int]) -> _Doubles:
     return np.asarray((total / np.maximum(known, 1))[np.ix_(rows, columns)])
 
 
-def _rows(sigma: _Doubles, count: _Doubles) -> list[list[str]]:
+def _rows(sigma: Floats, count: Floats) -> list[list[str]]:
     """Figures of the heights by the number of images."""
     found = []
     for n in range(2, int(np.nanmax(count, initial=1)) + 1):
@@ -270,7 +268,7 @@ def _rows(sigma: _Doubles, count: _Doubles) -> list[list[str]]:
 
 
 @styled
-def _draw_classes(sigma: _Doubles, count: _Doubles, texture: _Doubles) -> bytes:
+def _draw_classes(sigma: Floats, count: Floats, texture: Floats) -> bytes:
     known = np.isfinite(sigma)
     fig = figure_of(8.4, 3.2)
     left, right = fig.subplots(1, 2, sharey=True)
@@ -292,7 +290,7 @@ def _draw_classes(sigma: _Doubles, count: _Doubles, texture: _Doubles) -> bytes:
 
 
 @styled
-def _draw_fit(fit: _Doubles, extent: tuple[float, float, float, float], coordinates: tuple[str, str]) -> bytes:
+def _draw_fit(fit: Floats, extent: tuple[float, float, float, float], coordinates: tuple[str, str]) -> bytes:
     left, bottom, right, top = extent
     fig = figure_of(8.4, float(np.clip(7.0 * (top - bottom) / (right - left), 2.6, 9.0)))
     ax = fig.subplots()
@@ -320,7 +318,7 @@ def _residuals(plan: SurfacePlan, result: SurfaceResult, path: Path) -> list[str
 
 
 @styled
-def _draw_residuals(drawn: Mapping[str, _Doubles], shape: float) -> bytes:
+def _draw_residuals(drawn: Mapping[str, Floats], shape: float) -> bytes:
     """Residuals by image; `shape` is their height through their width."""
     columns = min(3, len(drawn))
     rows = -(-len(drawn) // columns)

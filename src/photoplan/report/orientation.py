@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import shortest_path
 
+from photoplan.arrays import Floats, Ints
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.matching.features import Grey, GreyImage, Tracks, to_bytes
@@ -140,7 +141,7 @@ def _lengths(ax: Any, report: RegisterReport) -> None:
     ax.set_title(f"{figures.quarter:.2%} within 1/4 px, longest {figures.largest:.3f} px")
 
 
-def _thinned(report: RegisterReport) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _thinned(report: RegisterReport) -> tuple[Floats, Floats]:
     """Mean vectors and places of groups of neighbours, as many as can be seen."""
     found = report.found
     assert found is not None
@@ -150,7 +151,7 @@ def _thinned(report: RegisterReport) -> tuple[NDArray[np.float64], NDArray[np.fl
     _, group = np.unique((rows // side)[good] * 10_000_000 + (columns // side)[good], return_inverse=True)
     count = np.bincount(group)
 
-    def mean(values: NDArray[Any]) -> NDArray[np.float64]:
+    def mean(values: NDArray[Any]) -> Floats:
         return np.stack([np.bincount(group, values[good, k]) / count for k in range(2)], axis=1)
 
     return mean(found.moved), mean(found.at)
@@ -556,7 +557,7 @@ def draw_ties(report: TieReport) -> bytes | None:
     return png(fig)
 
 
-def _network(axes: Any, images: Sequence[TieImage], tracks: Tracks, points: NDArray[np.int64]) -> None:
+def _network(axes: Any, images: Sequence[TieImage], tracks: Tracks, points: Ints) -> None:
     joined, common = _common(tracks)
     positions = [image.position for image in images if image.position is not None]
     on_map = len(positions) == len(images)
@@ -601,13 +602,13 @@ def _view(axes: Any, image: TieImage, tracks: Tracks, which: int) -> None:
         axes.legend(loc="lower left", fontsize=6, markerscale=1.8, frameon=True)
 
 
-def _spread(points: NDArray[np.int64], most: int = 4) -> list[int]:
+def _spread(points: Ints, most: int = 4) -> list[int]:
     """Choose images to show, spread over those that have points."""
     some = np.flatnonzero(points)
     return sorted({int(some[int(i)]) for i in np.linspace(0, some.size - 1, min(most, some.size))})
 
 
-def _common(tracks: Tracks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _common(tracks: Tracks) -> tuple[Ints, Ints]:
     """Return pairs of images with common tracks, and the number of these."""
     incidence = coo_matrix((np.ones(len(tracks), np.int64), (tracks.image, tracks.track))).tocsr()
     both = (incidence @ incidence.T).tocoo()
@@ -615,7 +616,7 @@ def _common(tracks: Tracks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.stack([both.row[upper], both.col[upper]], axis=1).astype(np.int64), both.data[upper].astype(np.int64)
 
 
-def _places(count: int, joined: NDArray[np.int64], common: NDArray[np.int64]) -> NDArray[np.float64]:
+def _places(count: int, joined: Ints, common: Ints) -> Floats:
     """Place images in the plane, the closer the more they share (classical scaling of path lengths)."""
     length = 1.0 / np.sqrt(np.maximum(common, 1))
     graph = coo_matrix((length, (joined[:, 0], joined[:, 1])), shape=(count, count)).tocsr()

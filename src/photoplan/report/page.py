@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats
 from photoplan.errors import UsageError
 from photoplan.findings import Bars, Chart, Findings, Picture, Table, Trace, shrunk, spaced
 from photoplan.findings import number as figures
@@ -149,7 +149,7 @@ def shortened(name: str, most: int = 14) -> str:
 
 
 @styled
-def draw_normalised(values: NDArray[np.float64], limit: float, what: str) -> bytes:
+def draw_normalised(values: Floats, limit: float, what: str) -> bytes:
     """Histogram of normalised residuals with the normal curve, on a linear and on a logarithmic scale.
 
     Beyond the limit, if it is not 0, they count as gross errors; what lies off the scale is in its last classes.
@@ -392,8 +392,6 @@ def open_picture(
     return ReportFile(path)
 
 
-Array = NDArray[np.float64]
-
 _SIZE = (6.6, 3.6)
 #: Letters that fit side by side in a legend, and those that the sign of a curve takes.
 _LEGEND, _HANDLE = 84, 7
@@ -494,7 +492,7 @@ def _draw_curve(axes: Any, curve: Trace, colour: str) -> None:
         axes.errorbar(x, y, yerr=curve.sigma, fmt="none", ecolor=colour, elinewidth=0.9, capsize=2)
 
 
-def _draw_vectors(axes: Any, x: Array, y: Array, curve: Trace, options: dict[str, Any]) -> None:
+def _draw_vectors(axes: Any, x: Floats, y: Floats, curve: Trace, options: dict[str, Any]) -> None:
     """Lines from the points, by a round factor longer than they are, so that the longest is a tenth of the extent."""
     vectors = np.asarray(curve.vectors, float)
     largest = float(np.linalg.norm(vectors, axis=1).max()) or 1.0
@@ -504,7 +502,7 @@ def _draw_vectors(axes: Any, x: Array, y: Array, curve: Trace, options: dict[str
     axes.plot(*ends, linewidth=1.4, **{**options, "label": f"{curve.label} × {factor:g}"})
 
 
-def _limits(known: NDArray[np.float64]) -> tuple[float, float]:
+def _limits(known: Floats) -> tuple[float, float]:
     """Return the limits of a scale: of nearly all values, or of all if nearly all are equal."""
     if not known.size:
         return 0.0, 1.0

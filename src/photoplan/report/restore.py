@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Mask
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.balance import BalanceReport
@@ -47,14 +48,12 @@ from photoplan.report.page import (
     text,
 )
 
-Array = NDArray[np.float64]
-
 #: Kernels that are drawn; of more, the first ones are.
 MOST_DRAWN = 12
 _DIRECTIONS = (("row", BLUE, "-"), ("column", ORANGE, "--"), ("diagonal", GREEN, ":"))
 
 
-def frequency_response(values: Array, frequency: Array, direction: tuple[float, float]) -> Array:
+def frequency_response(values: Floats, frequency: Floats, direction: tuple[float, float]) -> Floats:
     """Factor by which a kernel changes the amplitude of waves."""
     m, n = (side // 2 for side in values.shape)
     rows, columns = np.mgrid[-m : m + 1, -n : n + 1]
@@ -63,7 +62,7 @@ def frequency_response(values: Array, frequency: Array, direction: tuple[float, 
 
 
 @styled
-def draw_kernels(title: str, kernels: Sequence[tuple[str, Array]]) -> bytes:
+def draw_kernels(title: str, kernels: Sequence[tuple[str, Floats]]) -> bytes:
     """PNG with a row of three panels for each kernel, given by name and values (2 m + 1, 2 n + 1)."""
     drawn = list(kernels[:MOST_DRAWN])
     height = 3.0 * len(drawn) + 0.7
@@ -79,7 +78,7 @@ def draw_kernels(title: str, kernels: Sequence[tuple[str, Array]]) -> bytes:
     return png(fig)
 
 
-def _weights(axes: Any, values: Array) -> None:
+def _weights(axes: Any, values: Floats) -> None:
     """Heat map; the colour is that of the root, since the middle is far larger than all others."""
     m, n = (side // 2 for side in values.shape)
     rooted = np.sign(values) * np.sqrt(np.abs(values))
@@ -99,7 +98,7 @@ def _weights(axes: Any, values: Array) -> None:
             )
 
 
-def _sections(axes: Any, values: Array) -> None:
+def _sections(axes: Any, values: Floats) -> None:
     """Middle row, middle column, and sums."""
     m, n = (side // 2 for side in values.shape)
     axes.axhline(0.0, color=SOFT, linewidth=0.8)
@@ -114,7 +113,7 @@ def _sections(axes: Any, values: Array) -> None:
     axes.legend(fontsize=7.5)
 
 
-def _response(axes: Any, values: Array) -> None:
+def _response(axes: Any, values: Floats) -> None:
     """Up to the Nyquist frequency along rows and columns."""
     frequency = np.linspace(0.0, 0.5, 101)
     for (name, colour, line), direction in zip(_DIRECTIONS, ((1.0, 0.0), (0.0, 1.0), (0.5**0.5, 0.5**0.5))):
@@ -149,13 +148,13 @@ class AxisPicture:
     """Sharpness in one direction, before and after."""
 
     label: str
-    spread: Array
+    spread: Floats
     """Centre Z and the values A, B, … on one side."""
-    frequency: Array
+    frequency: Floats
     """Cycles per pixel, up to 0.5."""
-    modulation: Array
+    modulation: Floats
     """NaN where it is not known."""
-    expected: Array
+    expected: Floats
     """Modulation times the response of the filter."""
 
 
@@ -164,7 +163,7 @@ class FieldMap:
     """One value in each part of the field."""
 
     title: str
-    values: Array
+    values: Floats
     """(rows, columns), NaN where it is not known."""
     digits: int
 
@@ -284,11 +283,11 @@ _SHARE = 256
 class HistogramEnds:
     """The dark and the bright end of a histogram."""
 
-    edges: tuple[NDArray[np.float64], NDArray[np.float64]]
+    edges: tuple[Floats, Floats]
     """Limits of the classes of grey values."""
-    before: tuple[NDArray[np.float64], NDArray[np.float64]]
+    before: tuple[Floats, Floats]
     """Share of the pixels in each class, percent."""
-    after: tuple[NDArray[np.float64], NDArray[np.float64]]
+    after: tuple[Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,7 +339,7 @@ def _windows(size: tuple[int, int]) -> list[Window]:
     return [Window(col, row, *side) for row in at[1] for col in at[0]]
 
 
-def _contrast(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> float:
+def _contrast(pixels: NDArray[Any], valid: Mask) -> float:
     grey = np.where(valid, pixels[:3].mean(0, dtype=np.float64), np.nan)
     squares = np.concatenate([(np.diff(grey, axis=axis) ** 2).ravel() for axis in (0, 1)])
     known = squares[np.isfinite(squares)]

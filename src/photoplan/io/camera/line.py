@@ -35,9 +35,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.polynomial import Chebyshev, polynomial
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from photoplan.arrays import Floats
 from photoplan.cameras.line_correction import LineCorrection, PoseErrors, TrackSpline
 from photoplan.cameras.pushbroom import ChippedLine, LineCamera
 from photoplan.cameras.pushbroom_rays import LineBend, LineLook, LineTrack
@@ -63,7 +63,6 @@ from photoplan.io.camera.model import Entry, Name, Number, Pixels, Positive, Tri
 from photoplan.io.camera.satellite import FORM, FRAME_MODEL, LENSES, Isd, lens_of, not_known
 from photoplan.io.files import looks_like, read_entries, read_head, read_json, read_text, read_xml
 
-_Floats = NDArray[np.float64]
 #: Nothing that holds a trajectory and what belongs to an image is larger.
 MAX_BYTES = 200_000_000
 
@@ -132,7 +131,7 @@ def look(isd: Isd) -> LineLook:
     step = np.asarray(to_plane[:, 1] * summing, float)
     kind = isd.distortion
 
-    def places(column: _Floats) -> _Floats:
+    def places(column: Floats) -> Floats:
         return np.asarray(place + column[:, None] * step)
 
     if kind is None or kind in LENSES:
@@ -148,7 +147,7 @@ def look(isd: Isd) -> LineLook:
     return LineLook.of(lambda column: undistorted(places(column)) / plane.focal, isd.samples, bend=bend)
 
 
-_Plane = Callable[[_Floats], _Floats]
+_Plane = Callable[[Floats], Floats]
 
 
 def _even(isd: Isd) -> _Plane:
@@ -158,7 +157,7 @@ def _even(isd: Isd) -> _Plane:
     return lambda d: np.asarray(d + shift + k[0] + (d**2).sum(axis=1, keepdims=True) * k[2])
 
 
-def _kaguya(isd: Isd) -> _Floats:
+def _kaguya(isd: Isd) -> Floats:
     """Coefficients (4, 2) of rising powers of the distance, for x and y."""
     return np.array([isd.coefficients(f"kaguyalism.{axis}", 4) for axis in "xy"]).T
 
@@ -178,7 +177,7 @@ def _themis(isd: Isd) -> _Plane:
     if not k > 0:
         raise InputError(f"optical_distortion.themisir.p_k is {k:g}: a scale, above 0")
 
-    def undistorted(d: _Floats) -> _Floats:
+    def undistorted(d: Floats) -> Floats:
         with np.errstate(invalid="ignore"):
             root = np.sqrt((1.0 + one) ** 2 + 4.0 * two * d[:, 1])
         return np.stack([d[:, 0] / k, 2.0 * d[:, 1] / (1.0 + one + root)], axis=1)
@@ -257,7 +256,7 @@ def _csm_track(isd: Isd) -> LineTrack:
     )
 
 
-def _csm_clock(isd: Isd) -> tuple[_Floats, _Floats, _Floats]:
+def _csm_clock(isd: Isd) -> tuple[Floats, Floats, Floats]:
     """Rows from which on lines last as they do, their times, and how long a line lasts.
 
     CSM counts from the upper edge of the first line, photoplan from its middle: half a line, and half a line of time.
@@ -311,7 +310,7 @@ def _dimap_track(model: Element, lines: int) -> LineTrack:
     if not (period > 0 and scale > 0):
         raise InputError(f"a line of {period:g} s, or attitudes over {scale:g} s")
 
-    def attitudes(t: _Floats) -> _Floats:
+    def attitudes(t: Floats) -> Floats:
         return np.stack([polynomial.polyval((t - offset) / scale, each) for each in cubics], axis=-1)
 
     clock = np.array([0.0]), np.array([0.0]), np.array([period])
@@ -333,7 +332,7 @@ def _dimap_look(model: Element, columns: int) -> LineLook:
     path = "Sensor_Viewing_Model/Viewing_Directions/{}_Model/COEFFICIENTS"
     psi_x, psi_y = (_dimap_numbers(model, path.format(name)) for name in ("PsiX", "PsiY"))
 
-    def tangents(column: _Floats) -> _Floats:
+    def tangents(column: Floats) -> Floats:
         return np.stack([polynomial.polyval(column, psi_y), -polynomial.polyval(column, psi_x)], axis=-1)
 
     return LineLook.of(tangents, columns)
@@ -371,7 +370,7 @@ def _second(text: str) -> float:
         raise InputError(f"{text[:40]!r} is not a time") from None
 
 
-def read_numbers(path: Path, columns: str, max_bytes: int) -> NDArray[np.float64]:
+def read_numbers(path: Path, columns: str, max_bytes: int) -> Floats:
     """The numbers (n, k) of a table: CSV that begins with the names of its columns, or NPY."""
     count = columns.count(",") + 1
     try:
@@ -397,7 +396,7 @@ def read_numbers(path: Path, columns: str, max_bytes: int) -> NDArray[np.float64
     return np.ascontiguousarray(table)
 
 
-def _from_npy(path: Path) -> NDArray[np.float64]:
+def _from_npy(path: Path) -> Floats:
     try:
         table = np.load(path, allow_pickle=False, mmap_mode="r")
         kind = table.dtype
@@ -483,7 +482,7 @@ def looks_of(detectors: StripDetectors, folder: Path, max_bytes: int) -> tuple[t
     return tuple(looks), None if table is None else beside
 
 
-_Curve = tuple[Callable[[_Floats], _Floats], Callable[[_Floats], _Floats]]
+_Curve = tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]
 
 
 def _stated(chip: StripChip) -> _Curve:
@@ -493,13 +492,13 @@ def _stated(chip: StripChip) -> _Curve:
     )
 
 
-def _tangents(curve: _Curve, first: int, focal_mm: float) -> Callable[[_Floats], _Floats]:
+def _tangents(curve: _Curve, first: int, focal_mm: float) -> Callable[[Floats], Floats]:
     """Directions by the columns of the image, of a curve by those of a chip."""
     x, y = curve
     return lambda column: np.asarray(np.stack([x(column - first), -y(column - first)], axis=-1) / focal_mm)
 
 
-def _through(table: _Floats, file: Path, first: int) -> tuple[_Curve, float]:
+def _through(table: Floats, file: Path, first: int) -> tuple[_Curve, float]:
     """Curves x, y of the column through elements, and how far these lie beside them, in columns.
 
     first: elements of the line before them.
@@ -619,7 +618,7 @@ def _strip_track(strip: StripFile, path: Path) -> LineTrack:
     )
 
 
-def _strip_record(path: Path) -> _Floats:
+def _strip_record(path: Path) -> Floats:
     """The table of the flight, shape (n, 7)."""
     table = read_numbers(path, _COLUMNS, MAX_BYTES)
     if len(table) < 2:
@@ -630,14 +629,14 @@ def _strip_record(path: Path) -> _Floats:
     return table
 
 
-def _gaps(t: _Floats) -> tuple[tuple[float, float], ...]:
+def _gaps(t: Floats) -> tuple[tuple[float, float], ...]:
     """Return the times in which a record is silent for much longer than from row to row otherwise."""
     step = np.diff(t)
     long = np.flatnonzero(step > _GAP * np.median(step))
     return tuple((float(t[k]), float(t[k + 1])) for k in long)
 
 
-def _judge_strip(table: _Floats, flight: StripFlight, path: Path) -> None:
+def _judge_strip(table: Floats, flight: StripFlight, path: Path) -> None:
     """Refuse what is finite and still cannot be meant."""
     worst = np.abs(table[:, 4:]).max(axis=1).argmax()
     odd = odd_angles(table[worst, 4:].tolist(), flight.angle_unit, _COLUMNS.split(",")[4:])
@@ -658,11 +657,7 @@ def _read_isd(path: Path) -> StatedLine:
 
 
 #: Reader of every format that states a single line, by file suffix.
-LINE_FORMATS: dict[str, Callable[[Path], StatedLine]] = {
-    ".json": _read_isd,
-    ".isd": _read_isd,
-    ".xml": _read_dimap,
-}
+LINE_FORMATS: dict[str, Callable[[Path], StatedLine]] = {".json": _read_isd, ".isd": _read_isd, ".xml": _read_dimap}
 
 
 def read_line(path: Path, detectors: str | None = None) -> StatedLine:
@@ -790,7 +785,7 @@ def read_line_correction(path: Path) -> LineCorrection:
 
 
 def line_correction_text(
-    found: LineCorrection, covariance: _Floats | None, sigma: _Floats | None, errors: PoseErrors | None = None
+    found: LineCorrection, covariance: Floats | None, sigma: Floats | None, errors: PoseErrors | None = None
 ) -> str:
     """The file."""
     lines = [
@@ -831,13 +826,13 @@ def line_correction_text(
     return "\n".join(lines) + "\n"
 
 
-def _units() -> _Floats:
+def _units() -> Floats:
     return np.repeat([1.0, np.pi / 180.0], 3)
 
 
-def _table(name: str, rows: _Floats, digits: int) -> list[str]:
+def _table(name: str, rows: Floats, digits: int) -> list[str]:
     return [f"{name} = [", *(f"    {_list(row, digits)}," for row in rows), "]"]
 
 
-def _list(values: _Floats, digits: int = 15) -> str:
+def _list(values: Floats, digits: int = 15) -> str:
     return "[" + ", ".join(repr(float(f"{v:.{digits}g}")) for v in values) + "]"

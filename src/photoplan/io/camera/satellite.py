@@ -34,8 +34,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 import rasterio
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats
 from photoplan.cameras.body_frame import BodyFrameCamera
 from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.frame import FrameCamera
@@ -284,7 +284,6 @@ def rpc_text(functions: RationalFunctions) -> str:
     return "\n".join(lines) + "\n"
 
 
-_Floats = NDArray[np.float64]
 FORM = "CSM support data (ISD)"
 #: What `name_model` of frame cameras says.
 FRAME_MODEL = "USGS_ASTRO_FRAME_SENSOR_MODEL"
@@ -298,11 +297,11 @@ _LARGEST = 1e30
 class FocalPlane:
     """Positions of detectors, in lines and samples of the whole detector from its outer corner, each (2,)."""
 
-    to_detector: _Floats
+    to_detector: Floats
     """(x, y) in the focal plane, millimetres, to (line, sample), shape (2, 2)."""
-    axis: _Floats
+    axis: Floats
     """Line and sample of the optical axis."""
-    first: _Floats
+    first: Floats
     """Line and sample at which the image begins."""
     focal: float
     """Focal length, millimetres."""
@@ -382,7 +381,7 @@ class Isd:
             raise InputError(f"{self._path}: {found:g} {name}s of the detector in one of the image")
         return found
 
-    def moments(self, name: str) -> _Floats:
+    def moments(self, name: str) -> Floats:
         """Times of a table, seconds of the ephemeris; rising, in whichever direction the file states them."""
         found = self.numbers(f"{name}.ephemeris_times", (-1,))
         steps = np.diff(found)
@@ -390,12 +389,12 @@ class Isd:
             raise InputError(f"{self._path}: the times of {name} neither rise nor fall throughout")
         return np.sort(found)
 
-    def _of_moments(self, name: str, values: _Floats) -> _Floats:
+    def _of_moments(self, name: str, values: Floats) -> Floats:
         """Rows of a table in the order of its `moments`."""
         found = self.numbers(f"{name}.ephemeris_times", (-1,))
         return values[::-1] if len(found) > 1 and found[0] > found[-1] else values
 
-    def positions(self) -> tuple[_Floats, _Floats | None]:
+    def positions(self) -> tuple[Floats, Floats | None]:
         """Positions and velocities of the camera in the inertial frame, metres."""
         unit = self._unit("instrument_position")
         count = len(self.moments("instrument_position"))
@@ -410,7 +409,7 @@ class Isd:
         speeds = unit * self.numbers("instrument_position.velocities", positions.shape)
         return positions, self._of_moments("instrument_position", speeds)
 
-    def turns(self, name: str, t: _Floats) -> _Floats:
+    def turns(self, name: str, t: Floats) -> Floats:
         """Quaternions (n, 4) from the inertial frame by a table and its constant rotation, at times (n,)."""
         moments = self.moments(name)
         table = self._of_moments(name, self.numbers(f"{name}.quaternions", (len(moments), 4)))
@@ -438,7 +437,7 @@ class Isd:
         return found
 
 
-def _quaternion(R: _Floats) -> _Floats:
+def _quaternion(R: Floats) -> Floats:
     """The unit quaternion (4,) of a rotation matrix (3, 3), scalar first."""
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError("a constant rotation is none")

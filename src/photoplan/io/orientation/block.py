@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.pose import (
@@ -128,7 +129,7 @@ class OrientationTable:
     true_metres: bool = False
     """True if the poses were computed in a Cartesian system of true metres (geocentric, or about a point) and brought
     into `crs` place by place; else they were adjusted in map coordinates, whose scale and curvature they absorbed."""
-    positions: NDArray[np.float64] | None = None
+    positions: Floats | None = None
     """Latitude, longitude (degrees, WGS 84) and height that a receiver measured, shape (n, 3), where the file states
     them beside the poses; NaN for images without. They were not used to place the poses."""
     notes: tuple[str, ...] = ()
@@ -209,18 +210,18 @@ class OrientationTable:
         return self.true_metres or self.origin is not None
 
     @cached_property
-    def centers(self) -> NDArray[np.float64]:
+    def centers(self) -> Floats:
         """Projection centres, shape (n, 3)."""
         return np.array([i.center for i in self.images], float)
 
     @cached_property
-    def rotations(self) -> NDArray[np.float64]:
+    def rotations(self) -> Floats:
         """R_ground_camera of every image, shape (n, 3, 3), in the axes of the table's system."""
         angles = angle_in_radians(np.array([i.angles for i in self.images], float), self.angle_unit)
         R = rotation_from_angles(angles, self.rotation)
         return R if self.direction == "camera-to-ground" else np.swapaxes(R, 1, 2)
 
-    def opk_degrees(self) -> NDArray[np.float64]:
+    def opk_degrees(self) -> Floats:
         """ω, φ, κ in degrees, shape (n, 3); numbers that are already so stay untouched."""
         if (self.angle_unit, self.rotation, self.direction) == ("deg", "opk", "camera-to-ground"):
             return np.array([i.angles for i in self.images], float)
@@ -228,11 +229,7 @@ class OrientationTable:
 
 
 def posed(
-    name: str,
-    center: ArrayLike,
-    R_ground_camera: NDArray[np.float64],
-    camera: str | None = None,
-    line: int | None = None,
+    name: str, center: ArrayLike, R_ground_camera: Floats, camera: str | None = None, line: int | None = None
 ) -> OrientedImage:
     """An image whose rotation is given by a matrix (3, 3), with ω, φ, κ in degrees; `center` is X, Y, Z, metres."""
     X, Y, Z = np.asarray(center, float).tolist()
@@ -322,7 +319,7 @@ class OrientationBlock:
         own = self.sizes.get(image.name)
         return own if own is not None or not self.cameras else self.camera(image).size
 
-    def angles(self, order: str, unit: str) -> NDArray[np.float64]:
+    def angles(self, order: str, unit: str) -> Floats:
         """Angles of all images, shape (n, 3), for camera-to-ground matrices: in the sequence of `order`, in `unit`."""
         table = self.table
         if (table.angle_unit, table.rotation, table.direction) == (unit, order, "camera-to-ground"):

@@ -37,9 +37,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.bounds import is_no_fix
 from photoplan.geometry.crs import agreement, canonical_crs, crs_label, crs_step, misfit, topocentric_poses, utm_codes
@@ -129,10 +129,7 @@ def _camera(values: Any, where: str) -> CameraEntry:
         if key not in _COEFFICIENTS[kind] and _value(values, key, where) != 0:
             raise InputError(f"{where}: {key} = {values[key]} is not supported for projection_type {kind!r}")
     lens: dict[str, Any] = {k: _value(values, k, where) for k in _COEFFICIENTS[kind]}
-    point = (
-        (w - 1) / 2 + _value(values, "c_x", where) * side,
-        (h - 1) / 2 + _value(values, "c_y", where) * side,
-    )
+    point = ((w - 1) / 2 + _value(values, "c_x", where) * side, (h - 1) / 2 + _value(values, "c_y", where) * side)
     lens = {"type": "opencv_fisheye" if kind.startswith("fisheye") else "opencv", **lens}
     return frame_in_pixels(InPixels((w, h), (focal_x * side, focal_y * side), point), lens, where)
 
@@ -160,8 +157,6 @@ def resized(camera: CameraEntry, size: tuple[int, int], where: str) -> CameraEnt
     return camera.model_copy(update={"size": size, "focal_px": focal, "principal_point_px": point})
 
 
-_Floats = NDArray[np.float64]
-
 #: How near to whole metres a reference lies that was made from an offset, metres; the numbers differ by rounding.
 _WHOLE = 0.005
 #: Rotation vectors that are one number written twice; and poses in two worlds that no orthophoto tells apart, metres.
@@ -178,7 +173,7 @@ class World:
 
     crs: str | None
     """UTM zone; None: east, north, up about the reference."""
-    offset: _Floats
+    offset: Floats
     """To be added to positions (3,), metres."""
     note: str
 
@@ -188,11 +183,11 @@ class Shots:
     """Poses as the file states them, n images."""
 
     names: tuple[str, ...]
-    centers: _Floats
+    centers: Floats
     """Shape (n, 3)."""
-    vectors: _Floats
+    vectors: Floats
     """Rotation vectors, shape (n, 3)."""
-    gps: _Floats
+    gps: Floats
     """Positions of a receiver, shape (n, 3): east, north, up; NaN: not stated."""
     dop: float
     """Their usual error as the shots state it, metres."""
@@ -233,7 +228,7 @@ def world_of(path: Path, origin: tuple[float, float, float], shots: Shots) -> Wo
 _INSTEAD = "give odm_report/shots.geojson of the project, or opensfm/reconstruction.topocentric.json under its own name"
 
 
-def _utm_offset(origin: tuple[float, float, float]) -> tuple[str, _Floats] | None:
+def _utm_offset(origin: tuple[float, float, float]) -> tuple[str, Floats] | None:
     """UTM zone in which the reference lies on whole metres, and these (3,)."""
     lat, lon, _ = origin
     for code in utm_codes(lat, lon):
@@ -280,7 +275,7 @@ def _equal(shots: Shots, rotations: dict[str, object], file: Path) -> bool | Non
     return max(apart) < _SAME if apart else None
 
 
-def _vote_of_gps(shots: Shots, map_gps: _Floats) -> dict[str, bool]:
+def _vote_of_gps(shots: Shots, map_gps: Floats) -> dict[str, bool]:
     """Return whether positions of the receiver fit the poses better in UTM (True), if they decide."""
     fit = agreement(map_gps, shots.centers)
     if fit.count < 4:
@@ -293,7 +288,7 @@ def _vote_of_gps(shots: Shots, map_gps: _Floats) -> dict[str, bool]:
     return {f"gps_position of {fit.count} shots": bool(utm < local)}
 
 
-def _refuse_far(path: Path, worlds: dict[str, _Floats], shots: Shots) -> None:
+def _refuse_far(path: Path, worlds: dict[str, Floats], shots: Shots) -> None:
     """Refuse poses that are far from the receiver's positions, or turned against them, in every world."""
     faults = []
     for name, gps in worlds.items():
@@ -353,9 +348,7 @@ def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     return {path: json.dumps([contents], indent=1) + "\n"}
 
 
-def _tangential(
-    table: OrientationTable, path: Path
-) -> tuple[tuple[float, float, float], NDArray[np.float64], NDArray[np.float64]]:
+def _tangential(table: OrientationTable, path: Path) -> tuple[tuple[float, float, float], Floats, Floats]:
     """Origin of a tangential system, and poses in it."""
     if table.origin is not None:
         return table.origin, table.centers, table.rotations
@@ -530,7 +523,7 @@ def _odm_shot(feature: Any, k: int, path: Path) -> tuple[tuple[int, int], Orient
     return (int(width), int(height)), image, finite(place, f"{where}: coordinates", 3)
 
 
-def _utm_zone(lonlat: NDArray[np.float64], XYZ: NDArray[np.float64], path: Path) -> tuple[str | None, list[str]]:
+def _utm_zone(lonlat: Floats, XYZ: Floats, path: Path) -> tuple[str | None, list[str]]:
     """The UTM zone in which longitude, latitude and the map coordinates agree, with a note."""
     for code in utm_codes(float(np.median(lonlat[:, 1])), float(np.median(lonlat[:, 0]))):
         try:

@@ -52,8 +52,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.local import is_local_crs, legacy_wkt
@@ -180,7 +180,7 @@ def _read_inpho(path: Path, form: TableFormat) -> OrientationBlock:
     direction, reason = _direction(poses, file, form, path)
     notes.append(f"{path.name}: rotation matrices read as {DIRECTIONS[direction]}{reason}")
     cameras: dict[str, CameraEntry] = {}
-    turns: dict[str, NDArray[np.float64]] = {}
+    turns: dict[str, Floats] = {}
     for section in file.cameras:
         name, camera, turn, why = _inpho_camera(section, path)
         turns[name] = turn
@@ -260,14 +260,14 @@ def _direction(poses: list[_Pose], file: _InphoFile, form: TableFormat, path: Pa
     return OWN, usual
 
 
-def _between(A: NDArray[np.float64], B: NDArray[np.float64]) -> float:
+def _between(A: Floats, B: Floats) -> float:
     """Angle between two rotations, degrees."""
     S = A.T @ B
     sine = np.linalg.norm([S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1]])
     return float(np.degrees(np.arctan2(sine, np.trace(S) - 1)))
 
 
-def _inpho_camera(section: _Section, path: Path) -> tuple[str, CameraEntry | None, NDArray[np.float64], str | None]:
+def _inpho_camera(section: _Section, path: Path) -> tuple[str, CameraEntry | None, Floats, str | None]:
     """Name, camera, rotation from the file's image axes to those of the pixels, and why there is no camera."""
     name = section.text("$CAMERA_ID", "$ID", "$TYPE")
     if name is None:
@@ -297,7 +297,7 @@ def _inpho_camera(section: _Section, path: Path) -> tuple[str, CameraEntry | Non
     return name, _frame(section, name, A, t, pixel, path), turn, None
 
 
-def _affine(section: _Section, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _affine(section: _Section, path: Path) -> tuple[Floats, Floats]:
     entry = section["$CCD_INTERIOR_ORIENTATION"]
     where = f"{path}:{entry.line}"
     rows = [numbers(row.split(), where, entry.key, 3) for row in entry.rows[:2]]
@@ -307,9 +307,7 @@ def _affine(section: _Section, path: Path) -> tuple[NDArray[np.float64], NDArray
     return both[:, :2], both[:, 2]
 
 
-def _frame(
-    section: _Section, name: str, A: NDArray[np.float64], t: NDArray[np.float64], pixel: NDArray[np.float64], path: Path
-) -> CameraEntry:
+def _frame(section: _Section, name: str, A: Floats, t: Floats, pixel: Floats, path: Path) -> CameraEntry:
     where = f"{path}:{section.line}: camera {name!r}"
     ppa = numbers((section.text("$PRINCIPAL_POINT_PPA") or "0 0").split(), where, "$PRINCIPAL_POINT_PPA", 2)
     col, row = (A @ ppa + t).tolist()
@@ -655,16 +653,14 @@ def _read_full(lines: list[str], path: Path) -> OrientationBlock:
     return _block(path, images, {label: c for c, label in cameras.items()}, notes)
 
 
-def _offset(path: Path) -> tuple[NDArray[np.float64], list[str]]:
+def _offset(path: Path) -> tuple[Floats, list[str]]:
     file = path.with_name(f"{_stem(path).name}_offset.xyz")
     if not file.is_file():
         return np.zeros(3), [f"{path.name}: positions are relative to {file.name}, which is not there"]
     return np.array(numbers(read_text(file, 10_000).split(), str(file), "offset", 3)), []
 
 
-def _ten_lines(
-    rows: list[tuple[int, str]], path: Path
-) -> tuple[str, CameraEntry, NDArray[np.float64], NDArray[np.float64]]:
+def _ten_lines(rows: list[tuple[int, str]], path: Path) -> tuple[str, CameraEntry, Floats, Floats]:
     """Name, camera, position and R_camera_world of an image."""
     where = f"{path}:{rows[0][0]}"
     words = rows[0][1].rsplit(maxsplit=2)

@@ -38,9 +38,10 @@ from typing import Any
 from xml.etree.ElementTree import Element, tostring
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError, named_by
 from photoplan.geometry.crs import crs_step, parse_crs
 from photoplan.geometry.local import (
@@ -75,7 +76,6 @@ from photoplan.plain import xml_quoted, xml_text
 _METASHAPE_BYTES = 256 << 20
 _COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
-_Floats = NDArray[np.float64]
 #: How far a printed matrix times itself may be from the unit matrix.
 _ROUNDED = 2e-5
 
@@ -84,8 +84,8 @@ _ROUNDED = 2e-5
 class _Similarity:
     """From the chunk's own system to the world: X = scale · R x + t."""
 
-    R: _Floats = field(default_factory=lambda: np.eye(3))
-    t: _Floats = field(default_factory=lambda: np.zeros(3))
+    R: Floats = field(default_factory=lambda: np.eye(3))
+    t: Floats = field(default_factory=lambda: np.zeros(3))
     scale: float = 1.0
 
 
@@ -209,7 +209,7 @@ def _similarity(element: Element | None, where: str) -> _Similarity | None:
 
 def _pose_of(
     camera: Element, every: Mapping[str, Element], sensors: Mapping[str, Element], path: Path
-) -> tuple[_Floats, _Floats] | None:
+) -> tuple[Floats, Floats] | None:
     """Rotation and centre in the chunk; None if neither the camera nor the master of its rig is aligned."""
     where = f"{path}: camera {camera.get('label')!r}"
     master = every.get(camera.get("master_id", ""))
@@ -226,7 +226,7 @@ def _pose_of(
     return None if camera.find("transform") is None else _camera_pose(camera, where)
 
 
-def _camera_pose(camera: Element, where: str) -> tuple[_Floats, _Floats]:
+def _camera_pose(camera: Element, where: str) -> tuple[Floats, Floats]:
     M = np.array(element_numbers(camera.find("transform"), f"{where}: transform", 16)).reshape(4, 4)
     if not np.allclose(M[3], [0.0, 0.0, 0.0, 1.0], rtol=0, atol=1e-9):
         raise InputError(f"{where}: transform: the last row is {M[3].tolist()}; 0 0 0 1 is needed")
@@ -244,7 +244,7 @@ def _reference(camera: Element) -> list[float]:
         return [np.nan] * 3
 
 
-def _geodetic(references: _Floats, chunk: Element, path: Path) -> _Floats | None:
+def _geodetic(references: Floats, chunk: Element, path: Path) -> Floats | None:
     """Latitude, longitude and height (n, 3) of receivers' positions; None: none, or in no CRS that leads there."""
     crs = (chunk.findtext("./reference") or "").strip()
     there = np.isfinite(references[:, :2]).all(axis=1) & (references[:, :2] != 0).any(axis=1)
@@ -329,14 +329,14 @@ def _image_names(chunk: Element, cameras: Sequence[Element]) -> dict[Element, st
 class _Placed:
     """Poses in a system that photoplan knows."""
 
-    centers: _Floats
-    rotations: _Floats
+    centers: Floats
+    rotations: Floats
     crs: str | None = None
     origin: tuple[float, float, float] | None = None
     notes: tuple[str, ...] = ()
 
 
-def _place(chunk: Element, centers: _Floats, rotations: _Floats, georeferenced: bool, path: Path) -> _Placed:
+def _place(chunk: Element, centers: Floats, rotations: Floats, georeferenced: bool, path: Path) -> _Placed:
     """Poses of the world system, in the CRS that the file states."""
     stated = (chunk.findtext("./reference") or "").strip()
     if not georeferenced:
@@ -417,7 +417,7 @@ def _render_metashape(block: OrientationBlock, path: Path) -> dict[Path, str]:
     return {path: "\n".join(lines)}
 
 
-def _placed(block: OrientationBlock) -> tuple[_Floats, _Floats, str, _Floats, _Floats]:
+def _placed(block: OrientationBlock) -> tuple[Floats, Floats, str, Floats, Floats]:
     """Rotation and translation of the chunk, WKT of the CRS, and poses in the chunk's system."""
     table = block.table
     if table.crs is not None:
@@ -513,14 +513,14 @@ _TURNED, _APART = 1e-4, 1e-3
 class _Rigid:
     """World coordinates to those of a camera or a rig: x = R X + t."""
 
-    R: NDArray[np.float64]
-    t: NDArray[np.float64]
+    R: Floats
+    t: Floats
 
     def __matmul__(self, other: _Rigid) -> _Rigid:
         return _Rigid(self.R @ other.R, self.R @ other.t + self.t)
 
     @property
-    def center(self) -> NDArray[np.float64]:
+    def center(self) -> Floats:
         """Origin of the camera in world coordinates (3,)."""
         return -self.R.T @ self.t
 
@@ -885,7 +885,7 @@ def _render_colmap(block: OrientationBlock, path: Path) -> dict[Path, str]:
         "#   POINTS2D[] as (X, Y, POINT3D_ID)",
     ]
     for k, (image, R) in enumerate(zip(block.table.images, block.table.rotations), 1):
-        R_camera_world: NDArray[np.float64] = FLIP @ R.T
+        R_camera_world: Floats = FLIP @ R.T
         q = np.roll(Rotation.from_matrix(R_camera_world).as_quat(), 1)
         t = -R_camera_world @ np.array(image.center)
         values = " ".join(repr(v) for v in (*q.tolist(), *t.tolist()))

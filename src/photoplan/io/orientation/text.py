@@ -39,9 +39,10 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.local import enu_poses, is_local_crs, is_wgs84_geographic, legacy_wkt
@@ -101,7 +102,7 @@ def one_word(name: str, path: Path) -> str:
     return name
 
 
-def checked_rotation(values: ArrayLike, where: str, tolerance: float = ORTHOGONAL) -> NDArray[np.float64]:
+def checked_rotation(values: ArrayLike, where: str, tolerance: float = ORTHOGONAL) -> Floats:
     """Return the rotation (3, 3) nearest to nine rounded numbers, row by row.
 
     `tolerance` is that of the matrix times itself.

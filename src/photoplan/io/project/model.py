@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Discriminator, Field, PrivateAttr, Strict, Tag, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
+from photoplan.arrays import Floats
 from photoplan.cameras.fiducials import Affine2D, FiducialFit
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Lens
@@ -37,7 +38,7 @@ from photoplan.io.camera.model import (
 )
 from photoplan.io.files import check_input_name, resolve_input, unique_stems
 
-Deviation = tuple[str, NDArray[np.float64]]
+Deviation = tuple[str, Floats]
 """An error's name, and what it changes of the numbers that state a geometry."""
 
 InputName = Annotated[str, Field(max_length=4000)]
@@ -90,9 +91,7 @@ class ImageEntry(Entry, ABC):
         """Independent errors of its geometry, each one standard deviation large."""
         raise InputError(f"image {self.name!r}: its kind of geometry states no accuracy that a raster could be made of")
 
-    def moved(
-        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
-    ) -> tuple[ImageEntry, Mapping[str, CameraEntry]]:
+    def moved(self, change: Floats, cameras: Mapping[str, CameraEntry]) -> tuple[ImageEntry, Mapping[str, CameraEntry]]:
         """It and the cameras with its geometry changed by a part of one of its `deviations`."""
         raise NotImplementedError
 
@@ -175,9 +174,7 @@ class LineImage(ImageEntry):
             )
         return tuple(("trajectory", row) for row in np.eye(6))
 
-    def moved(
-        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
-    ) -> tuple[LineImage, Mapping[str, CameraEntry]]:
+    def moved(self, change: Floats, cameras: Mapping[str, CameraEntry]) -> tuple[LineImage, Mapping[str, CameraEntry]]:
         """See `ImageEntry.moved`; on a flight without tremor, which makes no difference to errors."""
         image = self.model_copy()
         image._change = tuple(change.tolist())
@@ -250,10 +247,7 @@ class RpcImage(ImageEntry):
         if self.covariance is not None:
             known = f"± {self.covariance[0] ** 0.5:.2g}, {self.covariance[2] ** 0.5:.2g} px"
         x, y = self.shift
-        return (
-            *scaled,
-            f"polynomials are corrected by {x:+.2f}, {y:+.2f} px ({known})",
-        )
+        return (*scaled, f"polynomials are corrected by {x:+.2f}, {y:+.2f} px ({known})")
 
     def deviations(self, cameras: Mapping[str, CameraEntry], rotation: str) -> tuple[Deviation, ...]:
         """See `ImageEntry.deviations`: of shift and drift."""
@@ -277,9 +271,7 @@ class RpcImage(ImageEntry):
             raise InputError(f"image {self.name!r}: covariance is none; `photoplan adjust` writes it")
         return tuple(("polynomials", a * scale * np.sqrt(max(v, 0.0))) for v, a in zip(values, axes.T))
 
-    def moved(
-        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
-    ) -> tuple[RpcImage, Mapping[str, CameraEntry]]:
+    def moved(self, change: Floats, cameras: Mapping[str, CameraEntry]) -> tuple[RpcImage, Mapping[str, CameraEntry]]:
         """See `ImageEntry.moved`."""
         x, y, *rest = (
             change + np.array([*(self.shift or (0.0, 0.0)), *(self.drift or (0.0,) * 4)])[: len(change)]
@@ -396,7 +388,7 @@ class Image(ImageEntry):
             for k, value, axis in zip(largest.tolist(), values, axes.T)
         )
 
-    def _correlations(self, of_camera: int) -> tuple[NDArray[np.float64], int]:
+    def _correlations(self, of_camera: int) -> tuple[Floats, int]:
         """Correlation matrix of centre, angles and so many parameters of the camera; how many first ones it states."""
         size, given = 6 + of_camera, np.array(self.correlation or (), float)
         joined = {0: 0, 15: 6, size * (size - 1) // 2: size}.get(len(given))
@@ -409,9 +401,7 @@ class Image(ImageEntry):
         R[:joined, :joined][np.tril_indices(joined, -1)] = given
         return np.tril(R) + np.tril(R, -1).T, joined
 
-    def moved(
-        self, change: NDArray[np.float64], cameras: Mapping[str, CameraEntry]
-    ) -> tuple[Image, Mapping[str, CameraEntry]]:
+    def moved(self, change: Floats, cameras: Mapping[str, CameraEntry]) -> tuple[Image, Mapping[str, CameraEntry]]:
         """See `ImageEntry.moved`."""
         camera = cameras[self.camera]
         center, angles = (np.array(part) for part in self.pose_numbers)

@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats
 from photoplan.errors import GeometryError, HeightSystemError, InputError, UsageError
 from photoplan.geometry.bounds import area_fault, area_note, beyond_area
 from photoplan.geometry.crs import crs_label, require_projected_metres, same_crs, split_compound
@@ -227,12 +227,12 @@ def _judged_area(path: Path, part: MeasuredTerrain, crs: str) -> tuple[str, ...]
     return () if note is None else (f"{path.name}: {note}",)
 
 
-def _coordinates(points: Sequence[PointGroup], lines: Sequence[MeasuredLine]) -> list[NDArray[np.float64]]:
+def _coordinates(points: Sequence[PointGroup], lines: Sequence[MeasuredLine]) -> list[Floats]:
     """X, Y, Z of each group and line that has some."""
     return [xyz for xyz in (*(p.xyz for p in points), *(line.xyz for line in lines)) if len(xyz)]
 
 
-def _scaled(group: PointGroup, factors: NDArray[np.float64]) -> PointGroup:
+def _scaled(group: PointGroup, factors: Floats) -> PointGroup:
     return group if (factors == 1.0).all() else replace(group, xyz=group.xyz * factors)
 
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Ints
 from photoplan.codec import NotData, decode, encode, storable
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
@@ -192,10 +192,10 @@ def _check_header(path: Path) -> _Header:
     return _Header(int(count), int(record), packed)
 
 
-def _points(path: Path, file: Any, options: ReadOptions) -> tuple[NDArray[np.float64], NDArray[np.int64], list[str]]:
+def _points(path: Path, file: Any, options: ReadOptions) -> tuple[Floats, Ints, list[str]]:
     """Coordinates and numbers of the wanted points, and notes."""
     wanted = options.las_classes
-    kept: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+    kept: list[tuple[Floats, Ints]] = []
     counts: Counter[int] = Counter()
     withheld, done, classified = 0, 0, wanted is not None
     for chunk in file.chunk_iterator(CHUNK):

@@ -20,6 +20,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.io.files import fingerprint, open_database, plain_tables
 from photoplan.plain import json_text
@@ -408,7 +409,7 @@ class ModelReader:
     """Bytes of units that are kept."""
     header: ModelHeader = field(init=False, repr=False)
     """What the model is."""
-    ranges: NDArray[np.float64] = field(init=False, repr=False)
+    ranges: Floats = field(init=False, repr=False)
     """Lowest and highest height of every unit, shape (rows, columns, 2); NaN for empty units."""
     finest: float = field(init=False)
     """Smallest grid width, metres."""
@@ -545,7 +546,7 @@ class ModelReader:
         check_unit(unit, where)
         return unit, buffer.nbytes
 
-    def _read_ranges(self, layout: UnitLayout) -> tuple[NDArray[np.float64], int]:
+    def _read_ranges(self, layout: UnitLayout) -> tuple[Floats, int]:
         """Heights of the units, and meshes along a side of the finest."""
         missing = {HEADER, UNITS, LINES, "units"} - self._tables()
         if missing:

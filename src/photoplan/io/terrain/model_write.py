@@ -27,6 +27,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from photoplan import __version__
+from photoplan.arrays import Floats, Floats32, Ints, Mask
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import parse_crs
@@ -108,7 +109,7 @@ def _write_lines(
     path: Path,
     layer: str,
     lines: Sequence[LineElement],
-    vertices: Sequence[NDArray[np.float64]],
+    vertices: Sequence[Floats],
     kinds: dict[str, Callable[[LineElement], Any]],
     crs: str,
 ) -> None:
@@ -121,7 +122,7 @@ def _write_lines(
     _write(path, layer, shapes, columns, crs, "LineString Z")
 
 
-def _of(function: Callable[[Any], Any], values: NDArray[np.float64]) -> float:
+def _of(function: Callable[[Any], Any], values: Floats) -> float:
     return float(function(values)) if np.isfinite(values).any() else np.nan
 
 
@@ -215,7 +216,7 @@ def _finish_heights(path: Path) -> None:
 
 def base_posts(
     layout: UnitLayout, meshes: int, unit: Callable[[int, int], Unit | None], area: Window
-) -> NDArray[np.float32] | None:
+) -> Floats32 | None:
     """Heights of a window of the raster, NaN where there is none; None: all are."""
     out = np.full((area.height, area.width), np.nan, np.float32)
     right, bottom = area.stop
@@ -236,7 +237,7 @@ def base_posts(
     return out if found else None
 
 
-def _resampled(unit: Unit, meshes: int) -> NDArray[np.float32]:
+def _resampled(unit: Unit, meshes: int) -> Floats32:
     values = unit.heights
     if unit.meshes != meshes:
         step = unit.meshes / meshes
@@ -501,11 +502,11 @@ _SAME_HEIGHT = 5e-4
 class MeshPart:
     """What one unit adds to the triangulation."""
 
-    vertices: NDArray[np.float64]
+    vertices: Floats
     """New vertices, X, Y, Z, shape (k, 3), metres; their numbers follow those of the parts before."""
-    faces: NDArray[np.int64]
+    faces: Ints
     """Vertex numbers, from 0 over all parts, of each triangle of the surface, counter-clockwise, shape (f, 3)."""
-    walls: NDArray[np.int64]
+    walls: Ints
     """The same of vertical triangles at two-sided breaklines, shape (w, 3)."""
 
 
@@ -526,7 +527,7 @@ def mesh_parts(source: UnitSource) -> Iterator[MeshPart]:
         numbers.next_row()
 
 
-def unit_mesh(unit: Unit) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+def unit_mesh(unit: Unit) -> tuple[Floats, Ints, Ints]:
     """Vertices (k, 3), triangles (f, 3) and vertical triangles of walls (w, 3) of a unit; vertex numbers from 0."""
     n = unit.meshes
     post = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
@@ -553,7 +554,7 @@ def unit_mesh(unit: Unit) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArr
     return vertices, faces, _walls(vertices, faces) if unit.faces is not None else np.empty((0, 3), np.int64)
 
 
-def _joined(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
+def _joined(vertices: Floats) -> Ints:
     """For each vertex the first that lies at its place."""
     there = np.flatnonzero(np.isfinite(vertices[:, 2]))
     scaled = vertices[there] / [_SAME, _SAME, _SAME_HEIGHT]
@@ -567,7 +568,7 @@ def _joined(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
     return first
 
 
-def _walls(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _walls(vertices: Floats, faces: Ints) -> Ints:
     """Vertical triangles between edges that lie above each other and belong to one triangle each."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
@@ -590,7 +591,7 @@ def _walls(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[n
     return np.array(walls, np.int64).reshape(-1, 3)
 
 
-def _on_edge(vertices: NDArray[np.float64], unit: Unit) -> NDArray[np.bool_]:
+def _on_edge(vertices: Floats, unit: Unit) -> Mask:
     """Whether vertices lie on the border of their unit."""
     x, y = vertices[:, 0] - unit.left, unit.top - vertices[:, 1]
     inside = (x > _SAME) & (x < unit.side - _SAME) & (y > _SAME) & (y < unit.side - _SAME)
@@ -609,9 +610,7 @@ class _SharedNumbers:
         """Forget vertices that no later unit can share."""
         self._above, self._here = self._here, {}
 
-    def take(
-        self, vertices: NDArray[np.float64], shared: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def take(self, vertices: Floats, shared: Mask) -> tuple[Ints, Mask]:
         """Number of each vertex, and which are new."""
         known = np.full(len(vertices), -1, np.int64)
         cells = np.floor(vertices[:, :2] / (4 * _SAME) + 0.5)
@@ -629,7 +628,7 @@ class _SharedNumbers:
             self._here.setdefault(place, []).append((x, y, z, int(known[i])))
         return known, new
 
-    def _find(self, cell: NDArray[np.float64], near: NDArray[np.int64], xyz: list[float]) -> int:
+    def _find(self, cell: Floats, near: Ints, xyz: list[float]) -> int:
         column, row = int(cell[0]), int(cell[1])
         for c in {column, column + int(near[0])}:
             for r in {row, row + int(near[1])}:
@@ -786,7 +785,7 @@ def _two_files(stack: ExitStack, path: Path) -> tuple[IO[bytes], IO[bytes]]:
     return stack.enter_context(path.open("w+b")), stack.enter_context(faces.open("w+b"))
 
 
-def _text(form: str, rows: NDArray[np.float64] | NDArray[np.int64]) -> bytes:
+def _text(form: str, rows: Floats | Ints) -> bytes:
     return (form * len(rows) % tuple(rows.ravel().tolist())).encode()
 
 
@@ -822,7 +821,7 @@ def write_points(
     return ExportFigures(posts, line_points=points)
 
 
-def _posts(source: UnitSource) -> Iterator[NDArray[np.float64]]:
+def _posts(source: UnitSource) -> Iterator[Floats]:
     """X, Y, Z, sigma of the posts of each unit, shape (k, 4); a post that the unit before has is left out."""
     layout = source.layout
     above: dict[int, Unit] = {}
@@ -849,14 +848,14 @@ def _posts(source: UnitSource) -> Iterator[NDArray[np.float64]]:
         above = here
 
 
-def _shared(edge: NDArray[np.float32], meshes: int) -> NDArray[np.bool_]:
+def _shared(edge: Floats32, meshes: int) -> Mask:
     """Which of the posts along an edge the other unit has, whose posts along it are given."""
     at = np.arange(meshes + 1) * (len(edge) - 1) / meshes
     nearest = np.rint(at).astype(int)
     return np.asarray((np.abs(at - nearest) < 1e-9) & np.isfinite(edge[nearest]))
 
 
-def _rows(unit: Unit, which: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _rows(unit: Unit, which: Mask) -> Floats:
     along = np.arange(unit.meshes + 1) * unit.width
     X, Y = np.meshgrid(unit.left + along, unit.top - along)
     heights = unit.heights.astype(float) + unit.datum

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photoplan.arrays import Floats32, Ints
 from photoplan.codec import storable
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.units import metres_in
@@ -211,7 +211,7 @@ class KnownRanges:
         except (OSError, RuntimeError):  # no home
             return None
 
-    def load(self, layout: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def load(self, layout: tuple[int, ...]) -> tuple[Ints, Floats32]:
         """Numbers of parts (n,), and the lowest and highest heights of their cells (n, 2, rows, columns)."""
         key = hashlib.sha256(f"{self.state} {layout}".encode()).digest()
         record, head = _record(layout), _MAGIC + key
@@ -234,7 +234,7 @@ class KnownRanges:
             self._key.clear()
         return kept["part"].astype(np.int64), kept["cells"].astype(np.float32)
 
-    def keep(self, layout: tuple[int, ...], part: int, cells: NDArray[np.float32]) -> None:
+    def keep(self, layout: tuple[int, ...], part: int, cells: Floats32) -> None:
         """Keep what was found of a part, shape (2, rows, columns); where it cannot be written it is not kept."""
         if not self._key:
             return

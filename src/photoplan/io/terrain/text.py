@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.errors import InputError
 from photoplan.io.files import crs_beside, whole_number
 from photoplan.io.tables import (
@@ -170,7 +171,7 @@ def _fast(layout: TableLayout, lines: list[str], decimal_comma: bool) -> _Block 
 
 
 def _slow(
-    path: Path, layout: TableLayout, lines: list[str], records: NDArray[np.int64], look_up: LookUp, decimal_comma: bool
+    path: Path, layout: TableLayout, lines: list[str], records: Ints, look_up: LookUp, decimal_comma: bool
 ) -> _Block:
     """Read columns line by line, and name the line and the column that cannot be read."""
     rows: dict[str, list[Any]] = {role: [] for role in layout.roles}
@@ -309,12 +310,12 @@ def _terrain(
 def _make_lines(
     path: Path,
     columns: PointColumns,
-    on_line: NDArray[np.bool_],
+    on_line: Mask,
     ids: NDArray[np.int32] | None,
-    right: NDArray[np.float64] | None,
+    right: Floats | None,
     texts: tuple[list[str], list[str]],
     classes: list[CodeClass],
-) -> tuple[list[MeasuredLine], NDArray[np.int64]]:
+) -> tuple[list[MeasuredLine], Ints]:
     """Lines, and the rows of those that would have one vertex; `texts` are codes and line ids by their numbers."""
     codes, id_texts = texts
     rows = np.flatnonzero(on_line)
@@ -347,16 +348,14 @@ def _make_lines(
     return lines, np.array(alone, np.int64)
 
 
-def _right_heights(
-    right: NDArray[np.float64] | None, xyz: NDArray[np.float64], part: NDArray[np.int64], kind: str
-) -> NDArray[np.float64] | None:
+def _right_heights(right: Floats | None, xyz: Floats, part: Ints, kind: str) -> Floats | None:
     """Heights right of a line; records without one have one height. None: no record has one."""
     if right is None or kind != "breakline" or np.isnan(right[part]).all():
         return None
     return np.where(np.isnan(right[part]), xyz[part, 2], right[part])
 
 
-def _line_sigma(sigma: NDArray[np.float64] | None, part: NDArray[np.int64], default: float | None) -> float | None:
+def _line_sigma(sigma: Floats | None, part: Ints, default: float | None) -> float | None:
     """One standard deviation for a line: the root mean square of its records'."""
     if sigma is None or np.isnan(sigma[part]).all():
         return default
@@ -388,7 +387,7 @@ class PointPart:
 
     rows: list[tuple[str, ...]]
     """Their fields, as the file has them."""
-    xy: NDArray[np.float64]
+    xy: Floats
     """X, Y, shape (n, 2)."""
 
 

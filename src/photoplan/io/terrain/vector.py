@@ -24,6 +24,7 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import iterparse
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
 from photoplan.geometry.units import FOOT, metres_in, unit_label
@@ -61,11 +62,11 @@ class CodeIndex:
 class PointColumns:
     """Points of one file as columns."""
 
-    xyz: NDArray[np.float64]
-    records: NDArray[np.int64]
+    xyz: Floats
+    records: Ints
     codes: NDArray[np.int32] | None = None
     """Number of each point's code."""
-    sigma: NDArray[np.float64] | None = None
+    sigma: Floats | None = None
     """Standard deviation of each point; NaN: that of its code or class."""
     names: NDArray[Any] | None = None
 
@@ -170,10 +171,10 @@ class _Layer:
 
     name: str
     geometry: NDArray[Any]
-    feature: NDArray[np.int64]
+    feature: Ints
     """Number of the feature of each geometry, from 1."""
     codes: list[str]
-    sigma: NDArray[np.float64] | None
+    sigma: Floats | None
     names: NDArray[Any] | None
     fields: tuple[str, ...]
     """What the attributes are called."""
@@ -315,7 +316,7 @@ def _raised(
     layer: str,
     wanted: str,
     parts: NDArray[Any],
-    row: NDArray[np.int64],
+    row: Ints,
     fields: Mapping[str, NDArray[Any]],
     notes: list[str],
 ) -> NDArray[Any]:
@@ -344,9 +345,7 @@ def _raised(
     return out
 
 
-def _drawn(
-    path: Path, geometry: NDArray[Any], fields: dict[str, Any], options: ReadOptions, notes: list[str]
-) -> NDArray[np.bool_]:
+def _drawn(path: Path, geometry: NDArray[Any], fields: dict[str, Any], options: ReadOptions, notes: list[str]) -> Mask:
     """Which entities of a drawing are measured points and lines: no faces and hatches, and no texts but those of
     numbers that `height_field` takes for heights."""
     spot = (options.height_field or "").casefold() == "text"
@@ -385,7 +384,7 @@ def _text(value: Any) -> str:
     )
 
 
-def _sigma(path: Path, values: NDArray[Any]) -> NDArray[np.float64]:
+def _sigma(path: Path, values: NDArray[Any]) -> Floats:
     try:
         sigma = np.array([np.nan if v is None or v == "" else v for v in values], np.float64)
     except (TypeError, ValueError):
@@ -405,7 +404,7 @@ def _features(
     classes = [(_known(path, layer, code, options) if code else None) or of_layer for code in codes.texts]
     kind = shapely.get_type_id(layer.geometry)
     lines: list[MeasuredLine] = []
-    stray: list[tuple[int, NDArray[np.float64]]] = []
+    stray: list[tuple[int, Floats]] = []
     left_out: Counter[str] = Counter()
     for at in np.flatnonzero(kind != _POINT).tolist():
         cls = classes[number[at]] or CodeClass("border" if kind[at] == _POLYGON else "breakline")
@@ -459,7 +458,7 @@ def _no_height(path: Path, layer: _Layer, at: int, count: int) -> str:
     )
 
 
-def _heights(path: Path, layer: _Layer, at: int, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+def _heights(path: Path, layer: _Layer, at: int, xyz: Floats) -> Floats:
     if np.isnan(xyz[:, 2]).any():
         raise InputError(_no_height(path, layer, at, 1))
     return xyz
@@ -487,7 +486,7 @@ def _lines(path: Path, layer: _Layer, at: int, cls: CodeClass) -> list[MeasuredL
     return lines
 
 
-def _right(path: Path, layer: _Layer, at: int, count: int) -> NDArray[np.float64] | None:
+def _right(path: Path, layer: _Layer, at: int, count: int) -> Floats | None:
     """Heights right of a line from the attribute z_right."""
     value = None if layer.right is None else layer.right[at]
     if value is None or (isinstance(value, str) and not value.strip()):
@@ -535,10 +534,10 @@ class _LandXmlSurface:
     """What was read of one surface."""
 
     name: str
-    points: list[tuple[str, NDArray[np.float64]]] = field(default_factory=list)
+    points: list[tuple[str, Floats]] = field(default_factory=list)
     lines: list[MeasuredLine] = field(default_factory=list)
     numbers: dict[int, int] = field(default_factory=dict)
-    vertices: list[NDArray[np.float64]] = field(default_factory=list)
+    vertices: list[Floats] = field(default_factory=list)
     faces: list[tuple[int, ...]] = field(default_factory=list)
     ignored: int = 0
 
@@ -797,7 +796,7 @@ class _Reader:
 
     def _groups(self, surface: _LandXmlSurface) -> list[PointGroup]:
         groups, count = [], 0
-        by_code: dict[str, list[NDArray[np.float64]]] = {}
+        by_code: dict[str, list[Floats]] = {}
         for code, xyz in surface.points:
             by_code.setdefault(code, []).append(xyz)
         for code, parts in by_code.items():
@@ -829,7 +828,7 @@ def _tag(element: Element) -> str:
     return str(element.tag).rpartition("}")[2]
 
 
-def _floats(text: str, where: str) -> NDArray[np.float64]:
+def _floats(text: str, where: str) -> Floats:
     words = text.split()
     try:
         values = np.array(words, np.float64)
@@ -849,7 +848,7 @@ def _is_float(word: str) -> bool:
     return True
 
 
-def _numbers(element: Element, width: int, where: str) -> NDArray[np.float64]:
+def _numbers(element: Element, width: int, where: str) -> Floats:
     values = _floats(element.text or "", where)
     if not len(values) or len(values) % width:
         raise InputError(f"{where}: {len(values)} numbers; {width} for each point are needed")

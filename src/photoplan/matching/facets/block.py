@@ -23,6 +23,7 @@ from scipy import ndimage
 from scipy.ndimage import maximum_filter
 from scipy.optimize import nnls
 
+from photoplan.arrays import Floats, Floats32, Mask
 from photoplan.cameras.base import project, tremor_of
 from photoplan.events import tell
 from photoplan.geometry.grid import Window
@@ -69,9 +70,6 @@ from photoplan.matching.facets.observe import (
     smoothed,
 )
 
-_Floats = NDArray[np.float32]
-_Doubles = NDArray[np.float64]
-
 #: Facets over which squared slopes are averaged, twice: all that are seen, and those of noise, which change slowly.
 _SEEN, _DRAWN = 3, 9
 #: Least part that is taken to be texture: sums over so few facets tell no less from none.
@@ -93,21 +91,21 @@ class GreyTexture:
     yet, or never, looks like noise.
     """
 
-    errors: _Floats
+    errors: Floats32
     """Errors of the coefficients: one standard deviation each, with their covariance."""
-    density: _Floats
+    density: Floats32
     """Weights that lay on each coefficient then."""
-    shares: _Doubles
+    shares: Floats
     """Part of the squared sensitivities in each facet that is texture, 0 to 1, shape (rows − 1, columns − 1)."""
 
     @classmethod
     def of(
         cls,
         sights: Sequence[Sight],
-        weights: Sequence[_Floats],
+        weights: Sequence[Floats32],
         ground: GreyFacets,
-        errors: _Floats,
-        density: _Floats,
+        errors: Floats32,
+        density: Floats32,
     ) -> GreyTexture:
         """From the surface and errors of its coefficients: see `FacetBlock`."""
         found = np.zeros((2, *ground.means.shape[:2]))
@@ -117,13 +115,13 @@ class GreyTexture:
         return cls(errors, density, np.clip(1 - noise / np.maximum(seen, 1e-300), 0.0, 1.0))
 
     @property
-    def at_posts(self) -> _Doubles:
+    def at_posts(self) -> Floats:
         """The same around each post, at least _LEAST, shape (rows, columns)."""
         around = np.pad(self.shares, 1, mode="edge")
         mean = (around[:-1, :-1] + around[:-1, 1:] + around[1:, :-1] + around[1:, 1:]) / 4
         return np.asarray(np.maximum(mean, _LEAST_TEXTURE))
 
-    def common(self, values: _Floats, ratio: int, counted: NDArray[np.uint8]) -> float:
+    def common(self, values: Floats32, ratio: int, counted: NDArray[np.uint8]) -> float:
         """Part of the variance of grey values at the posts that two images see that is not noise."""
         at = np.argwhere(counted > 1)[:, ::-1].astype(float)
         if not len(at):
@@ -135,7 +133,7 @@ class GreyTexture:
 
 
 @cache
-def shares() -> NDArray[np.float64]:
+def shares() -> Floats:
     """Return shares of the coefficients next to a place, see `add_missed`: those with which waves have, by least
     squares, the size that cubic facets give them, and nothing else.
 
@@ -191,45 +189,45 @@ class FacetBlock:
     facets: Facets
     sights: list[Sight]
     transfers: list[Transfer]
-    heights: _Doubles
+    heights: Floats
     """At the posts, shape (rows, columns), metres."""
     roughness: Roughness
-    sigmas: _Doubles
+    sigmas: Floats
     """Standard deviation of the grey values of each view, in the system of the surface."""
     scale: float = 1.0
     """See `parallax`."""
-    limits: tuple[_Doubles | float, _Doubles | float] = (-np.inf, np.inf)
+    limits: tuple[Floats | float, Floats | float] = (-np.inf, np.inf)
     """Heights between which the surface stays, metres, of all or shape (rows, columns)."""
     reach: float = 0.0
     """How far the start of the heights may be wrong, metres."""
     coarse: bool = False
     """Whether grey facets are coarser than pixels or hardly finer, so that what they do not hold is told of these."""
-    trusted: NDArray[np.bool_] | None = None
+    trusted: Mask | None = None
     """Posts around which pixels tell their noise, and heights how rough they are; None: all."""
     views: list[View] = field(default_factory=list)
     """Whose sights they are."""
-    values: _Floats = field(default_factory=lambda: np.empty((0, 0), np.float32))
+    values: Floats32 = field(default_factory=lambda: np.empty((0, 0), np.float32))
     """Coefficients of the grey facets."""
     moves: list[float] = field(default_factory=list)
     """Mean correction of every iteration so far, pixels of the parallax between the outermost views."""
-    system: _Doubles = field(default_factory=lambda: np.empty((0, 0, 0)))
+    system: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
     """Normal equations of the heights, of the pixels alone."""
-    noise: _Doubles = field(default_factory=lambda: np.empty((0, 0)))
+    noise: Floats = field(default_factory=lambda: np.empty((0, 0)))
     """Right-hand side of the heights of independent errors of the pixels."""
     counted: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 0), np.uint8))
     """Views that have pixels around each post."""
-    sums: _Doubles = field(default_factory=lambda: np.zeros((0, 2)))
+    sums: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """Of each view: Σ of robust factors times squared residuals in its own grey values; redundancy."""
-    ways: _Doubles = field(default_factory=lambda: np.empty((0, 0, 2)))
+    ways: Floats = field(default_factory=lambda: np.empty((0, 0, 2)))
     """Mean change of the pixels' places with height in each facet, posts per metre, (rows − 1, columns − 1, 2)."""
-    residuals: list[_Floats] = field(default_factory=list)
+    residuals: list[Floats32] = field(default_factory=list)
     """Of every view's pixels, the surface's grey value less theirs in its system, shape (h, w); NaN: not used."""
-    density: _Floats = field(default_factory=lambda: _NONE)
+    density: Floats32 = field(default_factory=lambda: _NONE)
     """Weights that lie on each coefficient."""
     texture: GreyTexture | None = None
     """None: not told from noise, which is as if all were texture."""
-    _factors: list[_Floats] = field(default_factory=list)
-    _pull: tuple[_Doubles, _Doubles] = (np.empty((0, 0)), np.empty((0, 0)))
+    _factors: list[Floats32] = field(default_factory=list)
+    _pull: tuple[Floats, Floats] = (np.empty((0, 0)), np.empty((0, 0)))
     """Heights where the last equations were set up, and their right-hand side, of the pixels alone."""
 
     def adjust(self, most: int, radiometry: bool, texture: bool = False) -> None:
@@ -273,11 +271,11 @@ class FacetBlock:
         self.heights = np.clip(before + np.clip(change, -_FARTHEST / self.scale, _FARTHEST / self.scale), *self.limits)
 
     @property
-    def astray(self) -> NDArray[np.bool_]:
+    def astray(self) -> Mask:
         """Posts that have come to the end of their limits: what is there is no height, shape (rows, columns)."""
         return np.asarray((self.heights <= self.limits[0]) | (self.heights >= self.limits[1]))
 
-    def misfit(self, heights: _Doubles) -> float:
+    def misfit(self, heights: Floats) -> float:
         """Variance of the grey values about a surface of these heights over their own; infinite if few pixels tell."""
         relief = Relief.of(heights)
         trial = replace(self, heights=heights, sights=[s.onto(relief) for s in self.sights], values=_NONE, _factors=[])
@@ -294,7 +292,7 @@ class FacetBlock:
         surface = np.concatenate([trial.surface_at(s, w)[w > 0] for s, w in zip(trial.sights, weights)])
         return float(np.sum((values - surface) ** 2) / free / max(float(values.var()), 1e-12))
 
-    def variances(self) -> _Doubles:
+    def variances(self) -> Floats:
         """Of the heights, shape (rows, columns): of the pixels' noise, and of what smoothing takes away."""
         found = np.empty((2, *self.facets.shape))
         for out, stiffer in zip(found, (1.0, _STIFFER)):
@@ -320,20 +318,20 @@ class FacetBlock:
         return Smoother(lambda rights: self._solved(*rights), self.noise, inside, self._signs)
 
     @cached_property
-    def _signs(self) -> _Doubles:
+    def _signs(self) -> Floats:
         """Signs for every curvature: of a place always the same, so that neighbouring blocks learn the same."""
         left, top = np.rint(np.array([self.facets.left, -self.facets.top]) / self.facets.pitch).astype(int).tolist()
         out = np.empty((3, *self.facets.shape))
         rademacher(left, top, out)
         return out
 
-    def _equations(self, stiffer: float = 1.0) -> _Doubles:
+    def _equations(self, stiffer: float = 1.0) -> Floats:
         """Normal equations of pixels and curvatures."""
         out = self.system.copy()
         add_curvatures(stiffer * self.roughness.weights, out)
         return out
 
-    def _solved(self, *rights: _Doubles) -> _Doubles:
+    def _solved(self, *rights: Floats) -> Floats:
         """Solutions of the normal equations for right-hand sides, shape (k, rows, columns)."""
         out, system = np.zeros((len(rights), *self.facets.shape), np.float32), self._equations()
         for right, x in zip(rights, out):
@@ -356,13 +354,13 @@ class FacetBlock:
         apart = (highest - lowest)[count > 1]
         return max(float(np.median(np.hypot(*apart.T))) * self.facets.ratio if len(apart) else 0.0, 1e-9)
 
-    def grey_values(self, uv: _Doubles) -> _Floats:
+    def grey_values(self, uv: Floats) -> Floats32:
         """Grey values of the surface at places (n, 2) of the posts inside the block."""
         out = np.empty(len(uv), np.float32)
         sample_grey(self.values, self.facets.ratio, uv, out)
         return out
 
-    def observed(self) -> tuple[list[_Floats], list[_Floats]]:
+    def observed(self) -> tuple[list[Floats32], list[Floats32]]:
         """Grey values of all views' pixels in the system of the surface, and their weights."""
         grey = [transfer.apply(sight, self.facets) for sight, transfer in zip(self.sights, self.transfers)]
         if not self._factors:
@@ -376,7 +374,7 @@ class FacetBlock:
                 add_spline_residual(self.values, self.facets.ratio, sight.places, w, shares(), g)
         return grey, weights
 
-    def _start(self, grey: Sequence[_Floats], weights: Sequence[_Floats]) -> None:
+    def _start(self, grey: Sequence[Floats32], weights: Sequence[Floats32]) -> None:
         """Coefficients that are the mean grey value."""
         total = sum(float(w.sum()) for w in weights) or 1.0
         mean = sum(float(np.nansum(g * w)) for g, w in zip(grey, weights)) / total
@@ -384,8 +382,8 @@ class FacetBlock:
         self.values = np.full(shape, mean, np.float32)
 
     def _solve_grey(
-        self, grey: Sequence[_Floats], weights: Sequence[_Floats], drawn: bool = False
-    ) -> tuple[_Floats, _Floats | None]:
+        self, grey: Sequence[Floats32], weights: Sequence[Floats32], drawn: bool = False
+    ) -> tuple[Floats32, Floats32 | None]:
         """The grey values of the surface; returns the weights that lie on each, and perhaps errors of theirs."""
         shape, ratio, errors = self.values.shape, self.facets.ratio, None
         counts = np.zeros((shape[0] - 2 * PAD, shape[1] - 2 * PAD), np.int32)
@@ -411,13 +409,13 @@ class FacetBlock:
             errors = _solved_exactly(system, right, density, np.zeros(shape, np.float32), *_FULLY)
         return density, errors
 
-    def surface_at(self, sight: Sight, weights: _Floats) -> _Floats:
+    def surface_at(self, sight: Sight, weights: Floats32) -> Floats32:
         """Grey values of the surface where a view's pixels lie; 0 where none is used."""
         out = np.empty(sight.raw.shape, np.float32)
         sample_pixels(self.values, self.facets.ratio, sight.places, weights, out)
         return out
 
-    def _improve_radiometry(self, weights: Sequence[_Floats]) -> None:
+    def _improve_radiometry(self, weights: Sequence[Floats32]) -> None:
         contrast = max(float(self.values.std()), 1e-6)
         new = [
             transfer.improved(sight, self.facets, w, self.surface_at(sight, w), contrast) if (w > 0).any() else transfer
@@ -425,7 +423,7 @@ class FacetBlock:
         ]
         self.transfers = levelled(new)
 
-    def _heights(self, grey: Sequence[_Floats], weights: Sequence[_Floats], errors: _Floats | None) -> _Doubles:
+    def _heights(self, grey: Sequence[Floats32], weights: Sequence[Floats32], errors: Floats32 | None) -> Floats:
         """Normal equations of the heights (kept) and their right-hand side; new standard deviations and factors."""
         rows, columns = self.facets.shape
         sums, counted = np.zeros((rows - 1, columns - 1, 3)), np.zeros((rows, columns), np.uint8)
@@ -451,7 +449,7 @@ class FacetBlock:
         self._weigh(found, int((self.density > 0).sum()) * float(found[:, 2].sum()) / max(used, 1.0))
         return right
 
-    def _weigh(self, found: _Doubles, unknowns: float) -> None:
+    def _weigh(self, found: Floats, unknowns: float) -> None:
         """Standard deviations of the views' grey values, by variance components (Förstner 1979)."""
         used = found[:, 0] > 0
         share = np.where(used, found[:, 0], 0.0) / self.sigmas**2
@@ -467,8 +465,8 @@ class FacetBlock:
 
 
 def _solved_exactly(
-    system: _Floats, right: _Floats, density: _Floats, values: _Floats, rounds: int, enough: float
-) -> _Floats:
+    system: Floats32, right: Floats32, density: Floats32, values: Floats32, rounds: int, enough: float
+) -> Floats32:
     """Coefficients of grey facets from their normal equations and the weights on each of them, beginning with `values`:
     as exact as a part of their own standard deviations. Those that hardly any pixel knows stay near what they were."""
     usual = np.float32(density[density > 0].mean() if (density > 0).any() else 1.0)
@@ -487,7 +485,7 @@ _LEAST = 0.1
 _FITS, _SURROUNDINGS = 1.3, 9
 
 
-def grey_places(block: FacetBlock, window: Window, margin: int) -> _Doubles:
+def grey_places(block: FacetBlock, window: Window, margin: int) -> Floats:
     """Places of the grey values of a window, which begins `margin` posts inside a block, in columns and rows of its
     posts; shape (m · rows, m · columns, 2)."""
     m = block.facets.ratio
@@ -496,7 +494,7 @@ def grey_places(block: FacetBlock, window: Window, margin: int) -> _Doubles:
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
-def grey_sigmas(block: FacetBlock, at: _Doubles, height_variances: _Doubles) -> _Floats:
+def grey_sigmas(block: FacetBlock, at: Floats, height_variances: Floats) -> Floats32:
     """Standard deviations of grey values at places (n, m, 2) of a grid.
 
     Errors of the pixels are drawn and carried through the normal equations: what comes out has the covariance of the
@@ -522,7 +520,7 @@ def grey_sigmas(block: FacetBlock, at: _Doubles, height_variances: _Doubles) -> 
     return np.sqrt(times * single + beside**2 * height_variances).astype(np.float32)
 
 
-def fit(block: FacetBlock) -> _Doubles:
+def fit(block: FacetBlock) -> Floats:
     """Root mean square of the standardised residuals around each post, shape (rows, columns); NaN without pixels.
 
     1 is what is expected: squares are divided by the redundancy, what grey values and height take of the pixels.
@@ -536,7 +534,7 @@ def fit(block: FacetBlock) -> _Doubles:
         return np.where(sums[..., 0] > 0, np.sqrt(squares / free), np.nan)
 
 
-def pixel_noise(raw: _Floats) -> float:
+def pixel_noise(raw: Floats32) -> float:
     """Standard deviation of the noise of pixels by themselves, from differences that slopes of grey values do not have
     (Immerkær 1996), robustly; 0 without pixels."""
     a = np.array([1.0, -2.0, 1.0])
@@ -545,7 +543,7 @@ def pixel_noise(raw: _Floats) -> float:
     return float(np.median(found)) / (0.6745 * 6.0) if found.size else 0.0
 
 
-def edge_variances(block: FacetBlock) -> _Doubles:
+def edge_variances(block: FacetBlock) -> Floats:
     """Variances of heights beside edges, shape (rows, columns), m²; 0 elsewhere.
 
     Where neighbours part by more parallax than lies between them, not all images see the facet that joins them (a
@@ -563,7 +561,7 @@ def edge_variances(block: FacetBlock) -> _Doubles:
     return out
 
 
-def misfit_variances(block: FacetBlock, misfit: _Doubles) -> _Doubles:
+def misfit_variances(block: FacetBlock, misfit: Floats) -> Floats:
     """Variances of heights around which pixels do not fit, shape (rows, columns), m²; 0 where they do.
 
     A height that is not where it should be may be any of those around it. How probable that is: the square of the part
@@ -575,7 +573,7 @@ def misfit_variances(block: FacetBlock, misfit: _Doubles) -> _Doubles:
     return np.asarray(wrong * around**2 / 12)
 
 
-def residual_pictures(block: FacetBlock) -> list[_Floats]:
+def residual_pictures(block: FacetBlock) -> list[Floats32]:
     """Mean standardised residual of each view's pixels in every grey value's cell, shape (m · rows, m · columns); NaN
     without pixels. The first cell is that of the first post less half a facet."""
     m, pictures = block.facets.ratio, []
@@ -587,13 +585,13 @@ def residual_pictures(block: FacetBlock) -> list[_Floats]:
     return pictures
 
 
-def standardised(block: FacetBlock) -> list[_Floats]:
+def standardised(block: FacetBlock) -> list[Floats32]:
     """Residuals of every view's pixels, the surface's grey value less theirs, in their standard deviations; NaN: not
     used."""
     return [residuals / np.float32(sigma) for residuals, sigma in zip(block.residuals, block.sigmas)]
 
 
-_Variances = Callable[[_Doubles], _Doubles]
+_Variances = Callable[[Floats], Floats]
 
 #: Cells of a patch to each side, and how many of its grey values count as independent.
 _HALF, _INDEPENDENT = 2, 8.0
@@ -629,15 +627,15 @@ class HeightEvidence:
 
     count: NDArray[np.uint8]
     """Images that see the post."""
-    variance: _Doubles
+    variance: Floats
     """Variance of the choice among the heights within the reach, m²."""
-    probability: _Doubles
+    probability: Floats
     """Probability that the height is right to a pixel of parallax."""
-    fit: _Doubles
+    fit: Floats
     """Root mean square of residuals, or of differences between images if these are less, 1 is expected; NaN: none."""
 
 
-def visible(block: FacetBlock) -> NDArray[np.bool_]:
+def visible(block: FacetBlock) -> Mask:
     """Return which views see the posts of a block over its surface, shape (views, rows, columns)."""
     facets, heights = block.facets, block.heights
     XYZ = np.concatenate([facets.posts, heights[..., None]], axis=-1)
@@ -657,7 +655,7 @@ def visible(block: FacetBlock) -> NDArray[np.bool_]:
 
 
 def evidence(
-    block: FacetBlock, level: int, low: _Doubles, high: _Doubles, inner: tuple[slice, slice], misfit: _Doubles
+    block: FacetBlock, level: int, low: Floats, high: Floats, inner: tuple[slice, slice], misfit: Floats
 ) -> HeightEvidence | None:
     """Compare the images of a block at heights between two surfaces (rows, columns); `level`: of the pyramids, `inner`:
     the posts that are asked for; `misfit`: see `judged.fit`.
@@ -686,7 +684,7 @@ def evidence(
     sloping = np.abs(slopes).max(axis=0) * block.scale * _HALF / facets.ratio > _SLOPING
     levels = np.zeros_like(slopes)
 
-    def tried(k: int, wanted: NDArray[np.bool_]) -> tuple[_Doubles, _Doubles]:
+    def tried(k: int, wanted: Mask) -> tuple[Floats, Floats]:
         """Differences and those of unrelated grey values, of patches that follow the surface, and of level ones."""
         found = np.full((2, 2, rows, columns), np.nan, np.float32)
         z = (heights + k * step - bottom) / rise
@@ -749,14 +747,14 @@ def evidence(
 class _Choice:
     """Choice among heights by evidence that was added over squares of a size; the first one is the surface's own."""
 
-    def __init__(self, here: _Doubles) -> None:
+    def __init__(self, here: Floats) -> None:
         self._here = self._barrier = here
         self.lowest = here
         """Evidence of the best height so far."""
         self.sums = np.stack([np.ones(here.shape), *np.zeros((2, *here.shape))])
         """Sums of p, of p times the squared distance, and of p of other heights, relative to the best height's p."""
 
-    def add(self, total: _Doubles, k: int, offset: float, allowed: _Doubles, flat: _Doubles) -> None:
+    def add(self, total: Floats, k: int, offset: float, allowed: Floats, flat: Floats) -> None:
         """Add the k-th height to one side, from near to far; `allowed` is `total` as far as the height may be taken."""
         if abs(k) == 1:
             self._barrier = self._here
@@ -775,8 +773,8 @@ class _Choice:
 
 
 def _decided(
-    choices: Mapping[int, _Choice], none: Mapping[int, _Doubles], heights: _Doubles, fit: _Doubles
-) -> tuple[_Doubles, _Doubles]:
+    choices: Mapping[int, _Choice], none: Mapping[int, Floats], heights: Floats, fit: Floats
+) -> tuple[Floats, Floats]:
     """Return the variance of the choice and the probability of the height, from squares of those sizes that are surest;
     `none` is the weight of no height at all."""
     around = np.maximum(maximum_filter(heights, _RANGE) - heights, heights + maximum_filter(-heights, _RANGE)) ** 2 / 3
@@ -792,14 +790,14 @@ def _decided(
     return variance, agreed
 
 
-def _open(L: _Doubles) -> _Doubles:
+def _open(L: Floats) -> Floats:
     """Return by how much evidence leaves a height undecided, 0 to 1."""
     return np.clip((L - _UNDECIDED) / 2 + 0.5, 0.0, 1.0)
 
 
 def _projected(
     block: FacetBlock, level: int, bottom: float, top: float
-) -> tuple[list[tuple[int, _Floats]], _Doubles, float]:
+) -> tuple[list[tuple[int, Floats32]], Floats, float]:
     """Pixels of views that see the block between two heights, where places on a lattice over it lie in them, and the
     distance of its heights."""
     facets = block.facets
@@ -820,7 +818,7 @@ def _projected(
     return stack, np.ascontiguousarray(places), rise
 
 
-def _expected(squares: _Doubles, unrelated: _Doubles, trusted: NDArray[np.bool_] | None) -> _Variances:
+def _expected(squares: Floats, unrelated: Floats, trusted: Mask | None) -> _Variances:
     """Function that returns the variance of differences at right heights from that of unrelated ones: a + b U, from
     medians over posts of like texture."""
     known = np.isfinite(squares) & np.isfinite(unrelated)
@@ -837,7 +835,7 @@ def _expected(squares: _Doubles, unrelated: _Doubles, trusted: NDArray[np.bool_]
     return lambda U: max(a, 0.2) + min(b, _RESAMPLED) * U
 
 
-def _lacking(squares: _Doubles, unrelated: _Doubles, variances: _Variances) -> _Doubles:
+def _lacking(squares: Floats, unrelated: Floats, variances: _Variances) -> Floats:
     """Half the excess of -2 ln p of the differences, taken as those of a right height, over that of unrelated ones."""
     s2 = variances(unrelated)
     # Patches of noise alone differ by chance, and heights were fitted to them.

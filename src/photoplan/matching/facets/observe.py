@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from photoplan.arrays import Floats, Floats32, Mask
 from photoplan.cameras.base import Camera, project, tremor_of
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.facet_transfer import (
@@ -28,11 +29,8 @@ from photoplan.kernels.facets import curvature_gradient
 from photoplan.kernels.matching import box_means
 from photoplan.matching.features import Grey
 
-_Floats = NDArray[np.float32]
-_Doubles = NDArray[np.float64]
 
-
-def means_around(values: NDArray[np.floating], patch: int) -> _Doubles:
+def means_around(values: NDArray[np.floating], patch: int) -> Floats:
     """Means over patches of patch × patch values, fewer at the border, shape (rows, columns); an even patch has one
     more before than behind."""
     out = np.empty(values.shape)
@@ -40,20 +38,20 @@ def means_around(values: NDArray[np.floating], patch: int) -> _Doubles:
     return out
 
 
-def smoothed(values: _Floats) -> _Floats:
+def smoothed(values: Floats32) -> Floats32:
     """Means of three by three."""
     padded = np.pad(values, 1, mode="edge")
     across = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
     return (across[:-2] + across[1:-1] + across[2:]) / np.float32(9)
 
 
-def corners(facets: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def corners(facets: Mask) -> Mask:
     """Posts at the corners of any of these facets: shape (rows, columns) of (rows − 1, columns − 1)."""
     around = np.pad(facets, 1)
     return around[:-1, :-1] | around[:-1, 1:] | around[1:, :-1] | around[1:, 1:]
 
 
-def away_from_border(seen: NDArray[np.bool_], border: int, least: float) -> NDArray[np.bool_]:
+def away_from_border(seen: Mask, border: int, least: float) -> Mask:
     """Of what is seen of a block, what is `border` values away from its border and from what is not seen along that.
 
     Where less than the part `least` of what is seen would be left, the latter does not count. Holes do not, either:
@@ -67,7 +65,7 @@ def away_from_border(seen: NDArray[np.bool_], border: int, least: float) -> NDAr
     parts, _ = ndimage.label(~seen)
     edge = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     beside = ndimage.maximum_filter(np.isin(parts, edge[edge > 0]), 2 * border + 1)
-    away: NDArray[np.bool_] = inner & ~beside
+    away: Mask = inner & ~beside
     return away if np.count_nonzero(away) >= least * np.count_nonzero(inner) else inner
 
 
@@ -94,7 +92,7 @@ class Pyramid:
     """Pixels that the low-pass filter spans."""
     kept: int = 64 << 20
     """Bytes of blocks that are kept for the next window."""
-    _blocks: OrderedDict[tuple[int, int, int], _Floats] = field(default_factory=OrderedDict, init=False, repr=False)
+    _blocks: OrderedDict[tuple[int, int, int], Floats32] = field(default_factory=OrderedDict, init=False, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False)
 
     def size(self, level: int) -> tuple[int, int]:
@@ -102,7 +100,7 @@ class Pyramid:
         width, height = self.image.size
         return ((width - 1) >> level) + 1, ((height - 1) >> level) + 1
 
-    def read(self, level: int, window: Window) -> _Floats:
+    def read(self, level: int, window: Window) -> Floats32:
         """Grey values of any window of a level, shape (height, width); NaN where there are none."""
         if level == 0:
             return self.image.read(window)
@@ -115,7 +113,7 @@ class Pyramid:
                 out[part.slices(window)] = self._block(level, block)[part.slices(block)]
         return out
 
-    def _block(self, level: int, block: Window) -> _Floats:
+    def _block(self, level: int, block: Window) -> Floats32:
         key = level, block.col, block.row
         with self._lock:
             if key in self._blocks:
@@ -134,7 +132,7 @@ class Pyramid:
         return made
 
 
-def halved(fine: _Floats, low_pass: NDArray[np.float64]) -> _Floats:
+def halved(fine: Floats32, low_pass: Floats) -> Floats32:
     """Filter along rows and columns and keep every second pixel, the first of them where the filter first fits.
 
     Pixels without a value count nothing; where they have most of the weight there is none.
@@ -149,9 +147,9 @@ def halved(fine: _Floats, low_pass: NDArray[np.float64]) -> _Floats:
         return np.where(weight > 0.6, total / weight, np.float32(np.nan))
 
 
-def _along(values: _Floats, low_pass: NDArray[np.float64], axis: int) -> _Floats:
+def _along(values: Floats32, low_pass: Floats, axis: int) -> Floats32:
     count = (values.shape[axis] - len(low_pass) + 1 + 1) // 2
-    out: _Floats | None = None
+    out: Floats32 | None = None
     for k, share in enumerate(low_pass):
         if share:
             index = [slice(None), slice(None)]
@@ -191,17 +189,17 @@ class Facets:
     ratio: int
     """Grey facets along a side of a height facet."""
 
-    def to_posts(self, XY: ArrayLike) -> _Doubles:
+    def to_posts(self, XY: ArrayLike) -> Floats:
         """Map points (..., 2) to column and row of the posts."""
         XY = np.asarray(XY, float)
         return np.stack([(XY[..., 0] - self.left) / self.pitch, (self.top - XY[..., 1]) / self.pitch], axis=-1)
 
-    def to_map(self, uv: ArrayLike) -> _Doubles:
+    def to_map(self, uv: ArrayLike) -> Floats:
         """Inverse of `to_posts`."""
         uv = np.asarray(uv, float)
         return np.stack([self.left + uv[..., 0] * self.pitch, self.top - uv[..., 1] * self.pitch], axis=-1)
 
-    def sampled(self, values: _Doubles, XY: ArrayLike) -> _Doubles:
+    def sampled(self, values: Floats, XY: ArrayLike) -> Floats:
         """Values at the posts (..., rows, columns), bilinear at map points (n, m, 2) of a grid, shape (..., n, m);
         beyond the border those of the border."""
         uv = self.to_posts(XY)
@@ -215,7 +213,7 @@ class Facets:
         return np.asarray(upper * (1 - b) + lower * b)
 
     @property
-    def posts(self) -> _Doubles:
+    def posts(self) -> Floats:
         """X, Y of all posts, shape (rows, columns, 2)."""
         v, u = np.mgrid[: self.shape[0], : self.shape[1]]
         return self.to_map(np.stack([u, v], axis=-1))
@@ -255,15 +253,15 @@ class View:
 class Relief:
     """A surface that pixels are carried to."""
 
-    heights: _Doubles
+    heights: Floats
     """At the posts, shape (rows, columns), metres."""
-    bent: _Doubles
+    bent: Floats
     """See `facet_transfer.facet_curvatures`."""
-    steep: _Doubles
+    steep: Floats
     """See `facet_transfer.steepness`."""
 
     @classmethod
-    def of(cls, heights: _Doubles) -> Relief:
+    def of(cls, heights: Floats) -> Relief:
         """From heights at the posts."""
         rows, columns = heights.shape
         bent, steep = np.empty((2, rows, columns)), np.empty((-(-(rows - 1) // CELL), -(-(columns - 1) // CELL)))
@@ -276,9 +274,9 @@ class Relief:
 class Sight:
     """What a view has of a block: pixels of a window of one of its levels, and how their rays run."""
 
-    raw: _Floats
+    raw: Floats32
     """Grey values, shape (h, w); NaN where there are none."""
-    ways: _Doubles
+    ways: Floats
     """Rays of every so many pixels, see `facet_transfer.transfer`; (m, n, 8)."""
     steps: tuple[int, int]
     """How many pixels to the right and down."""
@@ -286,9 +284,9 @@ class Sight:
     """Height that is 0 for them, metres."""
     first: tuple[int, int]
     """Column and row of the first pixel."""
-    places: _Floats = field(default_factory=lambda: np.empty((0, 0, 4), np.float32))
+    places: Floats32 = field(default_factory=lambda: np.empty((0, 0, 4), np.float32))
     """Where the pixels lie on the surface, see `facet_transfer.transfer`."""
-    on: _Doubles | None = None
+    on: Floats | None = None
     """Heights of the surface that they were carried to."""
 
     def onto(self, relief: Relief) -> Sight:
@@ -312,7 +310,7 @@ def look(view: View, level: int, facets: Facets, heights: tuple[float, float]) -
 
 def pixels_between(
     view: View, level: int, facets: Facets, heights: tuple[float, float]
-) -> tuple[Window, _Floats] | None:
+) -> tuple[Window, Floats32] | None:
     """Window of a level of a view that may look at a block between two heights, metres, and its grey values, shape
     (h, w); None: there is none."""
     low, high = _known(view, heights)
@@ -350,17 +348,17 @@ def _window(view: View, level: int, facets: Facets, heights: tuple[float, float]
 
 
 def _followed(
-    camera: Camera, raw: _Floats, window: Window, level: int, facets: Facets, levels: tuple[float, float]
+    camera: Camera, raw: Floats32, window: Window, level: int, facets: Facets, levels: tuple[float, float]
 ) -> Sight:
     """Rays of a lattice of pixels, as fine along each axis as it takes for straight lines between them to be good."""
     size, first, scale = (window.width, window.height), np.array([window.col, window.row]), 2.0**level
     # Where a flight shakes each line of the image stands for itself.
     right, down = _STEP, _STEP if tremor_of(camera) is None else 1
 
-    def cross(at: _Doubles, z: float) -> _Doubles:
+    def cross(at: Floats, z: float) -> Floats:
         return facets.to_posts(_on_level(camera, (at + first) * scale, z))
 
-    def worst(found: _Doubles, expected: _Doubles) -> float:
+    def worst(found: Floats, expected: Floats) -> float:
         return float(np.nanmax(np.abs(found - expected), initial=0.0)) * facets.ratio
 
     while True:
@@ -392,7 +390,7 @@ def _followed(
     return Sight(raw=raw, ways=ways, steps=(right, down), level=sum(levels) / 2, first=first_pixel)
 
 
-def _on_level(camera: Camera, xy: NDArray[Any], height: float) -> _Doubles:
+def _on_level(camera: Camera, xy: NDArray[Any], height: float) -> Floats:
     """X, Y where rays of image points (..., 2) come down to a height; NaN where they do not."""
     origin, direction = camera.rays(xy.reshape(-1, 2), height)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -414,9 +412,9 @@ class Transfer:
     Schlüter 2001, eq. 1 has h1 + h2 · g = G, hence h2 = 1/gain and h1 = −offset/gain.
     """
 
-    offsets: _Doubles
+    offsets: Floats
     """At the nodes, shape (rows, columns)."""
-    gains: _Doubles
+    gains: Floats
     left: float
     top: float
     """X and Y of the first node."""
@@ -430,13 +428,13 @@ class Transfer:
         offsets, gains = self._nodes.sampled(self.offsets, XY), self._nodes.sampled(self.gains, XY)
         return replace(new, offsets=offsets, gains=gains)
 
-    def apply(self, sight: Sight, facets: Facets) -> _Floats:
+    def apply(self, sight: Sight, facets: Facets) -> Floats32:
         """Grey values of a view's pixels in the system of the surface, shape (h, w); NaN off the surface."""
         out = np.empty(sight.raw.shape, np.float32)
         to_surface_grey(sight.places, sight.raw, self.offsets, self.gains, self._lattice(facets), out)
         return out
 
-    def improved(self, sight: Sight, facets: Facets, weights: _Floats, surface: _Floats, contrast: float) -> Transfer:
+    def improved(self, sight: Sight, facets: Facets, weights: Floats32, surface: Floats32, contrast: float) -> Transfer:
         """Least squares from grey values of the surface at the pixels' places (h, w) and their weights."""
         rows, columns = self.offsets.shape
         n = rows * columns
@@ -457,7 +455,7 @@ class Transfer:
         u, v = facets.to_posts((self.left, self.top))
         return float(u), float(v), self.pitch / facets.pitch
 
-    def _tie(self, system: _Doubles, right: _Doubles, contrast: float) -> None:
+    def _tie(self, system: Floats, right: Floats, contrast: float) -> None:
         """Neighbours differ little; and what no pixel knows stays as it is."""
         rows, columns = self.offsets.shape
         n = rows * columns
@@ -527,16 +525,16 @@ _SHARED, _STEADY, _MOST = 0.25, 0.5, 64.0
 class Smoother:
     """The normal equations of an adjustment."""
 
-    solve: Callable[[Sequence[_Doubles]], _Doubles]
+    solve: Callable[[Sequence[Floats]], Floats]
     """N⁻¹ of right-hand sides, shape (k, rows, columns)."""
-    noise: _Doubles
+    noise: Floats
     """A right-hand side of errors of the pixels, shape (rows, columns)."""
-    inside: NDArray[np.bool_]
+    inside: Mask
     """Posts that tell: seen by some images, and away from the border."""
-    signs: _Doubles
+    signs: Floats
     """Of the curvatures that are drawn, 1 or −1, shape (3, rows, columns)."""
 
-    def mean(self, values: _Doubles, shared: float, wide: bool = False) -> _Doubles:
+    def mean(self, values: Floats, shared: float, wide: bool = False) -> Floats:
         """Means of what tells over patches, twice if `wide`, and in the part `shared` of the block, (rows, columns)."""
         number = max(float(np.count_nonzero(self.inside)), 1.0)
         telling = np.where(self.inside, values, 0.0)
@@ -550,9 +548,9 @@ class Smoother:
 class Roughness:
     """Curvatures along columns, along rows and across, at the posts of a block."""
 
-    squares: _Doubles
+    squares: Floats
     """Their variances, shape (3, rows, columns), m²."""
-    factors: _Doubles
+    factors: Floats
     """Robust factors of their weights, the same shape; 0 where a curvature is not inside."""
 
     @classmethod
@@ -565,23 +563,23 @@ class Roughness:
         return Roughness(own.sampled(self.squares, finer.posts), _inside(finer.shape).astype(float))
 
     @property
-    def weights(self) -> _Doubles:
+    def weights(self) -> Floats:
         """Of the curvatures, shape (3, rows, columns)."""
         return self.factors / self.squares
 
-    def gradient(self, heights: _Doubles) -> _Doubles:
+    def gradient(self, heights: Floats) -> Floats:
         """Half the gradient of the weighted sum of their squares, shape (rows, columns)."""
         out = np.empty(heights.shape)
         curvature_gradient(self.weights, heights, out)
         return out
 
-    def around(self, heights: _Doubles) -> Roughness:
+    def around(self, heights: Floats) -> Roughness:
         """The same variances, with the robust factors of heights (rows, columns)."""
         found, inside = curvatures(heights) ** 2, self.factors > 0
         single = found / _usual(found, self.squares, inside)
         return Roughness(self.squares, np.where(inside, (_FREEDOM + 1) / (_FREEDOM + single), 0.0))
 
-    def estimated(self, heights: _Doubles, smoother: Smoother) -> Roughness:
+    def estimated(self, heights: Floats, smoother: Smoother) -> Roughness:
         """Variances with which the band around the smoothing length holds what it does in heights (rows, columns)."""
         mean = partial(smoother.mean, wide=True)
         seen, drawn, noise = (band**2 for band in self._bands(heights, smoother, 1)[0][0])
@@ -592,9 +590,7 @@ class Roughness:
         # Of smooth terrain it falls with the 2.5th power of the variance: whole steps would not settle.
         return Roughness(self.squares * np.sqrt(np.clip(change, 1 / _MOST, _MOST)), self.factors).around(heights)
 
-    def sandwich(
-        self, heights: _Doubles, smoother: Smoother, variances: _Doubles, stiffer: float
-    ) -> tuple[_Doubles, _Doubles]:
+    def sandwich(self, heights: Floats, smoother: Smoother, variances: Floats, stiffer: float) -> tuple[Floats, Floats]:
         """Variances of heights (rows, columns), of the pixels' noise and of what smoothing takes away.
 
         `variances` are the diagonals of N⁻¹ with these weights and with weights `stiffer` times as large, (2, rows,
@@ -618,7 +614,7 @@ class Roughness:
         share = np.clip(known + np.maximum(times, 0.0) * np.maximum(rest, 0.0), 0.0, _MOST)
         return whole - prior, share * prior
 
-    def _bands(self, heights: _Doubles, smoother: Smoother, count: int) -> tuple[list[_Doubles], _Doubles]:
+    def _bands(self, heights: Floats, smoother: Smoother, count: int) -> tuple[list[Floats], Floats]:
         """(N⁻¹ R)ⁿ of a smoothed surface, n = 1 … count: of heights, and expected ones of independent curvatures and
         of noise, each of shape (3, rows, columns); and what smoothing takes away of the second, not yet smoothed."""
         drawn = _transposed(np.sqrt(self.weights) * smoother.signs)
@@ -630,7 +626,7 @@ class Roughness:
         return bands, taken
 
 
-def _usual(found: _Doubles, least: _Doubles, inside: NDArray[np.bool_]) -> _Doubles:
+def _usual(found: Floats, least: Floats, inside: Mask) -> Floats:
     """What squares of curvatures usually are around each: the scale of Student's distribution that is most probable for
     those of a patch (by the EM algorithm, Lange, Little and Taylor 1989), not below `least`; all (3, rows, columns)."""
     share = np.maximum(np.stack([_means(part.astype(float)) for part in inside]), 1.0 / _PATCH**2)
@@ -641,7 +637,7 @@ def _usual(found: _Doubles, least: _Doubles, inside: NDArray[np.bool_]) -> _Doub
     return scale
 
 
-def _transposed(c: _Doubles) -> _Doubles:
+def _transposed(c: Floats) -> Floats:
     """The transpose of `curvatures`, shape (rows, columns), for c that are 0 where they are not inside."""
     out = np.zeros(c.shape[1:])
     for shift, a in ((-1, 1.0), (0, -2.0), (1, 1.0)):
@@ -651,7 +647,7 @@ def _transposed(c: _Doubles) -> _Doubles:
     return out
 
 
-def curvatures(heights: _Doubles) -> _Doubles:
+def curvatures(heights: Floats) -> Floats:
     """Second differences along columns, along rows and across, shape (3, rows, columns); 0 where not inside."""
     out = np.zeros((3, *heights.shape))
     out[0, :, 1:-1] = heights[:, 2:] - 2 * heights[:, 1:-1] + heights[:, :-2]
@@ -660,13 +656,13 @@ def curvatures(heights: _Doubles) -> _Doubles:
     return out
 
 
-def _inside(shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _inside(shape: tuple[int, int]) -> Mask:
     """Which of `curvatures` are inside."""
     out = np.zeros((3, *shape), bool)
     out[0, :, 1:-1] = out[1, 1:-1] = out[2, :-1, :-1] = True
     return out
 
 
-def _means(values: _Doubles) -> _Doubles:
+def _means(values: Floats) -> Floats:
     """Means around each post over squares of `_PATCH` posts, shape (rows, columns)."""
     return means_around(values, _PATCH)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.arrays import Floats, Floats32, Ints, Mask
 from photoplan.cameras.base import project
 from photoplan.events import stretch, tell
 from photoplan.geometry.grid import MapGrid, Window
@@ -57,9 +58,6 @@ from photoplan.matching.facets.observe import (
     pixels_between,
 )
 
-_Doubles = NDArray[np.float64]
-_Integers = NDArray[np.int64]
-
 #: Distance of the planes, pixels of parallax of a level.
 _STEP = 0.5
 #: Cells between those that are projected, and planes.
@@ -89,26 +87,26 @@ class Planes:
     ceiling: float = np.inf
     """Height of the images, metres: towards it planes come closer, as parallax grows."""
 
-    def heights(self, numbers: NDArray[np.number], level: int) -> _Doubles:
+    def heights(self, numbers: NDArray[np.number], level: int) -> Floats:
         """Of planes by their numbers, metres."""
         if np.isinf(self.ceiling):
             return np.asarray(numbers * self._step(level))
         return np.asarray(self.ceiling - 1.0 / (np.maximum(numbers, 1e-3) * self._step(level)))
 
-    def numbers(self, heights: _Doubles, level: int) -> _Doubles:
+    def numbers(self, heights: Floats, level: int) -> Floats:
         """Inverse of `heights`, with parts."""
         if np.isinf(self.ceiling):
             return np.asarray(heights / self._step(level))
         least = _NEAREST * (self.ceiling - self.at)
         return np.asarray(1.0 / np.maximum(self.ceiling - heights, least) / self._step(level))
 
-    def pixels(self, heights: _Doubles) -> _Doubles:
+    def pixels(self, heights: Floats) -> Floats:
         """Height of one pixel of parallax at heights, metres; of the finest level."""
         if np.isinf(self.ceiling):
             return np.full(np.shape(heights), self.pixel)
         return np.asarray(self.pixel * ((self.ceiling - heights) / (self.ceiling - self.at)) ** 2)
 
-    def away(self, heights: _Doubles, found: _Doubles) -> _Doubles:
+    def away(self, heights: Floats, found: Floats) -> Floats:
         """By how much heights are farther from others than a pixel of parallax, metres; 0 where they are not."""
         return np.asarray(np.maximum(np.abs(heights - found) - _AWAY * self.pixels(found), 0.0))
 
@@ -137,32 +135,27 @@ class Searched:
     """Heights that were found post by post."""
 
     facets: Facets
-    heights: _Doubles
+    heights: Floats
     """Shape (rows, columns), metres."""
-    margin: _Doubles
+    margin: Floats
     """By how much other heights cost more, parts of the cost's usual contrast; 0: unknown."""
-    variance: _Doubles
+    variance: Floats
     """Of the choice among heights, m²."""
-    ends: tuple[_Doubles, _Doubles]
+    ends: tuple[Floats, Floats]
     """Least and largest number of the planes of the posts around."""
 
     @property
-    def sure(self) -> NDArray[np.bool_]:
+    def sure(self) -> Mask:
         """Where other heights cost clearly more."""
         return np.asarray(self.margin >= _SURE)
 
-    def __call__(self, XY: _Doubles) -> _Doubles:
+    def __call__(self, XY: Floats) -> Floats:
         """Heights at map points (n, m, 2) of a grid."""
         return self.facets.sampled(self.heights, XY)
 
 
 def search(
-    views: Sequence[View],
-    grid: MapGrid,
-    window: Window,
-    how: Search,
-    start: Callable[[_Doubles], _Doubles],
-    reach: float,
+    views: Sequence[View], grid: MapGrid, window: Window, how: Search, start: Callable[[Floats], Floats], reach: float
 ) -> Searched | None:
     """Heights of a window of a map."""
     found: Searched | None = None
@@ -188,7 +181,7 @@ def search(
     return replace(found, heights=heights, variance=found.variance + planes.away(heights, found.heights) ** 2)
 
 
-def _filled(values: _Doubles, weights: _Doubles) -> _Doubles:
+def _filled(values: Floats, weights: Floats) -> Floats:
     """Values as far as they weigh, 0 to 1, and for the rest those of cells twice as large, and so on."""
     rows, columns = values.shape
     if min(rows, columns) < 2:
@@ -200,13 +193,13 @@ def _filled(values: _Doubles, weights: _Doubles) -> _Doubles:
     return np.asarray(weights * values + (1 - weights) * finer)
 
 
-def _near(found: Searched, facets: Facets) -> tuple[_Integers, _Integers]:
+def _near(found: Searched, facets: Facets) -> tuple[Ints, Ints]:
     """First and last plane to be searched at the posts of the next finer level."""
     low, high = (2.0 * _nearest(found.facets, end, facets) + side * _AROUND for side, end in zip((-1, 1), found.ends))
     return np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
 
 
-def _around(steps: _Doubles, sure: NDArray[np.bool_]) -> tuple[_Doubles, _Doubles]:
+def _around(steps: Floats, sure: Mask) -> tuple[Floats, Floats]:
     """Least and largest of the planes of the sure posts around each, farther around where a post is not sure.
 
     Where no post around is sure, of all of them.
@@ -220,7 +213,7 @@ def _around(steps: _Doubles, sure: NDArray[np.bool_]) -> tuple[_Doubles, _Double
     return ends[0], ends[1]
 
 
-def _nearest(own: Facets, values: _Doubles, finer: Facets) -> _Doubles:
+def _nearest(own: Facets, values: Floats, finer: Facets) -> Floats:
     """Values at the nearest posts."""
     uv = np.rint(own.to_posts(finer.posts)).astype(int)
     rows, columns = own.shape
@@ -228,7 +221,7 @@ def _nearest(own: Facets, values: _Doubles, finer: Facets) -> _Doubles:
 
 
 def _level(
-    views: Sequence[View], level: int, base: int, facets: Facets, planes: Planes, low: _Integers, high: _Integers
+    views: Sequence[View], level: int, base: int, facets: Facets, planes: Planes, low: Ints, high: Ints
 ) -> Searched | None:
     """Heights at the posts of a level, each between its own two planes; None: no two images see it."""
     m, (rows, columns) = facets.ratio, facets.shape
@@ -277,7 +270,7 @@ def _level(
     return Searched(facets=facets, heights=heights, margin=margin / whole, variance=variance * step**2, ends=nearby)
 
 
-def _cells(active: NDArray[np.bool_], m: int, shape: tuple[int, int], half: tuple[int, int]) -> NDArray[np.bool_]:
+def _cells(active: Mask, m: int, shape: tuple[int, int], half: tuple[int, int]) -> Mask:
     """Cells around posts."""
     out = np.zeros(shape, bool)
     out[::m, ::m] = active
@@ -286,7 +279,7 @@ def _cells(active: NDArray[np.bool_], m: int, shape: tuple[int, int], half: tupl
 
 def _positions(
     view: View, window: Window, pyramid: int, facets: Facets, planes: Planes, level: int, k: int
-) -> tuple[_Doubles, _Doubles]:
+) -> tuple[Floats, Floats]:
     """Where every `_LATTICE`-th cell of a plane, and of another `_EVERY` further on, lies in a window of an image."""
     m, (rows, columns) = facets.ratio, facets.shape
     u, v = (np.arange(-(-((n - 1) * m) // _LATTICE) + 1) * (_LATTICE / m) for n in (columns, rows))
@@ -299,8 +292,8 @@ def _positions(
 
 
 def _pairs(
-    seen: Sequence[tuple[View, Window, NDArray[np.float32]]], facets: Facets, planes: Planes, level: int, height: float
-) -> _Integers:
+    seen: Sequence[tuple[View, Window, Floats32]], facets: Facets, planes: Planes, level: int, height: float
+) -> Ints:
     """All pairs of images, the best to compare first: those whose rays part as the planes are made for.
 
     Rays that part more see things from sides too different, and those that part less tell less of heights.
@@ -319,7 +312,7 @@ def _pairs(
     return np.ascontiguousarray(every[np.argsort(np.abs(np.log(np.maximum(apart, 1e-9) / best)), kind="stable")])
 
 
-def _contrast(cost: NDArray[np.float32], first: _Integers) -> tuple[float, float]:
+def _contrast(cost: Floats32, first: Ints) -> tuple[float, float]:
     """Usual cost of a plane less the least one of its post, and the usual cost; NaN: not seen by two images."""
     known = np.isfinite(cost)
     counts = np.add.reduceat(known, first[:-1], dtype=np.int64)
@@ -330,8 +323,6 @@ def _contrast(cost: NDArray[np.float32], first: _Integers) -> tuple[float, float
     usual = np.add.reduceat(np.where(known, cost, np.float32(0)), first[:-1])[several] / counts[several]
     return max(float(np.median(usual - least)), 0.02), float(np.median(usual))
 
-
-_Floats = NDArray[np.float32]
 
 #: Iterations of the coarsest level and of others until roughness is estimated; for the last level and others, how many
 #: estimates follow each other, and iterations after each series.
@@ -384,27 +375,27 @@ class Scheme:
 class Found:
     """A window of the surface."""
 
-    heights: _Floats
+    heights: Floats32
     """Shape (rows, columns), metres; NaN where fewer than two images see it."""
-    sigmas: _Floats
+    sigmas: Floats32
     """Standard deviations, metres; NaN where there is no height."""
     count: NDArray[np.uint8]
     """Images that see the facets around a post."""
-    fit: _Floats
+    fit: Floats32
     """Root mean square of the standardised residuals around a post, or of the differences between the images that agree
     best there if that is less; 1 is expected, NaN where there is no height."""
-    grey: _Floats
+    grey: Floats32
     """Grey values, `ratio` times as fine; NaN where no image sees it."""
-    grey_sigmas: _Floats
+    grey_sigmas: Floats32
     """Their standard deviations; NaN where there is no grey value."""
-    residuals: _Floats | None
+    residuals: Floats32 | None
     """Standardised residuals of every view where the grey values are, shape (views, m · rows, m · columns), NaN without
     a pixel; None: not wanted."""
     astray: int
     """Posts without a height since it went as far from the start as it may."""
-    sums: _Doubles
+    sums: Floats
     """Of every view: Σ of squared residuals in its own grey values, and redundancy; shape (n, 2)."""
-    noise: _Doubles
+    noise: Floats
     """Of every view: the noise of its pixels by themselves, squared, and their mean grey value, both times the pixels,
     and the pixels; shape (n, 3)."""
     moves: tuple[float, ...]
@@ -416,7 +407,7 @@ def reconstruct(
     grid: MapGrid,
     window: Window,
     scheme: Scheme,
-    start: Callable[[_Doubles], _Doubles],
+    start: Callable[[Floats], Floats],
     residuals: bool = False,
 ) -> Found | None:
     """Heights and grey values of a window of a map.
@@ -488,7 +479,7 @@ def _part(scheme: Scheme, window: Window, level: int, *ends: float) -> AbstractC
     return stretch(begin, end, f"level {scheme.coarsest - level + 1} of {scheme.coarsest + 1}")
 
 
-def _telling(block: FacetBlock, found: Searched | None) -> NDArray[np.bool_] | None:
+def _telling(block: FacetBlock, found: Searched | None) -> Mask | None:
     """Posts that tell noise and roughness of a block: not those beside steps, where pixels fit far worse than they
     usually do, nor where a search is not sure.
 
@@ -503,7 +494,7 @@ def _telling(block: FacetBlock, found: Searched | None) -> NDArray[np.bool_] | N
 
 
 def _opened(
-    views: Sequence[View], level: int, facets: Facets, heights: _Doubles, before: FacetBlock | None, reach: float
+    views: Sequence[View], level: int, facets: Facets, heights: Floats, before: FacetBlock | None, reach: float
 ) -> FacetBlock | None:
     """A block at the start of a level; None if fewer than two views see it."""
     span, relief = (float(heights.min()), float(heights.max())), Relief.of(heights)
@@ -540,7 +531,7 @@ def _opened(
     return block
 
 
-def _lifted(block: FacetBlock, reach: float) -> _Doubles:
+def _lifted(block: FacetBlock, reach: float) -> Floats:
     """The start, lifted or lowered as a whole by what fits best within its reach."""
     pixel = 1.0 / block.scale
     count = min(_MOST_TRIALS, int(np.ceil(reach / (_TRIAL * pixel) - 0.5)))
@@ -562,7 +553,7 @@ def _room(view: View, facets: Facets, span: tuple[float, float], before: FacetBl
 
 def _radiometry(
     views: Sequence[View], sights: Sequence[Sight], facets: Facets, before: FacetBlock | None
-) -> tuple[list[Transfer], _Doubles]:
+) -> tuple[list[Transfer], Floats]:
     """Transfer parameters and noise of the level before; of views that it did not have, guesses."""
     guesses = first_guess(sights, facets)
     contrast = max(float(np.nanstd(np.concatenate([s.raw.reshape(-1) for s in sights]))), 1e-3)
@@ -575,16 +566,14 @@ def _radiometry(
     return guesses, sigmas
 
 
-def _start_heights(start: Callable[[_Doubles], _Doubles], facets: Facets) -> _Doubles | None:
+def _start_heights(start: Callable[[Floats], Floats], facets: Facets) -> Floats | None:
     """Heights of the start at the posts; where it has none, their mean; None if it has none at all."""
     found = np.asarray(start(facets.posts), float)
     known = np.isfinite(found)
     return np.where(known, found, found[known].mean()) if known.any() else None
 
 
-def _limits(
-    start: Callable[[_Doubles], _Doubles], facets: Facets, reach: float
-) -> tuple[_Doubles | float, _Doubles | float]:
+def _limits(start: Callable[[Floats], Floats], facets: Facets, reach: float) -> tuple[Floats | float, Floats | float]:
     """What the surface keeps to around a start that is wrong by `reach` at most; no limits if nobody says so."""
     if not reach > 0:
         return -np.inf, np.inf
@@ -592,7 +581,7 @@ def _limits(
     return np.nan_to_num(begun - room, nan=-np.inf), np.nan_to_num(begun + room, nan=np.inf)
 
 
-def _finer(block: FacetBlock, facets: Facets, start: Callable[[_Doubles], _Doubles]) -> _Doubles:
+def _finer(block: FacetBlock, facets: Facets, start: Callable[[Floats], Floats]) -> Floats:
     """Heights of the level before at the posts of finer facets, bilinear, with what the start has between its posts;
     beyond the border those of the border.
 
@@ -608,7 +597,7 @@ def _found(
     views: Sequence[View],
     window: Window,
     scheme: Scheme,
-    start: Callable[[_Doubles], _Doubles],
+    start: Callable[[Floats], Floats],
     searched: Searched | None,
     moves: tuple[float, ...],
     residuals: bool = False,
@@ -669,6 +658,6 @@ def _found(
     )
 
 
-def _where(known: NDArray[np.bool_], values: NDArray[Any]) -> _Floats:
+def _where(known: Mask, values: NDArray[Any]) -> Floats32:
     """Values where they are known, NaN elsewhere."""
     return np.where(known, values, np.nan).astype(np.float32)

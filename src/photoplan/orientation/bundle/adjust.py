@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from photoplan.adjustment.statistics import chance_gain
+from photoplan.arrays import Floats, Ints
 from photoplan.cameras.corrected import CurvatureCorrection
 from photoplan.cameras.curvature import Refraction, local_pose
 from photoplan.cameras.observed import GroundPoints, ObservedAttitudes, ObservedPositions
@@ -57,7 +58,6 @@ from photoplan.orientation.bundle.robust import (
     weights_of,
 )
 
-_Floats = NDArray[np.float64]
 #: Step for the derivatives of angles, radians.
 _STEP = 1e-6
 
@@ -76,7 +76,7 @@ class BlockFrame:
     """From the orientation's height system to the one that is computed in."""
     outward: HeightStep
 
-    def points(self, XYZ: ArrayLike) -> _Floats:
+    def points(self, XYZ: ArrayLike) -> Floats:
         """Map points (..., 3) to block points; NaN where a coordinate is NaN and a local system mixes it in."""
         XYZ = np.array(XYZ, float)
         if self.local is None:
@@ -84,7 +84,7 @@ class BlockFrame:
         XYZ[..., 2] = self.inward(XYZ)
         return self.local.to_local(XYZ)
 
-    def map_points(self, points: ArrayLike) -> _Floats:
+    def map_points(self, points: ArrayLike) -> Floats:
         """Block points (..., 3) to map points."""
         if self.local is None:
             return np.array(points, float)
@@ -92,7 +92,7 @@ class BlockFrame:
         XYZ[..., 2] = self.outward(XYZ)
         return XYZ
 
-    def jacobian(self, XYZ: ArrayLike) -> _Floats:
+    def jacobian(self, XYZ: ArrayLike) -> Floats:
         """∂ block / ∂ map at map points (..., 3), shape (..., 3, 3); the height systems' own slope is left out."""
         XYZ = np.array(XYZ, float)
         if self.local is None:
@@ -100,14 +100,14 @@ class BlockFrame:
         XYZ[..., 2] = self.inward(XYZ)
         return self.local.jacobian(XYZ)
 
-    def map_covariance(self, covariance: _Floats, XYZ: ArrayLike) -> _Floats:
+    def map_covariance(self, covariance: Floats, XYZ: ArrayLike) -> Floats:
         """Covariances (..., 3, 3) of block coordinates as those of map coordinates, at map points."""
         if self.local is None:
             return np.array(covariance)
         back = np.linalg.inv(self.jacobian(XYZ))
         return back @ covariance @ np.swapaxes(back, -1, -2)
 
-    def map_vectors(self, vectors: _Floats, XYZ: ArrayLike) -> _Floats:
+    def map_vectors(self, vectors: Floats, XYZ: ArrayLike) -> Floats:
         """Small vectors (..., 3) of block coordinates as those of map coordinates, at map points."""
         if self.local is None:
             return np.array(vectors)
@@ -130,7 +130,7 @@ class BlockFrame:
         center[2] = self.outward(center)
         return Pose(center, R)
 
-    def ground(self, ground: GroundPoints, near: _Floats) -> GroundPoints:
+    def ground(self, ground: GroundPoints, near: Floats) -> GroundPoints:
         """Ground points in the block's system."""
         if self.local is None:
             return ground
@@ -162,7 +162,7 @@ class BlockFrame:
             time=positions.time,
         )
 
-    def attitudes(self, attitudes: ObservedAttitudes, centers: _Floats) -> ObservedAttitudes:
+    def attitudes(self, attitudes: ObservedAttitudes, centers: Floats) -> ObservedAttitudes:
         """Observed attitudes in the block's system; `centers` (n, 3) are the stations in the map."""
         if self.local is None:
             return attitudes
@@ -172,7 +172,7 @@ class BlockFrame:
         return ObservedAttitudes(attitudes.images, R, attitudes.sigma)
 
 
-def angle_derivatives(R: _Floats, order: str) -> _Floats:
+def angle_derivatives(R: Floats, order: str) -> Floats:
     """∂ angles / ∂ small rotations about the camera's x, y, z (R ← R · exp[δ]×), shape (3, 3), for an order of angles.
 
     By central differences; large where the angles are not determined (the second one near a right angle).
@@ -188,7 +188,7 @@ def make_bend(
     frame: BlockFrame,
     images: Sequence[BlockImage],
     cameras: Mapping[str, BlockCamera],
-    nadir: _Floats,
+    nadir: Floats,
     curved: bool,
     refracted: bool,
 ) -> Bend | None:
@@ -201,18 +201,18 @@ def make_bend(
         return None
     radii = [earth_radius(frame.crs, image.pose.center[:2]) if curved else MEAN_RADIUS for image in images]
 
-    def warp_of(k: int, center: _Floats) -> Callable[[_Floats], _Floats]:
+    def warp_of(k: int, center: Floats) -> Callable[[Floats], Floats]:
         X, Y, Z = (float(v) for v in center)
         refract = Refraction((X, Y, Z)) if refracted else None
         curve = CurvatureCorrection((X, Y, Z), float(nadir[k]), radii[k] + float(nadir[k])) if curved else None
 
-        def warp(points: _Floats) -> _Floats:
+        def warp(points: Floats) -> Floats:
             points = points if refract is None else refract(points)
             return points if curve is None else curve(points)
 
         return warp
 
-    def bend(image: NDArray[np.int64], poses: tuple[Pose, ...], points: _Floats) -> _Floats:
+    def bend(image: Ints, poses: tuple[Pose, ...], points: Floats) -> Floats:
         on_map = points if frame.local is None else frame.local.to_map(points)
         shift = np.empty((len(points), 2))
         order = np.argsort(image, kind="stable")
@@ -232,7 +232,7 @@ def make_bend(
     return bend
 
 
-def _pixels(image: BlockImage, camera: BlockCamera, pose: Pose, points: _Floats) -> _Floats:
+def _pixels(image: BlockImage, camera: BlockCamera, pose: Pose, points: Floats) -> Floats:
     p = pose.to_camera(points)
     t = p[:, :2] / np.where(p[:, 2] < 0, -p[:, 2], np.nan)[:, None]
     return image.plane_to_pixel(camera.c * camera.lens.distort(t) + np.array(camera.principal_point))
@@ -337,7 +337,7 @@ def _weighted(
         used = solution.weight[image][::2] > 0
         correlations = correlation_of(model, solution.normalised()[image].reshape(-1, 2), used)
     effects = effects_of_rows(model, correlations, len(solution.e)) if correlations else None
-    factors: _Floats | None = None
+    factors: Floats | None = None
     common = False
     for _ in range(2 * _COMPONENTS):
         if settings.variance_components and settings.covariance:
@@ -362,7 +362,7 @@ def _weighted(
 
 def _selected(
     block: Block, active: Active, lost: frozenset[str], wait: bool = False
-) -> tuple[Selection, _Floats, frozenset[str]]:
+) -> tuple[Selection, Floats, frozenset[str]]:
     """What takes part, start values of its points, and the points whose rays are parallel."""
     while True:
         selection = select(block, active, lost)
@@ -409,7 +409,7 @@ def _rebuilt(
     return made, state.carried(_started(made, XYZ)), selection, lost
 
 
-def _returned(model: Model, state: State, active: Active, factors: _Floats, critical: float) -> Active:
+def _returned(model: Model, state: State, active: Active, factors: Floats, critical: float) -> Active:
     """Points that have lost most of their rays while orientations were poor, and that fit now that they are good."""
     seen = model.block.observations
     left = np.bincount(seen.point[active.image], minlength=len(seen.points))
@@ -426,7 +426,7 @@ def _returned(model: Model, state: State, active: Active, factors: _Floats, crit
     return replace(active, image=image)
 
 
-def _started(model: Model, XYZ: _Floats) -> State:
+def _started(model: Model, XYZ: Floats) -> State:
     poses = [model.block.images[k].pose for k in model.image_rows]
     return start_state(model.block, model.camera_names, model.strip_names, poses, XYZ, model.sets)
 

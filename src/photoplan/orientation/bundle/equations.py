@@ -7,12 +7,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, sparse
 from scipy.sparse import identity
 from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, splu
 
 from photoplan.adjustment.blocks import Layout
+from photoplan.arrays import Floats, Ints
 from photoplan.cameras.base import Camera
 from photoplan.cameras.lenses import Brown, OpenCV
 from photoplan.errors import DatumDefect, GeometryError
@@ -39,8 +39,6 @@ from photoplan.orientation.bundle.model import (
     State,
 )
 
-_Floats = NDArray[np.float64]
-_Index = NDArray[np.int64]
 _NONE = np.empty(0, np.int64)
 
 
@@ -48,15 +46,15 @@ _NONE = np.empty(0, np.int64)
 class Residuals:
     """Computed minus observed, of every kind of observation."""
 
-    image: _Floats
+    image: Floats
     """(k, 2), pixels; NaN: the point lies behind the camera."""
-    ground: _Floats
+    ground: Floats
     """(c,) whitened, in the order of the model's control rows."""
-    position: _Floats
+    position: Floats
     """(p, 3), metres."""
-    attitude: _Floats
+    attitude: Floats
     """(a, 3), radians."""
-    prior: _Floats
+    prior: Floats
     """(q,) whitened: parameters and corrections that are known beforehand."""
 
 
@@ -64,11 +62,11 @@ class Residuals:
 class Rows:
     """Linearised equations: whitened residual + A_global · step + A_points · step of points."""
 
-    e: _Floats
+    e: Floats
     """Whitened residuals, (rows,): image (x, y by turns), control, positions, attitudes, priors."""
     A_global: sparse.csr_matrix
     A_points: sparse.csr_matrix
-    point: NDArray[np.int64]
+    point: Ints
     """Point of each row, −1: none."""
 
 
@@ -76,14 +74,14 @@ class Rows:
 class _Rays:
     """Intermediate results of image points."""
 
-    p: _Floats
-    t: _Floats
-    real: _Floats
-    inner: _Floats
+    p: Floats
+    t: Floats
+    real: Floats
+    inner: Floats
     """∂ plane / ∂ t in units of the image plane, (k, 2, 2)."""
-    outer: _Floats
+    outer: Floats
     """∂ pixel / ∂ plane, (k, 2, 2)."""
-    px: _Floats
+    px: Floats
 
 
 def residuals_of(model: Model, state: State) -> Residuals:
@@ -91,7 +89,7 @@ def residuals_of(model: Model, state: State) -> Residuals:
     return _residuals(model, state, _project(model.posed, state, derivatives=False), _seen(model, state))
 
 
-def residuals_of_all(model: Model, state: State) -> _Floats:
+def residuals_of_all(model: Model, state: State) -> Floats:
     """Computed minus measured position of every measurement of the block, (k, 2); NaN: image or point takes no part."""
     seen = model.block.observations
     images = {name: k for k, name in enumerate(model.image_names)}
@@ -137,7 +135,7 @@ def _residuals(model: Model, state: State, rays: _Rays, seen: list[_Seen]) -> Re
     return Residuals(image=image, ground=ground, position=position, attitude=attitude, prior=_known(model, state))
 
 
-def linearise(model: Model, state: State, weight: _Floats) -> tuple[Rows, Residuals]:
+def linearise(model: Model, state: State, weight: Floats) -> tuple[Rows, Residuals]:
     """Equations at a state; `weight` (rows,) is the square root of each row's robust weight."""
     rays, seen = _project(model.posed, state, derivatives=True), _seen(model, state)
     found = _residuals(model, state, rays, seen)
@@ -170,10 +168,10 @@ class _Entries:
     """Entries of a sparse matrix while it is filled: values, rows, columns."""
 
     def __init__(self, columns: Layout) -> None:
-        self.parts: list[tuple[_Floats, NDArray[np.int64], NDArray[np.int64]]] = []
+        self.parts: list[tuple[Floats, Ints, Ints]] = []
         self._columns = columns
 
-    def put(self, rows: _Index, key: str, block: _Index, values: _Floats, skip: int = 0) -> None:
+    def put(self, rows: Ints, key: str, block: Ints, values: Floats, skip: int = 0) -> None:
         """Derivatives `values` (n, r, u) on rows (n, r) by the unknowns of blocks (n,), from parameter `skip` on.
 
         Of a kind that is held fixed there are none.
@@ -186,7 +184,7 @@ class _Entries:
         self.parts.append((values.ravel(), row.ravel(), column.ravel()))
 
 
-def _image_rows(model: Model, state: State, rays: _Rays, seen: list[_Seen], entries: _Entries) -> _Floats:
+def _image_rows(model: Model, state: State, rays: _Rays, seen: list[_Seen], entries: _Entries) -> Floats:
     """Rows of image points: entries of orientations and cameras; returned: the coefficients of the points, (2k, 3)."""
     every = np.arange(2 * len(model.image)).reshape(-1, 2)
     by_X = _posed_rows(model.posed, state, rays, entries, every[model.framed])
@@ -212,13 +210,13 @@ class _Seen:
     """The measurements of a projection: where its camera sees their points."""
 
     projection: BlockProjection
-    mine: _Index
+    mine: Ints
     camera: Camera
-    XYZ: _Floats
+    XYZ: Floats
     """In the map, (n, 3)."""
-    by_block: _Floats
+    by_block: Floats
     """∂ map / ∂ block."""
-    xy: _Floats
+    xy: Floats
     """(n, 2), pixels."""
 
 
@@ -241,14 +239,14 @@ def _seen(model: Model, state: State) -> list[_Seen]:
     return out
 
 
-def _on_map(model: Model, XYZ: _Floats) -> tuple[_Floats, _Floats]:
+def _on_map(model: Model, XYZ: Floats) -> tuple[Floats, Floats]:
     """Map points and their derivatives by block points."""
     if model.block.on_map is None:
         return XYZ, np.broadcast_to(np.eye(3), (len(XYZ), 3, 3))
     return model.block.on_map(XYZ)
 
 
-def _posed_rows(model: Model, state: State, rays: _Rays, entries: _Entries, rows: _Index) -> _Floats:
+def _posed_rows(model: Model, state: State, rays: _Rays, entries: _Entries, rows: Ints) -> Floats:
     """The same for measurements in images with poses, which have `rows` (k, 2); returned: (k, 2, 3)."""
     k = len(model.image)
     white = 1.0 / model.sigma[:, :, None]
@@ -291,7 +289,7 @@ def _direct_rows(model: Model, state: State, found: Residuals, entries: _Entries
         entries.put(rows, BORESIGHT, np.zeros(n, np.int64), by_turn * white)
 
 
-def whitened(model: Model, found: Residuals) -> _Floats:
+def whitened(model: Model, found: Residuals) -> Floats:
     """Residuals of all rows divided by their standard deviations, in the order of `Rows`."""
     parts = [(found.image / model.sigma).ravel(), found.ground]
     positions, attitudes = model.block.positions, model.block.attitudes
@@ -302,9 +300,7 @@ def whitened(model: Model, found: Residuals) -> _Floats:
     return np.concatenate([*parts, found.prior])
 
 
-def _matrix(
-    parts: list[tuple[_Floats, NDArray[np.int64], NDArray[np.int64]]], weight: _Floats, shape: tuple[int, int]
-) -> sparse.csr_matrix:
+def _matrix(parts: list[tuple[Floats, Ints, Ints]], weight: Floats, shape: tuple[int, int]) -> sparse.csr_matrix:
     value, row, column = (np.concatenate(p) for p in zip(*parts))
     # Points behind a camera have no derivatives, and no weight.
     weighted = np.where(weight[row] > 0, value, 0.0) * weight[row]
@@ -338,7 +334,7 @@ def _project(model: Model, state: State, derivatives: bool) -> _Rays:
     return _Rays(p=p, t=t, real=real, inner=inner, outer=outer, px=px)
 
 
-def _by_parameters(camera: CameraState, rays: _Rays, mine: _Index) -> _Floats:
+def _by_parameters(camera: CameraState, rays: _Rays, mine: Ints) -> Floats:
     """∂ pixel / ∂ free parameters of a camera, (n, 2, k)."""
     t = rays.t[mine]
     J = np.zeros((len(mine), 2, len(camera.free)))
@@ -352,7 +348,7 @@ def _by_parameters(camera: CameraState, rays: _Rays, mine: _Index) -> _Floats:
     return rays.outer[mine] @ J
 
 
-def by_coefficient(camera: CameraState, name: str, t: _Floats, real: _Floats) -> _Floats:
+def by_coefficient(camera: CameraState, name: str, t: Floats, real: Floats) -> Floats:
     """∂ real tangent coordinates / ∂ a coefficient of the lens, (n, 2)."""
     lens = camera.lens
     x, y = t[:, 0], t[:, 1]
@@ -376,7 +372,7 @@ def by_coefficient(camera: CameraState, name: str, t: _Floats, real: _Floats) ->
     return d
 
 
-def _known(model: Model, state: State) -> _Floats:
+def _known(model: Model, state: State) -> Floats:
     """Whitened residuals of what is known beforehand."""
     off = [(state.known(key).value(parameter) - value) / sigma for key, parameter, value, sigma in model.known]
     smooth = [each.known @ state.corrections(each.key).ravel() for each in model.sets]
@@ -394,7 +390,7 @@ _MANY = 600
 class OfPoints(NamedTuple):
     """What takes steps of the other unknowns to those of the points."""
 
-    V_inverse: _Floats
+    V_inverse: Floats
     """Inverse normal matrices of the points, (m, 3, 3)."""
     N_pg: sparse.csr_matrix
     """Their normal matrix with the other unknowns, (3m, n)."""
@@ -416,7 +412,7 @@ def by_prior(model: Model, state: State, rows: Rows, points: OfPoints) -> tuple[
     return motions_of_points(state, points, vectors[:, values > _PRIOR] * scale[:, None])
 
 
-def motions_of_points(state: State, points: OfPoints, directions: _Floats) -> tuple[str, ...]:
+def motions_of_points(state: State, points: OfPoints, directions: Floats) -> tuple[str, ...]:
     """Motions of all points as one (shifts, turns, scale) that lie in directions (n, q) of the other unknowns."""
     V_inverse, N_pg = points
     if not directions.shape[1] or len(V_inverse) < 3:
@@ -455,13 +451,13 @@ class Reduced:
     rows: Rows
     S: sparse.csc_matrix
     """Scaled to a unit diagonal: S = D N D."""
-    scale: _Floats
+    scale: Floats
     """D."""
-    b: _Floats
-    V_inverse: _Floats
+    b: Floats
+    V_inverse: Floats
     """(points, 3, 3)."""
     N_pg: sparse.csr_matrix
-    n_p: _Floats
+    n_p: Floats
     """(points, 3)."""
 
     @property
@@ -469,7 +465,7 @@ class Reduced:
         """What takes steps of the other unknowns to those of the points."""
         return OfPoints(self.V_inverse, self.N_pg)
 
-    def solved(self, model: Model, state: State) -> tuple[_Floats, _Floats]:
+    def solved(self, model: Model, state: State) -> tuple[Floats, Floats]:
         """As `solve`; what is not determined is named."""
         try:
             return self.solve()
@@ -487,7 +483,7 @@ class Reduced:
                 "the normal equations are singular: the observations do not determine all unknowns"
             ) from None
 
-    def solve(self) -> tuple[_Floats, _Floats]:
+    def solve(self) -> tuple[Floats, Floats]:
         """Step of all unknowns but points, and of the points (m, 3)."""
         x = self.scale * self.factor.solve(self.scale * -self.b)
         back = (-self.n_p - (self.N_pg @ x).reshape(-1, 3))[:, :, None]
@@ -529,7 +525,7 @@ def reduce_normals(rows: Rows, points: int, damping: float = 0.0) -> Reduced:
     )
 
 
-def _on_points(rows: Rows) -> tuple[NDArray[np.int64], _Floats]:
+def _on_points(rows: Rows) -> tuple[Ints, Floats]:
     """Point and coefficients (…, 3) of the rows that have a point; these come first."""
     count = int((rows.point >= 0).sum())
     return rows.point[:count], rows.A_points.data.reshape(-1, 3)
@@ -554,13 +550,13 @@ class Inverse:
         self._Q = SelectedInverse(pointer=pointer, rows=rows, diagonal=diagonal, lower=lower, order=order)
         self._reduced = reduced
 
-    def block(self, columns: NDArray[np.int64]) -> _Floats:
+    def block(self, columns: Ints) -> Floats:
         """Cofactors of unknowns that occur together in an equation (or belong to one image), shape (m, m)."""
         scale = self._reduced.scale[columns]
         dense = dense_inverse(self._Q, columns)
         return np.asarray(dense * scale[:, None] * scale[None, :])
 
-    def variances(self) -> tuple[_Floats, _Floats]:
+    def variances(self) -> tuple[Floats, Floats]:
         """Cofactors of all points (m, 3, 3), and a Q aᵀ of all rows: 1 minus it is the redundancy number."""
         rows, reduced = self._reduced.rows, self._reduced
         at, P = _on_points(rows)
@@ -573,7 +569,7 @@ class Inverse:
         return covariance, np.concatenate([with_point, row_variances(self._Q, A, others)])
 
 
-def _pattern(reduced: Reduced, order: NDArray[np.int64]) -> sparse.csc_matrix:
+def _pattern(reduced: Reduced, order: Ints) -> sparse.csc_matrix:
     """Strictly lower triangle, in the order of elimination, of everything that can occur in S.
 
     Entries that happen to cancel belong to the pattern too, so it is made from ones.
@@ -624,7 +620,7 @@ def check_rank(model: Model, state: State, reduced: Reduced) -> None:
     )
 
 
-def _smallest(reduced: Reduced) -> tuple[_Floats, _Floats]:
+def _smallest(reduced: Reduced) -> tuple[Floats, Floats]:
     """Smallest eigenvalues of the scaled normal equations, with their vectors."""
     n = reduced.S.shape[0]
     if n <= 400:
@@ -641,7 +637,7 @@ def _smallest(reduced: Reduced) -> tuple[_Floats, _Floats]:
     return values, vectors
 
 
-def _datum(model: Model, state: State, directions: _Floats, reduced_scale: _Floats) -> list[str]:
+def _datum(model: Model, state: State, directions: Floats, reduced_scale: Floats) -> list[str]:
     """Names of the block's motions among the undetermined directions; empty if there are others."""
     size, motions = state.images.motions()
     kind = model.columns.get(IMAGES)
@@ -662,7 +658,7 @@ def _datum(model: Model, state: State, directions: _Floats, reduced_scale: _Floa
     return named if len(named) >= directions.shape[1] else []
 
 
-def _one_motion(model: Model, state: State, directions: _Floats) -> list[str]:
+def _one_motion(model: Model, state: State, directions: Floats) -> list[str]:
     """A turn of the whole block about a line, where the one undetermined direction is that; otherwise empty."""
     kind = model.columns.get(IMAGES)
     if directions.shape[1] != 1 or kind is None:
@@ -714,7 +710,7 @@ def loose_points(model: Model, state: State, rows: Rows) -> frozenset[str]:
     return frozenset(model.point_names[k] for k in np.flatnonzero(far))
 
 
-def along_rays(model: Model, state: State, step: _Floats) -> _Floats:
+def along_rays(model: Model, state: State, step: Floats) -> Floats:
     """Steps of points (m, 3) as steps of direction and inverse distance, in which image points are nearly linear.
 
     Small steps stay what they are. A point that has to go far away gets there in a few steps instead of by doubling its
@@ -730,7 +726,7 @@ def along_rays(model: Model, state: State, step: _Floats) -> _Floats:
     return np.asarray(stretch * (at + across) - at)
 
 
-def _middles(model: Model, state: State) -> _Floats:
+def _middles(model: Model, state: State) -> Floats:
     """Middle of the cameras that see each point, (m, 3)."""
     m = len(state.XYZ)
     rays = np.maximum(np.bincount(model.point, minlength=m), 1)

@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photoplan.adjustment.blocks import Kind, Layout, Unknowns
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.cameras.correctable import Correctable, Corrections
 from photoplan.cameras.fiducials import Affine2D, Bilinear2D
 from photoplan.cameras.lenses import Brown, Lens, NoLens, OpenCV
@@ -24,7 +24,7 @@ PARAMETERS = ("c", "x0", "y0", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
 
 #: Shift of image points, (image indices (n,), poses of all images, ground points (n, 3)) → (n, 2) pixels, that is added
 #: to the central projection: earth curvature, refraction. It must be smooth and small; its derivatives are neglected.
-Bend = Callable[[NDArray[np.int64], "tuple[Pose, ...]", NDArray[np.float64]], NDArray[np.float64]]
+Bend = Callable[[Ints, "tuple[Pose, ...]", Floats], Floats]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class BlockImage:
 
 
 #: From block points (n, 3) to map points (n, 3), and their derivatives ∂ map / ∂ block (n, 3, 3).
-OnMap = Callable[[NDArray[np.float64]], "tuple[NDArray[np.float64], NDArray[np.float64]]"]
+OnMap = Callable[[Floats], "tuple[Floats, Floats]"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class BlockProjection:
     """Images that are measured alike, as messages call them: "rational polynomials"."""
     geometry: Correctable
     """Over map points."""
-    sight: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+    sight: Callable[[Floats], tuple[Floats, Floats]]
     """From image points (n, 2) to about where they are seen from, and unit directions, in the block's system."""
     metres: float
     """About the size of a pixel on the ground."""
@@ -115,11 +115,11 @@ class Block:
 class Active:
     """Observations that are not taken out."""
 
-    image: NDArray[np.bool_]
+    image: Mask
     """Of `block.observations`."""
-    ground: NDArray[np.bool_]
+    ground: Mask
     """Of the coordinates of `block.ground`, (g, 3)."""
-    position: NDArray[np.bool_]
+    position: Mask
     """Of `block.positions`."""
 
     @classmethod
@@ -181,9 +181,9 @@ class Correlation:
     """Measurements that count as one for an orientation."""
     reach: float
     """Distance over which errors are alike, pixels."""
-    distance: NDArray[np.float64]
+    distance: Floats
     """Outer limits of classes of distance, (m,), pixels."""
-    rho: NDArray[np.float64]
+    rho: Floats
     """Correlation of residuals in each class, (m,); NaN: too few pairs."""
 
 
@@ -197,7 +197,7 @@ class AdjustedCamera:
     lens: Lens
     free: tuple[str, ...]
     """The parameters that were unknowns."""
-    covariance: NDArray[np.float64]
+    covariance: Floats
     """Of those, shape (k, k), sigma0 included; NaN without covariance."""
 
 
@@ -206,13 +206,13 @@ class AdjustedCorrections:
     """A set of corrections after the adjustment."""
 
     key: str
-    values: NDArray[np.float64]
+    values: Floats
     """(owners, parameters)."""
-    covariance: NDArray[np.float64]
+    covariance: Floats
     """Of each owner, (owners, parameters, parameters); NaN without covariance."""
-    known: NDArray[np.float64]
+    known: Floats
     """What each value was known to beforehand: standard deviations; infinite: not at all. As `values`."""
-    joint: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    joint: Mapping[str, Floats] = field(default_factory=dict)
     """Of knots: the covariances of four that follow each other, from each on, with the first owner of another set of
     the same images before them, by the key of that set; empty: there is none. (owners − 3, n, n)."""
 
@@ -222,12 +222,12 @@ class AdjustedStrip:
     """Drift of the observed positions of a strip: position = antenna + shift + rate · (time − epoch)."""
 
     name: str
-    shift: NDArray[np.float64]
+    shift: Floats
     """(3,), metres."""
-    rate: NDArray[np.float64]
+    rate: Floats
     """(3,), metres per second; zero with shift only."""
     epoch: float
-    sigma: NDArray[np.float64]
+    sigma: Floats
     """Of shift and rate, (6,); NaN where it was no unknown."""
 
 
@@ -237,50 +237,50 @@ class Adjusted:
 
     images: tuple[str, ...]
     poses: tuple[Pose, ...]
-    pose_covariance: NDArray[np.float64]
+    pose_covariance: Floats
     """(n, 6, 6): projection centre in metres, then small rotations about the camera's x, y, z axes in radians
     (R ← R · exp[δ]×); NaN without covariance."""
-    pose_camera_covariance: tuple[NDArray[np.float64], ...]
+    pose_camera_covariance: tuple[Floats, ...]
     """For each image that of its pose with the free parameters of its camera, (6, k)."""
     cameras: tuple[AdjustedCamera, ...]
     points: tuple[str, ...]
     """All points that were adjusted: tie, control and check points."""
-    XYZ: NDArray[np.float64]
+    XYZ: Floats
     """(m, 3)."""
-    point_covariance: NDArray[np.float64]
+    point_covariance: Floats
     """(m, 3, 3); NaN without covariance."""
-    rays: NDArray[np.int64]
+    rays: Ints
     """Measurements of each point that take part, (m,)."""
     left_out: tuple[tuple[str, str], ...]
     """Points and images that could not take part: name and reason."""
-    residuals: NDArray[np.float64]
+    residuals: Floats
     """Computed minus measured position of every image measurement, (k, 2), pixels (column, row); NaN: not used."""
-    redundancies: NDArray[np.float64]
+    redundancies: Floats
     """Redundancy numbers of the measurements, (k, 2), 0 to 1; NaN: not used or not computed."""
-    normalised: NDArray[np.float64]
+    normalised: Floats
     """Residuals divided by their standard deviations, (k, 2)."""
-    rejected: NDArray[np.bool_]
+    rejected: Mask
     """Measurements that were taken out as gross errors, (k,); `residuals` and `normalised` then are those against the
     result without them, NaN where their point or image had not enough left."""
-    ground_residuals: NDArray[np.float64]
+    ground_residuals: Floats
     """Adjusted minus given coordinates of every ground point, (g, 3), metres; NaN: not known or not seen."""
-    ground_normalised: NDArray[np.float64]
+    ground_normalised: Floats
     """Normalised residuals of control, (g, 3); NaN for check points."""
-    ground_rejected: NDArray[np.bool_]
+    ground_rejected: Mask
     """Control taken out as a gross error, coordinate by coordinate, (g, 3)."""
-    position_residuals: NDArray[np.float64]
+    position_residuals: Floats
     """Computed minus observed positions, (n_positions, 3), metres."""
-    position_rejected: NDArray[np.bool_]
+    position_rejected: Mask
     """(n_positions,)."""
-    attitude_residuals: NDArray[np.float64]
+    attitude_residuals: Floats
     """Small rotations computed minus observed, (n_attitudes, 3), radians."""
-    lever_arm: NDArray[np.float64]
+    lever_arm: Floats
     """(3,), metres."""
-    lever_arm_sigma: NDArray[np.float64]
+    lever_arm_sigma: Floats
     """(3,); zero where held fixed."""
-    boresight: NDArray[np.float64]
+    boresight: Floats
     """(3,), radians; zero where it was no unknown."""
-    boresight_sigma: NDArray[np.float64]
+    boresight_sigma: Floats
     strips: tuple[AdjustedStrip, ...]
     common: tuple[float, float, float] | None
     """See `Block.common`; found from positions that agree among each other far better than stated."""
@@ -302,8 +302,6 @@ class Adjusted:
     """Control points of the largest other set that agrees within itself; empty where all of it agrees."""
 
 
-_Floats = NDArray[np.float64]
-
 #: Keys of the kinds of unknowns; those of a camera are "camera NAME".
 IMAGES, LEVER, BORESIGHT, DRIFT = "images", "lever arm", "boresight", "drift"
 COMMON = "common error of positions"
@@ -313,23 +311,23 @@ COMMON = "common error of positions"
 class Poses:
     """Exterior orientations."""
 
-    centers: _Floats
+    centers: Floats
     """(n, 3)."""
-    rotations: _Floats
+    rotations: Floats
     """R_ground_camera, (n, 3, 3)."""
 
-    def moved(self, step: _Floats) -> Poses:
+    def moved(self, step: Floats) -> Poses:
         """See `Unknowns`."""
         return Poses(self.centers + step[:, :3], self.rotations @ small_rotations(step[:, 3:]))
 
-    def motions(self) -> tuple[float, dict[str, _Floats]]:
+    def motions(self) -> tuple[float, dict[str, Floats]]:
         """What moves all images together: the size of the block, and steps (n, 6) by their names."""
         n = len(self.centers)
         if not n:
             return 1.0, {}
         away = self.centers - self.centers.mean(axis=0)
         size = float(np.abs(away).max()) or 1.0
-        motions: dict[str, _Floats] = {}
+        motions: dict[str, Floats] = {}
         for k, axis in enumerate("XYZ"):
             motions[f"position of the block in {axis}"] = np.tile(size * np.eye(6)[k], (n, 1))
             about = np.eye(3)[k]
@@ -363,7 +361,7 @@ class CameraState:
         """A free parameter by its number."""
         return self.parameter(self.free[parameter])
 
-    def moved(self, step: _Floats) -> CameraState:
+    def moved(self, step: Floats) -> CameraState:
         """See `Unknowns`."""
         values = {name: self.parameter(name) + float(d) for name, d in zip(self.free, step[0])}
         c, x0, y0 = (values.pop(name, getattr(self, name)) for name in ("c", "x0", "y0"))
@@ -381,14 +379,14 @@ class CameraState:
 class Vectors:
     """Numbers that steps are added to, a row for each block: a lever arm, shifts and rates of strips."""
 
-    values: _Floats
+    values: Floats
     """(n, w); a step may be of the first columns only."""
 
     def value(self, parameter: int) -> float:
         """A value of the first block."""
         return float(self.values[0, parameter])
 
-    def moved(self, step: _Floats) -> Vectors:
+    def moved(self, step: Floats) -> Vectors:
         """See `Unknowns`."""
         values = self.values.copy()
         values[:, : step.shape[1]] += step
@@ -399,14 +397,14 @@ class Vectors:
 class Turn:
     """A rotation, from observed to true camera axes."""
 
-    R: _Floats
+    R: Floats
     """(3, 3)."""
 
     def value(self, parameter: int) -> float:
         """Rotation about an axis, radians."""
         return float(rotation_vector(self.R)[parameter])
 
-    def moved(self, step: _Floats) -> Turn:
+    def moved(self, step: Floats) -> Turn:
         """See `Unknowns`."""
         return Turn(self.R @ small_rotations(step)[0])
 
@@ -419,7 +417,7 @@ class State:
     """By their keys."""
     strips: tuple[str, ...]
     """What the rows of the drift belong to."""
-    XYZ: _Floats
+    XYZ: Floats
     """Points (m, 3): blocks too, but so many that they are eliminated."""
 
     @property
@@ -428,17 +426,17 @@ class State:
         return cast(Poses, self.blocks[IMAGES])
 
     @property
-    def lever(self) -> _Floats:
+    def lever(self) -> Floats:
         """Antenna minus projection centre, in camera axes, (3,)."""
         return cast(Vectors, self.blocks[LEVER]).values[0]
 
     @property
-    def boresight(self) -> _Floats:
+    def boresight(self) -> Floats:
         """Rotation from observed to true camera axes, (3, 3)."""
         return cast(Turn, self.blocks[BORESIGHT]).R
 
     @property
-    def drift(self) -> _Floats:
+    def drift(self) -> Floats:
         """Shift and rate of each strip, (s, 6)."""
         return cast(Vectors, self.blocks[DRIFT]).values
 
@@ -447,7 +445,7 @@ class State:
         return cast(CameraState, self.blocks[f"camera {name}"])
 
     @property
-    def common(self) -> _Floats:
+    def common(self) -> Floats:
         """Error that all observed positions share, (3,)."""
         return cast(Vectors, self.blocks[COMMON]).values[0]
 
@@ -455,7 +453,7 @@ class State:
         """Blocks of which something may be known beforehand."""
         return cast("CameraState | Vectors | Turn", self.blocks[key])
 
-    def corrections(self, key: str) -> _Floats:
+    def corrections(self, key: str) -> Floats:
         """Values of a set of corrections, (owners, parameters)."""
         return cast(Vectors, self.blocks[key]).values
 
@@ -463,7 +461,7 @@ class State:
         """Exterior orientations as values."""
         return tuple(Pose(c, R) for c, R in zip(self.images.centers, self.images.rotations))
 
-    def moved(self, layout: Layout, step: _Floats, points: _Floats) -> State:
+    def moved(self, layout: Layout, step: Floats, points: Floats) -> State:
         """The state after a step: `step` in the order of the layout, `points` (m, 3)."""
         return replace(self, blocks=layout.moved(self.blocks, step), XYZ=self.XYZ + points)
 
@@ -511,7 +509,7 @@ def start_state(
     cameras: tuple[str, ...],
     strips: tuple[str, ...],
     poses: list[Pose],
-    XYZ: _Floats,
+    XYZ: Floats,
     sets: Sequence[Corrections] = (),
 ) -> State:
     """Start values of the images that take part, their cameras, strips and corrections, and the points (m, 3)."""
@@ -539,8 +537,6 @@ def start_state(
 #: anything that is measured, in any unit of length, and large enough for the arithmetic.
 FIXED = 1e-5
 
-_Index = NDArray[np.int64]
-
 
 @dataclass(frozen=True)
 class RowParts:
@@ -563,7 +559,7 @@ class Model:
     block: Block
     image_names: tuple[str, ...]
     """Those with poses first, then `projections`."""
-    image_rows: _Index
+    image_rows: Ints
     """Number of each image with a pose in `block.images`, (n,)."""
     projections: tuple[BlockProjection, ...]
     keys: tuple[tuple[str, ...], ...]
@@ -571,39 +567,39 @@ class Model:
     sets: tuple[Corrections, ...]
     """All these sets, each once."""
     camera_names: tuple[str, ...]
-    camera_of: _Index
+    camera_of: Ints
     """Camera of each image with a pose, then the group of each projection: an index into `groups`."""
     groups: tuple[str, ...]
     """Cameras as messages call them, then the groups of the projections."""
-    plane: NDArray[np.float64]
+    plane: Floats
     """Bilinear coefficients b1 … b8 from image plane to pixels of each image, (n, 8)."""
     point_names: tuple[str, ...]
-    observation: _Index
+    observation: Ints
     """Number of each measurement in `block.observations`, (k,)."""
-    image: _Index
-    point: _Index
-    xy: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    ground: _Index
+    image: Ints
+    point: Ints
+    xy: Floats
+    sigma: Floats
+    ground: Ints
     """Ground point of each control row, an index into `block.ground`, (c,)."""
-    ground_axis: _Index
+    ground_axis: Ints
     """Coordinate of each control row: 0, 1, 2."""
-    ground_point: _Index
+    ground_point: Ints
     """Point of each control row, an index into `point_names`."""
-    ground_white: NDArray[np.float64]
+    ground_white: Floats
     """What the residuals of the three coordinates are multiplied with in a control row, (c, 3)."""
-    position: _Index
+    position: Ints
     """Image of each observed position."""
-    position_row: _Index
+    position_row: Ints
     """Its number in `block.positions`."""
-    strip_of: _Index
+    strip_of: Ints
     """Strip of each observed position, an index into `strip_names`."""
     strip_names: tuple[str, ...]
-    tau: NDArray[np.float64]
+    tau: Floats
     """Time of each observed position since its strip's epoch."""
-    epochs: NDArray[np.float64]
-    attitude: _Index
-    attitude_row: _Index
+    epochs: Floats
+    attitude: Ints
+    attitude_row: Ints
     columns: Layout
     """The unknowns that are not points."""
     known: tuple[tuple[str, int, float, float], ...]
@@ -624,7 +620,7 @@ class Model:
         return int(self.parts.smooth.stop)
 
     @cached_property
-    def framed(self) -> _Index:
+    def framed(self) -> Ints:
         """Measurements in images with poses."""
         return np.flatnonzero(self.image < len(self.image_rows))
 
@@ -644,20 +640,20 @@ class Model:
         )
 
     @cached_property
-    def of_projections(self) -> tuple[tuple[BlockProjection, tuple[str, ...], _Index], ...]:
+    def of_projections(self) -> tuple[tuple[BlockProjection, tuple[str, ...], Ints], ...]:
         """Each projection with the keys of its sets and its measurements."""
         first = len(self.image_rows)
         return tuple((p, self.keys[k], np.flatnonzero(self.image == first + k)) for k, p in enumerate(self.projections))
 
     @cached_property
-    def seen_from(self) -> _Floats:
+    def seen_from(self) -> Floats:
         """About where the measurements in projections are seen from, (k, 3); NaN for those in images with poses."""
         out = np.full((len(self.image), 3), np.nan)
         for projection, _, mine in self.of_projections:
             out[mine] = projection.sight(self.xy[mine])[0]
         return out
 
-    def origins(self, centers: _Floats) -> _Floats:
+    def origins(self, centers: Floats) -> Floats:
         """Where every measurement is seen from, (k, 3), with projection centres (n, 3)."""
         if not self.projections:
             return np.asarray(centers[self.image])
@@ -690,7 +686,7 @@ def check_free(name: str, camera: BlockCamera) -> None:
         )
 
 
-def build_model(block: Block, images: list[int], measured: _Index, points: list[str]) -> Model:
+def build_model(block: Block, images: list[int], measured: Ints, points: list[str]) -> Model:
     """Arrays of a block."""
     seen = block.observations
     chosen = [block.images[k] for k in images if k < len(block.images)]
@@ -753,12 +749,12 @@ def _bilinear(plane: Affine2D | Bilinear2D) -> tuple[float, ...]:
     return astuple(plane)
 
 
-def _observed(names: tuple[str, ...], image_index: dict[str, int]) -> tuple[_Index, _Index]:
+def _observed(names: tuple[str, ...], image_index: dict[str, int]) -> tuple[Ints, Ints]:
     rows = [k for k, name in enumerate(names) if name in image_index]
     return np.array([image_index[names[k]] for k in rows], np.int64), np.array(rows, np.int64)
 
 
-def _strips(block: Block, rows: _Index) -> tuple[tuple[str, ...], _Index, NDArray[np.float64], NDArray[np.float64]]:
+def _strips(block: Block, rows: Ints) -> tuple[tuple[str, ...], Ints, Floats, Floats]:
     """Names of the strips, strip and time since its epoch of each observed position, and the epochs."""
     if block.positions is None:
         return (), np.empty(0, np.int64), np.empty(0), np.empty(0)
@@ -785,12 +781,12 @@ def _on_ground(block: Block) -> float:
     return float(np.median([*np.array(angles) * np.array(away), *(sigma * p.metres for p in block.projections)]))
 
 
-def _ground_rows(block: Block, point_index: dict[str, int]) -> tuple[_Index, _Index, _Index, NDArray[np.float64]]:
+def _ground_rows(block: Block, point_index: dict[str, int]) -> tuple[Ints, Ints, Ints, Floats]:
     """Control rows: ground point, coordinate, point, and the whitening of their residuals."""
     ground = block.ground
     fixed = FIXED * _on_ground(block)
     rows: list[tuple[int, int, int]] = []
-    white: list[NDArray[np.float64]] = []
+    white: list[Floats] = []
     for k, name in enumerate(ground.names):
         if ground.check[k] or name not in point_index:
             continue

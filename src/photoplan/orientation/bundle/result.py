@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, sparse
 from scipy.optimize import nnls
 
 from photoplan.adjustment.least_squares import ENOUGH, MEDIAN_1D, variance_factors
 from photoplan.adjustment.statistics import Components, chance_chi_square, variance_components
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.cameras.correctable import Corrections
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import GeometryError
@@ -56,8 +56,6 @@ from photoplan.orientation.bundle.robust import (
     select,
 )
 
-_Floats = NDArray[np.float64]
-
 #: Classes of distance: their number, and the largest distance as a part of the extent of an image's points.
 _CLASSES, _REACH = 14, 0.5
 #: The first class ends where the last does, divided by this.
@@ -70,7 +68,7 @@ _PAIRS, _CLEAR = 50, 3.0
 _LEAST = 1.2
 
 
-def correlation_of(model: Model, normalised: _Floats, used: NDArray[np.bool_]) -> tuple[Correlation, ...]:
+def correlation_of(model: Model, normalised: Floats, used: Mask) -> tuple[Correlation, ...]:
     """Correlation of the residuals within the images of each camera, as a function of their distance.
 
     Orientations are smooth functions of the image's points, so errors that are alike over some distance d do not
@@ -86,7 +84,7 @@ def correlation_of(model: Model, normalised: _Floats, used: NDArray[np.bool_]) -
     return tuple(found)
 
 
-def effects_of_rows(model: Model, correlations: tuple[Correlation, ...], rows: int) -> _Floats:
+def effects_of_rows(model: Model, correlations: tuple[Correlation, ...], rows: int) -> Floats:
     """How many measurements count as one, of each row; 1 for everything but correlated tie points, (rows,).
 
     Control and check points are few and far from each other, so what they say is hardly alike. And if the image points
@@ -103,7 +101,7 @@ def effects_of_rows(model: Model, correlations: tuple[Correlation, ...], rows: i
     return out
 
 
-def _of_camera(name: str, image: NDArray[np.int64], xy: _Floats, v: _Floats) -> Correlation | None:
+def _of_camera(name: str, image: Ints, xy: Floats, v: Floats) -> Correlation | None:
     extent = float(np.hypot(*np.ptp(xy, axis=0)))
     if extent == 0.0:
         return None
@@ -224,16 +222,16 @@ def _means(gain: float, more: int) -> bool:
     return more > 0 and chance_chi_square(max(gain, 0.0), more) < _CHANCE
 
 
-_Data = tuple[_Floats, _Floats, list[_Floats], _Floats]
+_Data = tuple[Floats, Floats, list[Floats], Floats]
 
 
 def _likeliest(
-    model: Model, K: _Floats, data: Callable[[_Floats], _Data], size: float
-) -> tuple[float, _Floats, Components]:
+    model: Model, K: Floats, data: Callable[[Floats], _Data], size: float
+) -> tuple[float, Floats, Components]:
     """Correlation length, its part of the covariance matrix, and variances: the last of errors that are alike."""
-    found: list[tuple[float, _Floats, Components]] = []
+    found: list[tuple[float, Floats, Components]] = []
 
-    def tried(lengths: _Floats) -> tuple[float, _Floats, Components]:
+    def tried(lengths: Floats) -> tuple[float, Floats, Components]:
         for length in lengths.tolist():
             w, fixed, image, near = data(_near(model, K, length))
             start = found[-1][2].variances if found else np.full(len(image) + 1, size / 2.0)
@@ -245,7 +243,7 @@ def _likeliest(
     return tried(best[0] * _BESIDE)
 
 
-def _near(model: Model, K: _Floats, length: float) -> _Floats:
+def _near(model: Model, K: Floats, length: float) -> Floats:
     """Covariance of contrasts from errors that are alike within each image, in either coordinate."""
     out = np.zeros((K.shape[1], K.shape[1]))
     for image in range(len(model.image_names)):
@@ -282,7 +280,7 @@ def _part(block: Block, base: Adjusted) -> Block:
     return replace(block, observations=seen.where(inside & chosen[seen.point]))
 
 
-def _contrasts(block: Block, base: Adjusted) -> tuple[Model, _Floats, _Floats]:
+def _contrasts(block: Block, base: Adjusted) -> tuple[Model, Floats, Floats]:
     """The model, combinations of its rows that no unknown moves (rows, n), and what they are (n,)."""
     cameras = {
         each.name: replace(block.cameras[each.name], c=each.c, principal_point=each.principal_point, lens=each.lens)
@@ -318,15 +316,15 @@ class Solution:
     state: State
     reduced: Reduced
     found: Residuals
-    e: _Floats
+    e: Floats
     """Residuals of all rows divided by the standard deviations that were stated."""
-    weight: _Floats
+    weight: Floats
     """Weights of all rows, each by itself: 0 for those that are taken out."""
     inverse: Inverse | None
     """None: covariances were not asked for."""
-    redundancies: _Floats
+    redundancies: Floats
     """Of each row; NaN without covariances."""
-    point_cofactors: _Floats
+    point_cofactors: Floats
     """(m, 3, 3); NaN without covariances."""
 
     @property
@@ -342,7 +340,7 @@ class Solution:
         redundancy = float(self.redundancies[counted].sum()) if self.inverse is not None else float(self.redundancy)
         return float(np.sqrt(total / redundancy)) if self.redundancy > 0 else float("nan")
 
-    def scales(self) -> _Floats:
+    def scales(self) -> Floats:
         """Standard deviation of each group's residuals in units of the stated ones, in a robust way."""
         kinds, of = kinds_of(self.model)
         out = np.ones(len(kinds))
@@ -352,7 +350,7 @@ class Solution:
             out[k] = robust_scale(size[: len(of)][(of == k) & counted[: len(of)]], kinds[k])
         return out
 
-    def normalised(self) -> _Floats:
+    def normalised(self) -> Floats:
         """Residuals divided by their own standard deviations, all rows; NaN where nothing checks the observation."""
         _, of = kinds_of(self.model)
         scale = np.ones(len(self.e))
@@ -365,7 +363,7 @@ class Solution:
         """What data snooping looks at."""
         return Judged(self.e, self.normalised(), self.weight, self.scales())
 
-    def trusted(self, factors: _Floats) -> _Floats:
+    def trusted(self, factors: Floats) -> Floats:
         """Factors that weights are made with: control is not taken for better than stated.
 
         Errors of control are often alike (one survey, one orthophoto); orientations then follow them, and residuals
@@ -375,7 +373,7 @@ class Solution:
         control = np.array([name.startswith("control, ") for name, _ in kinds], bool)
         return np.asarray(np.where(control, np.maximum(factors, 1.0), factors))
 
-    def factors(self, before: _Floats | None = None) -> _Floats:
+    def factors(self, before: Floats | None = None) -> Floats:
         """Variance components of the groups; `before`: None is 1 for all. Orientations that are the datum keep 1."""
         kinds, of = kinds_of(self.model)
         used = self.weight[: len(of)] > 0
@@ -385,7 +383,7 @@ class Solution:
 
 
 def solution_of(
-    model: Model, state: State, weight: _Floats, covariance: bool, effects: _Floats | None = None
+    model: Model, state: State, weight: Floats, covariance: bool, effects: Floats | None = None
 ) -> Solution:
     """Equations, redundancy numbers and cofactors at a converged state."""
     rows, found = linearise(model, state, np.sqrt(weight))
@@ -442,7 +440,7 @@ def evened_sigmas(model: Model) -> ImagePoints:
     return seen if np.array_equal(sigma, seen.sigma) else replace(seen, sigma=sigma)
 
 
-def refitted_sigmas(solution: Solution, stated: _Floats) -> ImagePoints:
+def refitted_sigmas(solution: Solution, stated: Floats) -> ImagePoints:
     """Image points whose standard deviations have the form that residuals show, group by group: √(a s² + b).
 
     Matching states what noise makes of a patch's place; what it does not know of (relief inside of the patch, shutter,
@@ -479,7 +477,7 @@ def refitted_sigmas(solution: Solution, stated: _Floats) -> ImagePoints:
 _BETTER, _CHANCE_RESULT = 0.7, 0.01
 
 
-def with_common_errors(solution: Solution, factors: _Floats) -> Block:
+def with_common_errors(solution: Solution, factors: Floats) -> Block:
     """The block with an error that all observed positions share, and one of all attitudes, where residuals hide them.
 
     What all positions have in common leaves no residuals: it moves the block, or bends its camera. So of a stated
@@ -508,7 +506,7 @@ class Weighted:
     """The last solution and how its observations were weighted."""
 
     solution: Solution
-    factors: _Floats
+    factors: Floats
     """Standard deviation found over the one stated, of each group (`kinds_of`)."""
     correlations: tuple[Correlation, ...]
 
@@ -563,7 +561,7 @@ def result_of(selection: Selection, weighted: Weighted, active: Active, iteratio
     )
 
 
-def _of_measurements(solution: Solution, residuals: _Floats) -> tuple[_Floats, _Floats]:
+def _of_measurements(solution: Solution, residuals: Floats) -> tuple[Floats, Floats]:
     """Redundancy numbers and normalised residuals of all measurements."""
     model = solution.model
     redundancies = np.full_like(residuals, np.nan)
@@ -579,7 +577,7 @@ def _of_measurements(solution: Solution, residuals: _Floats) -> tuple[_Floats, _
     return redundancies, normalised
 
 
-def _of_ground(solution: Solution) -> tuple[_Floats, _Floats]:
+def _of_ground(solution: Solution) -> tuple[Floats, Floats]:
     model = solution.model
     ground = model.block.ground
     points = {name: k for k, name in enumerate(model.point_names)}
@@ -596,7 +594,7 @@ def _of_ground(solution: Solution) -> tuple[_Floats, _Floats]:
     return residuals, normalised
 
 
-def _of_direct(solution: Solution) -> tuple[_Floats, _Floats]:
+def _of_direct(solution: Solution) -> tuple[Floats, Floats]:
     model, block = solution.model, solution.model.block
     position = np.full((0 if block.positions is None else len(block.positions.images), 3), np.nan)
     position[model.position_row] = solution.found.position
@@ -605,7 +603,7 @@ def _of_direct(solution: Solution) -> tuple[_Floats, _Floats]:
     return position, attitude
 
 
-def _covariances(solution: Solution, key: str, variance: float) -> _Floats:
+def _covariances(solution: Solution, key: str, variance: float) -> Floats:
     """Covariances of all blocks of a kind, (n, w, w); (0, 0, 0) where it is no unknown."""
     kind = solution.model.columns.get(key)
     if kind is None:
@@ -617,7 +615,7 @@ def _covariances(solution: Solution, key: str, variance: float) -> _Floats:
     return out
 
 
-def _with_camera(solution: Solution, variance: float) -> tuple[_Floats, ...]:
+def _with_camera(solution: Solution, variance: float) -> tuple[Floats, ...]:
     """Covariances of each pose with the free parameters of its camera, (6, k)."""
     model = solution.model
     poses = model.columns.get(IMAGES)
@@ -634,7 +632,7 @@ def _with_camera(solution: Solution, variance: float) -> tuple[_Floats, ...]:
     return tuple(out)
 
 
-def _sigma(solution: Solution, key: str, variance: float) -> _Floats:
+def _sigma(solution: Solution, key: str, variance: float) -> Floats:
     """Standard deviations of three unknowns; 0 where they are held fixed."""
     found = _covariances(solution, key, variance)
     return np.sqrt(np.diag(found[0])) if len(found) else np.zeros(3)
@@ -678,7 +676,7 @@ def _corrections(solution: Solution, variance: float) -> tuple[AdjustedCorrectio
     return tuple(found)
 
 
-def _joint(solution: Solution, knots: Corrections, variance: float) -> dict[str, _Floats]:
+def _joint(solution: Solution, knots: Corrections, variance: float) -> dict[str, Floats]:
     """See `AdjustedCorrections.joint`."""
     model, out = solution.model, {}
     kind = model.columns.get(knots.key)
@@ -709,7 +707,7 @@ def _strips(solution: Solution, variance: float) -> tuple[AdjustedStrip, ...]:
     )
 
 
-def _groups(solution: Solution, factors: _Floats) -> tuple[Group, ...]:
+def _groups(solution: Solution, factors: Floats) -> tuple[Group, ...]:
     """Figures of each kind of observation."""
     model = solution.model
     kinds, of = kinds_of(model)

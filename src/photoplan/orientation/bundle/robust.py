@@ -8,11 +8,11 @@ from itertools import combinations
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from photoplan.adjustment.least_squares import MEDIAN_1D, MEDIAN_2D, geman_mcclure, huber, spread
 from photoplan.adjustment.statistics import chance_chi_square
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.equations import (
     PARALLEL,
@@ -27,9 +27,6 @@ from photoplan.orientation.bundle.equations import (
 )
 from photoplan.orientation.bundle.model import Active, Block, Model, State
 
-_Floats = NDArray[np.float64]
-_Index = NDArray[np.int64]
-
 #: Angle between rays below which a point waits until orientations are better, radians; points that every image keeps.
 _NARROW, _ENOUGH = 0.02, 8
 #: Control that is so many times farther from where its rays meet than the median of all control was given wrongly.
@@ -42,7 +39,7 @@ class Selection:
 
     images: list[int]
     """Indices into `block.images`, and beyond these into `block.projections`."""
-    measured: _Index
+    measured: Ints
     """Indices into `block.observations`."""
     points: list[str]
     left_out: tuple[tuple[str, str], ...]
@@ -89,7 +86,7 @@ def _reason(rays: int) -> str:
     return "point seen in one image only" if rays == 1 else "point without measurements that can be used"
 
 
-def _known(block: Block, active: NDArray[np.bool_]) -> _Index:
+def _known(block: Block, active: Mask) -> Ints:
     """Control coordinates that take part, of each point of the observations."""
     coordinates = {
         name: int((np.isfinite(block.ground.XYZ[k]) & active[k]).sum())
@@ -99,7 +96,7 @@ def _known(block: Block, active: NDArray[np.bool_]) -> _Index:
     return np.array([coordinates.get(n, 0) for n in block.observations.points], np.int64)
 
 
-def _direct(block: Block, active: NDArray[np.bool_]) -> set[int]:
+def _direct(block: Block, active: Mask) -> set[int]:
     """Images whose orientation is observed directly."""
     if block.positions is None or block.attitudes is None:
         return set()
@@ -107,7 +104,7 @@ def _direct(block: Block, active: NDArray[np.bool_]) -> set[int]:
     return {k for k, b in enumerate(block.images) if b.name in both}
 
 
-def start_points(block: Block, selection: Selection, wait: bool = False) -> tuple[_Floats, frozenset[str]]:
+def start_points(block: Block, selection: Selection, wait: bool = False) -> tuple[Floats, frozenset[str]]:
     """Start values of the selected points (m, 3), and the points whose rays are parallel.
 
     With `wait`, points of narrow rays count as such, unless an image has too few others: while orientations are only
@@ -154,7 +151,7 @@ def start_points(block: Block, selection: Selection, wait: bool = False) -> tupl
     return XYZ, frozenset(selection.points[k] for k in np.flatnonzero(~determined))
 
 
-def _rays(block: Block, selection: Selection) -> tuple[_Index, _Floats, _Floats, _Floats]:
+def _rays(block: Block, selection: Selection) -> tuple[Ints, Floats, Floats, Floats]:
     """Of all measurements that were selected: number of the image, origin and direction (k, 3) of its ray, and the
     standard deviation of that, radians."""
     seen = block.observations
@@ -184,16 +181,14 @@ def _rays(block: Block, selection: Selection) -> tuple[_Index, _Floats, _Floats,
     return image, centers, directions, sigma
 
 
-def _on_ray(center: _Floats, direction: _Floats, given: _Floats) -> _Floats:
+def _on_ray(center: Floats, direction: Floats, given: Floats) -> Floats:
     """Point of a ray at a known height; NaN without one."""
     if not (np.isfinite(given[2]) and abs(direction[2]) > 1e-6):
         return np.full(3, np.nan)
     return np.asarray(center + direction * ((given[2] - center[2]) / direction[2]))
 
 
-def intersect(
-    centers: _Floats, directions: _Floats, point: _Index, count: int, rounds: int = 6
-) -> tuple[_Floats, _Floats]:
+def intersect(centers: Floats, directions: Floats, point: Ints, count: int, rounds: int = 6) -> tuple[Floats, Floats]:
     """Points nearest to their rays, in the robust mean, and the angle at which two such rays would meet, radians.
 
     Parameters
@@ -237,8 +232,6 @@ def intersect(
     return XYZ, meeting
 
 
-_Mask = NDArray[np.bool_]
-
 #: Sets that are begun with at most, and of these those that grow to the end.
 _BEGINNINGS, _GROWN = 150, 8
 #: Chance of a set that fits as badly as it does, below which its accuracy counts as stated too well.
@@ -259,19 +252,19 @@ _MASKED = 1e-6
 class Misclosures:
     """Where the block puts its control points without them, minus their coordinates; n points, X Y Z by turns."""
 
-    points: NDArray[np.int64]
+    points: Ints
     """Ground points, indices into `block.ground`, (n,)."""
-    known: _Mask
+    known: Mask
     """Coordinates that are known, (n, 3)."""
-    w: _Floats
+    w: Floats
     """(n, 3), metres; 0 where a coordinate is not known."""
-    Q: _Floats
+    Q: Floats
     """Covariance of block and coordinates, (3n, 3n); one and nothing else where a coordinate is not known."""
     defect: int
     """Directions in which nothing but control places the block."""
 
 
-def misclosures(model: Model, state: State, weight: _Floats, loose: float) -> Misclosures | None:
+def misclosures(model: Model, state: State, weight: Floats, loose: float) -> Misclosures | None:
     """Misclosures of all control at a state; None where there is none, or the block is not determined."""
     names, of = np.unique(model.ground, return_inverse=True)
     if not len(names):
@@ -325,13 +318,13 @@ def misclosures(model: Model, state: State, weight: _Floats, loose: float) -> Mi
 class Agreeing:
     """Result of `agreeing`."""
 
-    kept: _Mask
+    kept: Mask
     """Coordinates of all ground points that stay, (g, 3)."""
     alternative: tuple[int, ...] = ()
     """Ground points of the largest other set that agrees; empty where nothing contradicts."""
 
 
-def agreeing(found: Misclosures, ground: _Mask, critical: float) -> Agreeing:
+def agreeing(found: Misclosures, ground: Mask, critical: float) -> Agreeing:
     """The largest set of control points that agree, with what of the others agrees with it too.
 
     Where less than half of the points agree, or the set fits worse than its standard deviations allow, these are taken
@@ -364,7 +357,7 @@ def agreeing(found: Misclosures, ground: _Mask, critical: float) -> Agreeing:
     return Agreeing(kept, () if best.all() else tuple(found.points[other].tolist()))
 
 
-def _largest(found: Misclosures, critical: float, wide: float) -> tuple[_Mask, _Mask]:
+def _largest(found: Misclosures, critical: float, wide: float) -> tuple[Mask, Mask]:
     """The largest set that agrees, and the largest of those that hold a point which it does not, masks (n,)."""
     n = len(found.points)
     limit = wide**2 * special.chdtri(np.maximum(found.known.sum(axis=1), 1), 2.0 * special.ndtr(-critical))
@@ -391,12 +384,12 @@ def _largest(found: Misclosures, critical: float, wide: float) -> tuple[_Mask, _
     return best, (_ranked(found, second) or [np.zeros(n, bool)])[0]
 
 
-def _ranked(found: Misclosures, sets: list[_Mask]) -> list[_Mask]:
+def _ranked(found: Misclosures, sets: list[Mask]) -> list[Mask]:
     """The largest first, of equal ones that with the least misclosures."""
     return sorted(sets, key=lambda mask: (-int(mask.sum()), _fit(found, mask)))
 
 
-def _grown(found: Misclosures, mask: _Mask, limit: _Floats, wide: float) -> _Mask:
+def _grown(found: Misclosures, mask: Mask, limit: Floats, wide: float) -> Mask:
     """A set from which the worst points have gone until it agrees, and to which those that fit have come."""
     mask = mask.copy()
     for _ in range(3 * len(mask)):
@@ -412,7 +405,7 @@ def _grown(found: Misclosures, mask: _Mask, limit: _Floats, wide: float) -> _Mas
     return mask
 
 
-def _sizes(found: Misclosures, mask: _Mask) -> _Floats:
+def _sizes(found: Misclosures, mask: Mask) -> Floats:
     """Squared misclosure of each point (n,) in standard deviations, against the points of a set without itself."""
     n, inside = len(mask), np.flatnonzero(mask)
     a = (3 * inside[:, None] + np.arange(3)).ravel()
@@ -435,7 +428,7 @@ def _sizes(found: Misclosures, mask: _Mask) -> _Floats:
     return out
 
 
-def _against(found: Misclosures, mask: _Mask, rows: NDArray[np.int64]) -> tuple[float, int]:
+def _against(found: Misclosures, mask: Mask, rows: Ints) -> tuple[float, int]:
     """Squared misclosure of coordinates outside a set, in standard deviations, and how many of them are known."""
     a = (3 * np.flatnonzero(mask)[:, None] + np.arange(3)).ravel()
     G = np.linalg.solve(found.Q[np.ix_(a, a)], found.Q[np.ix_(a, rows)]).T
@@ -444,17 +437,17 @@ def _against(found: Misclosures, mask: _Mask, rows: NDArray[np.int64]) -> tuple[
     return square, int(found.known.ravel()[rows].sum())
 
 
-def _fit(found: Misclosures, mask: _Mask) -> float:
+def _fit(found: Misclosures, mask: Mask) -> float:
     """Sum of squared misclosures of a set, in standard deviations."""
     a = (3 * np.flatnonzero(mask)[:, None] + np.arange(3)).ravel()
     return float(found.w.ravel()[a] @ np.linalg.solve(found.Q[np.ix_(a, a)], found.w.ravel()[a]))
 
 
-def _freedom(found: Misclosures, mask: _Mask) -> int:
+def _freedom(found: Misclosures, mask: Mask) -> int:
     return int(found.known[mask].sum()) - found.defect
 
 
-def _chance(found: Misclosures, mask: _Mask, wide: float) -> float:
+def _chance(found: Misclosures, mask: Mask, wide: float) -> float:
     """Chance that a set of right points fits as badly."""
     freedom = _freedom(found, mask)
     return chance_chi_square(_fit(found, mask) / wide**2, freedom) if freedom > 0 else 1.0
@@ -483,16 +476,16 @@ _BACK = 0.75
 class Judged:
     """What data snooping looks at, of all rows."""
 
-    e: _Floats
+    e: Floats
     """Residuals divided by the standard deviations that were stated."""
-    normalised: _Floats
+    normalised: Floats
     """Residuals divided by their own standard deviations."""
-    weight: _Floats
-    scales: _Floats
+    weight: Floats
+    scales: Floats
     """Of each group (`kinds_of`): standard deviation of its residuals in units of the stated ones."""
 
 
-def kinds_of(model: Model) -> tuple[Kinds, NDArray[np.int64]]:
+def kinds_of(model: Model) -> tuple[Kinds, Ints]:
     """Groups of observations, and the group of each row; rows of what is known beforehand are not listed.
 
     Control and check points are measured otherwise than tie points (by hand, say), so they are groups of their own.
@@ -515,7 +508,7 @@ def kinds_of(model: Model) -> tuple[Kinds, NDArray[np.int64]]:
     return tuple(kinds), np.concatenate(of).astype(np.int64)
 
 
-def kinds_of_measurements(model: Model) -> NDArray[np.int64]:
+def kinds_of_measurements(model: Model) -> Ints:
     """Group of every measurement of the block, also of those that take no part; −1: its image takes none."""
     seen = model.block.observations
     groups = {name: k for k, name in enumerate(model.groups)}
@@ -527,7 +520,7 @@ def kinds_of_measurements(model: Model) -> NDArray[np.int64]:
     return np.where(camera < 0, -1, camera + len(groups) * surveyed)
 
 
-def weights_of(model: Model, active: Active, factors: _Floats | None = None) -> _Floats:
+def weights_of(model: Model, active: Active, factors: Floats | None = None) -> Floats:
     """Weights of all rows: 0 for what is taken out, 1 / factor² for its group's variance factor."""
     weight = np.ones(model.rows)
     if factors is not None:
@@ -537,7 +530,7 @@ def weights_of(model: Model, active: Active, factors: _Floats | None = None) -> 
     return weight
 
 
-def softened(model: Model, state: State) -> _Floats:
+def softened(model: Model, state: State) -> Floats:
     """Weights that make control no better than what image points say of the ground, while gross errors are sought.
 
     A wrong control point of high weight would otherwise draw its image points along, and these would look wrong.
@@ -559,7 +552,7 @@ def image_on_ground(model: Model, state: State) -> float:
     return float(np.median(np.concatenate([model.sigma.mean(axis=1) * distance / c[model.image], *size])))
 
 
-def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:
+def robust_scale(e: Floats, kind: tuple[str, str]) -> float:
     """Standard deviation of a group's whitened residuals, that one in five gross errors hardly moves.
 
     Image points may be better than stated. Control, positions and attitudes may not: many of them are checked so little
@@ -571,18 +564,18 @@ def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:
     return max(spread(e), _BEST if kind[1] == "px" else 1.0)
 
 
-def _joined(e: _Floats, kind: tuple[str, str]) -> _Floats:
+def _joined(e: Floats, kind: tuple[str, str]) -> Floats:
     """Whitened residuals of a group, each coordinate of an image point replaced by what its length makes of it.
 
     Points of two rays have no residuals along the base, so that half of all coordinates would be small.
     """
     if kind[1] != "px":
         return e
-    length: _Floats = np.linalg.norm(e.reshape(-1, 2), axis=1)
+    length: Floats = np.linalg.norm(e.reshape(-1, 2), axis=1)
     return np.repeat(length * (MEDIAN_1D / MEDIAN_2D), 2)
 
 
-def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
+def robust_weights(model: Model, e: Floats, turn: int) -> Floats:
     """Weights that fall with the residual: Huber's at first, then Geman and McClure's.
 
     Both coordinates of an image point, and all of an observed position, have one weight.
@@ -599,7 +592,7 @@ def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
     return np.nan_to_num(weight)
 
 
-def scales_of(model: Model, e: _Floats) -> _Floats:
+def scales_of(model: Model, e: Floats) -> Floats:
     """Standard deviation of the errors of each group (`kinds_of`), of whitened residuals, in a robust way."""
     kinds, of = kinds_of(model)
     own = e[: len(of)]
@@ -613,7 +606,7 @@ def _stretch(model: Model) -> float:
     return float(np.sqrt(rows / max(rows - unknowns, 0.05 * rows)))
 
 
-def _sizes_robust(model: Model, e: _Floats) -> _Floats:
+def _sizes_robust(model: Model, e: Floats) -> Floats:
     """Length of the whitened residual that each row is part of, in units of one coordinate's."""
     size = np.abs(e)
     for part, n in ((model.parts.image, 2), (model.parts.position, 3)):
@@ -639,7 +632,7 @@ def first_taken_out(model: Model, state: State, active: Active, critical: float)
 
 
 def judged_control(
-    model: Model, state: State, active: Active, factors: _Floats, critical: float
+    model: Model, state: State, active: Active, factors: Floats, critical: float
 ) -> tuple[Active, tuple[str, ...]]:
     """Control of which the largest set agrees, and the names of the largest other set.
 
@@ -659,7 +652,7 @@ def judged_control(
     return replace(active, ground=result.kept), tuple(model.block.ground.names[k] for k in result.alternative)
 
 
-def _without(model: Model, active: Active, bad: NDArray[np.bool_]) -> Active:
+def _without(model: Model, active: Active, bad: Mask) -> Active:
     """Take out the observations whose rows are bad."""
     image, position = active.image.copy(), active.position.copy()
     image[model.observation[bad[model.parts.image].reshape(-1, 2).any(axis=1)]] = False
@@ -737,7 +730,7 @@ class Loop:
         self.count = 0
         self._most, self._progress = most, progress
 
-    def watched(self, model: Model, state: State, base: _Floats) -> tuple[State, frozenset[str]]:
+    def watched(self, model: Model, state: State, base: Floats) -> tuple[State, frozenset[str]]:
         """As `run`, but stopped where the rays of points turn out to be parallel: these points are handed back."""
         watch = _Watch()
         state = self.run(model, state, base, watch=watch)
@@ -748,9 +741,7 @@ class Loop:
         rows, _ = linearise(model, state, np.sqrt(np.where(np.isfinite(e), base, 0.0)))
         return state, frozenset(model.point_names[k] for k in model.point[behind]) | loose_points(model, state, rows)
 
-    def run(
-        self, model: Model, state: State, base: _Floats, robust: bool = False, watch: _Watch | None = None
-    ) -> State:
+    def run(self, model: Model, state: State, base: Floats, robust: bool = False, watch: _Watch | None = None) -> State:
         """The state where the sum of squares with weights `base` (rows,) is least."""
         if robust:
             base = base * softened(model, state)
@@ -855,7 +846,7 @@ class _Descent:
         """Take up the best state next, unless the state at hand is better."""
         self._away = _AWAY
 
-    def step(self, state: State, rows: Rows, weight: _Floats, before: float, redundancy: float) -> _Step:
+    def step(self, state: State, rows: Rows, weight: Floats, before: float, redundancy: float) -> _Step:
         """A step that lowers the sum of squares, damped until it does; a whole one may raise it for once."""
         model = self._model
         while True:
@@ -891,7 +882,7 @@ def _left(gains: list[float]) -> float:
     return last * ratio / (1.0 - ratio) if ratio < 1.0 else np.inf
 
 
-def _cost(e: _Floats, weight: _Floats) -> float:
+def _cost(e: Floats, weight: Floats) -> float:
     """Weighted sum of squares; infinite when a point that counts has come behind a camera."""
     counted = weight > 0
     if not np.isfinite(e[counted]).all():

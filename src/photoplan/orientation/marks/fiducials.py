@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.adjustment.least_squares import solve
+from photoplan.arrays import Floats, Floats32
 from photoplan.cameras.fiducials import FiducialFit, MarkExample, MarkPattern, fit_affine
 from photoplan.errors import InputError, PhotoplanError
 from photoplan.geometry.grid import Window
@@ -63,7 +63,7 @@ class Scan(Protocol):
         """Width and height, pixels."""
         ...
 
-    def grey(self, window: Window, factor: int = 1) -> NDArray[np.float32]:
+    def grey(self, window: Window, factor: int = 1) -> Floats32:
         """Means of blocks of `factor` × `factor` pixels of a window whose sides it divides; NaN: no valid pixel."""
         ...
 
@@ -80,7 +80,7 @@ class MarkSearch:
     """Tones that come into question."""
     scale_tolerance: float = STEP
     """Part of the scale by which the true one may differ from those that are tried."""
-    _surfaces: dict[tuple[int, int, Window], NDArray[np.float64]] = field(default_factory=dict, repr=False)
+    _surfaces: dict[tuple[int, int, Window], Floats] = field(default_factory=dict, repr=False)
     _templates: list[tuple[int, float, Template]] = field(default_factory=list, repr=False)
 
 
@@ -120,7 +120,7 @@ def search_placements(search: MarkSearch, pixels_mm: Sequence[float]) -> list[Ma
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    values: NDArray[np.float64]
+    values: Floats
     origin: tuple[float, float]
     """Column and row in the scan of values[0, 0]."""
     apart: int
@@ -188,7 +188,7 @@ def _region(search: MarkSearch, k: int, turn: ScanTurn, pixel_mm: float, factor:
     return Window(int(c0), int(r0), int(c1 - c0 + 1), int(r1 - r0 + 1))
 
 
-def _padded(scan: Scan, col: int, row: int, width: int, height: int, factor: int) -> NDArray[np.float32]:
+def _padded(scan: Scan, col: int, row: int, width: int, height: int, factor: int) -> Floats32:
     """Coarse pixels of a window that may leave the scan, where they are NaN."""
     most = Window(0, 0, scan.size[0] // factor, scan.size[1] // factor)
     c0, r0 = max(col, 0), max(row, 0)
@@ -200,7 +200,7 @@ def _padded(scan: Scan, col: int, row: int, width: int, height: int, factor: int
     return grey
 
 
-def _peaks(surface: _Surface | None, negative: bool, factor: int) -> NDArray[np.float64]:
+def _peaks(surface: _Surface | None, negative: bool, factor: int) -> Floats:
     """Highest local maxima (minima of a negative): column, row in the scan, correlation; shape (k, 3)."""
     if surface is None:
         return np.empty((0, 3))
@@ -238,7 +238,7 @@ class Measured:
     """Best correlation and reason of those that were not found."""
     expected: Mapping[str, tuple[float, float]]
     """Column and row where the other marks say each one is."""
-    matrix: NDArray[np.float64]
+    matrix: Floats
     """From millimetres to columns and rows, as the last templates were drawn, shape (2, 2)."""
     blur_px: float
 
@@ -252,11 +252,11 @@ class Measured:
 class _Look:
     """How marks look in a round of measuring, and where they are sought."""
 
-    matrix: NDArray[np.float64]
+    matrix: Floats
     blur_px: float
     negative: bool
     least: float
-    expected: NDArray[np.float64]
+    expected: Floats
     radius: Mapping[str, float]
     sigmas: tuple[float, float] = (0.035, 0.02)
     """Standard deviations of rotation (radians) and scale of the matrix."""
@@ -301,7 +301,7 @@ def measure_marks(scan: Scan, layout: MarkLayout, placement: MarkPlacement, leas
     return Measured(placement=placement, found=found, missed=missed, expected=where, matrix=look.matrix, blur_px=blur)
 
 
-def mark_window(scan: Scan, xy: tuple[float, float], half: tuple[int, int]) -> tuple[NDArray[np.float32], int, int]:
+def mark_window(scan: Scan, xy: tuple[float, float], half: tuple[int, int]) -> tuple[Floats32, int, int]:
     """Grey values around a place, 2 half + 1 pixels wide and high, NaN beyond the scan; column and row of the first."""
     col, row = (round(v) - h for v, h in zip(xy, half))
     width, height = (2 * h + 1 for h in half)
@@ -350,7 +350,7 @@ def _locate(scan: Scan, layout: MarkLayout, k: int, look: _Look, radius: float) 
     return _by_edges(at, grey, pattern, look).moved(col, row)
 
 
-def _by_edges(at: Location, grey: NDArray[np.float32], pattern: MarkPattern | MarkExample, look: _Look) -> Location:
+def _by_edges(at: Location, grey: Floats32, pattern: MarkPattern | MarkExample, look: _Look) -> Location:
     """The place by the mark's edges where image content lies beside it; as it was, if they do not confirm it."""
     if not isinstance(pattern, MarkPattern) or not math.isnan(pattern.background) or not math.isfinite(at.x):
         return at
@@ -385,9 +385,7 @@ def _blur(scan: Scan, layout: MarkLayout, look: _Look, found: Mapping[str, Locat
     return float(np.clip(-top[1] / (2 * top[0]), BLURS[k - 1], BLURS[k + 1])) if top[0] < 0 else BLURS[k]
 
 
-def _refit(
-    layout: MarkLayout, placement: MarkPlacement, found: Mapping[str, Location]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _refit(layout: MarkLayout, placement: MarkPlacement, found: Mapping[str, Location]) -> tuple[Floats, Floats]:
     """Matrix of the affine transformation (similarity, below four marks), and where it puts all marks."""
     if len(found) < 2:
         return placement.matrix, placement(layout.mm)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.adjustment.least_squares import Fit, solve
+from photoplan.arrays import Floats, Mask
 from photoplan.cameras.fiducials import FiducialFit, MarkExample, MarkPart, MarkPattern
 from photoplan.errors import InputError
 from photoplan.kernels.matching import correlate, sample_template
@@ -37,7 +38,7 @@ class MarkLayout:
     """Calibrated marks and what each looks like."""
 
     names: tuple[str, ...]
-    mm: NDArray[np.float64]
+    mm: Floats
     """Coordinates in the image plane, x right, y up, millimetres, shape (n, 2)."""
     patterns: tuple[MarkPattern | MarkExample, ...]
 
@@ -82,7 +83,7 @@ class ScanTurn:
     """Left and right were exchanged, before it was turned."""
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Floats:
         """From millimetres (x right, y up) to directions of columns and rows, shape (2, 2)."""
         c, s = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][self.rotation // 90]
         sign = -1.0 if self.mirrored else 1.0
@@ -101,9 +102,9 @@ class MarkPlacement:
 
     turn: ScanTurn
     negative: bool
-    matrix: NDArray[np.float64]
+    matrix: Floats
     """From millimetres to columns and rows, shape (2, 2)."""
-    shift: NDArray[np.float64]
+    shift: Floats
     """Column and row of the image plane's origin."""
     found: Mapping[str, tuple[float, float, float]]
     """Column, row and correlation of each mark that has a candidate where the others say."""
@@ -117,14 +118,12 @@ class MarkPlacement:
         """Side of a pixel, millimetres."""
         return 1.0 / math.sqrt(abs(float(np.linalg.det(self.matrix))))
 
-    def __call__(self, mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, mm: Floats) -> Floats:
         """Points of the image plane (..., 2) to column and row."""
         return mm @ self.matrix.T + self.shift
 
 
-def fit_placement(
-    mm: NDArray[np.float64], xy: NDArray[np.float64], mirrored: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fit_placement(mm: Floats, xy: Floats, mirrored: bool) -> tuple[Floats, Floats]:
     """Matrix (2, 2) and shift (2,) of the similarity that fits points best; two points at least."""
     # As complex numbers; rows run down, so that an upright scan mirrors the plane, and a mirrored one does not.
     z = mm[:, 0] + 1j * mm[:, 1]
@@ -140,7 +139,7 @@ def fit_placement(
 
 def combine(
     layout: MarkLayout,
-    candidates: Sequence[NDArray[np.float64]],
+    candidates: Sequence[Floats],
     turn: ScanTurn,
     negative: bool,
     px_per_mm: float,
@@ -180,10 +179,7 @@ def combine(
 
 
 def _rivals(
-    layout: MarkLayout,
-    candidates: Sequence[NDArray[np.float64]],
-    found: Mapping[str, tuple[float, float, float]],
-    blunt: float,
+    layout: MarkLayout, candidates: Sequence[Floats], found: Mapping[str, tuple[float, float, float]], blunt: float
 ) -> tuple[tuple[str, float, float, float], ...]:
     """Candidates nearly as good as the chosen one that are no other mark."""
     rivals = []
@@ -199,13 +195,13 @@ def _rivals(
 
 def _scores(
     layout: MarkLayout,
-    candidates: Sequence[NDArray[np.float64]],
+    candidates: Sequence[Floats],
     pair: tuple[int, int],
     turn: ScanTurn,
     px_per_mm: float,
     scale_tolerance: float,
     gate: float,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Score of every pair of candidates of two marks, shape (k_i, k_j); −1: impossible."""
     i, j = pair
     ci, cj = candidates[i], candidates[j]
@@ -227,9 +223,7 @@ def _scores(
     return np.where(fits, score, -1.0)
 
 
-def _best_near(
-    candidates: NDArray[np.float64], xy: NDArray[np.float64], gate: float
-) -> tuple[float, float, float] | None:
+def _best_near(candidates: Floats, xy: Floats, gate: float) -> tuple[float, float, float] | None:
     near = candidates[np.hypot(*(candidates[:, :2] - xy).T) <= gate] if len(candidates) else candidates
     if not len(near):
         return None
@@ -279,7 +273,7 @@ class FiducialResult:
     missing: tuple[MissingMark, ...]
     fit: FiducialFit
     """Affine transformation from millimetres to pixels."""
-    residuals_um: NDArray[np.float64]
+    residuals_um: Floats
     """Transformed minus measured position of each mark in `fit`, in the image plane (x right, y up), micrometres."""
     turn: ScanTurn
     """How the upright picture was turned before it was scanned."""
@@ -338,8 +332,8 @@ _LAGS = tuple((dy, dx) for dy in range(4) for dx in range(-3, 4) if 0 < dy * dy 
 class FineTemplate:
     """A mark drawn with several samples in a pixel of the scan."""
 
-    values: NDArray[np.float64]
-    mask: NDArray[np.float64]
+    values: Floats
+    mask: Floats
     """1 where it is compared."""
     reference: tuple[float, float]
     """Column and row of the reference point in `values`."""
@@ -354,7 +348,7 @@ class Match:
     x: float
     y: float
     """Place of the reference point in the window, pixels."""
-    covariance: NDArray[np.float64]
+    covariance: Floats
     """Of x and y, shape (2, 2), pixels²; residuals that resemble their neighbours count less than independent ones."""
     gain: float
     """Grey values of the image for one of the template."""
@@ -366,7 +360,7 @@ class Match:
 
 
 def fine_template(
-    pattern: MarkPattern | MarkExample, mm_to_pixel: NDArray[np.float64], blur_px: float, negative: bool
+    pattern: MarkPattern | MarkExample, mm_to_pixel: Floats, blur_px: float, negative: bool
 ) -> FineTemplate:
     """A mark as the scan's optics blur it and its pixels gather it, sampled more densely than these."""
     coarse = draw(pattern, mm_to_pixel, negative=negative, blur_px=0.0)
@@ -412,15 +406,13 @@ class _Fitted:
     x: float
     y: float
     fit: Fit
-    grey: NDArray[np.float64]
-    T: NDArray[np.float64]
-    used: NDArray[np.bool_]
+    grey: Floats
+    T: Floats
+    used: Mask
     iterations: int
 
 
-def _fit(
-    image: NDArray[np.float64], template: FineTemplate, at: tuple[float, float], start: tuple[float, float]
-) -> _Fitted | None:
+def _fit(image: Floats, template: FineTemplate, at: tuple[float, float], start: tuple[float, float]) -> _Fitted | None:
     """Least squares with the pixels that the template covers at a place; None if it does not converge."""
     x, y = at
     sampled = np.empty((4, *image.shape))
@@ -465,14 +457,12 @@ def _result(fitted: _Fitted) -> Match:
     )
 
 
-def _sample(template: FineTemplate, x: float, y: float, out: NDArray[np.float64]) -> None:
+def _sample(template: FineTemplate, x: float, y: float, out: Floats) -> None:
     k, (rx, ry) = float(template.over), template.reference
     sample_template(template.values, template.mask, np.array([[k, 0.0, rx - k * x], [0.0, k, ry - k * y]]), out)
 
 
-def _covariance(
-    influence: NDArray[np.float64], residuals: NDArray[np.float64], used: NDArray[np.bool_], sigma0: float
-) -> NDArray[np.float64]:
+def _covariance(influence: Floats, residuals: Floats, used: Mask, sigma0: float) -> Floats:
     """Covariance of the shift: BᵀCB, with the influence B of each grey value on it and the correlation of residuals."""
     B = np.zeros((2, *used.shape))
     B[:, used] = influence[:2]
@@ -483,7 +473,7 @@ def _covariance(
     meat = np.einsum("irc,jrc->ij", B, B)
     if variance > 0:
         sums: dict[int, list[float]] = {}
-        parts: dict[int, NDArray[np.float64]] = {}
+        parts: dict[int, Floats] = {}
         for dy, dx in _LAGS:
             here, other = _shifted(dy, dx)
             key = dy * dy + dx * dx
@@ -595,7 +585,7 @@ class Location:
 
 def correlation_surface(
     image: NDArray[np.floating], template: Template, least_share: float = LEAST_SHARE
-) -> tuple[NDArray[np.float64], tuple[float, float]]:
+) -> tuple[Floats, tuple[float, float]]:
     """Correlation coefficients of a template at all places of an image."""
     h, w = image.shape
     a, b = template.values.shape
@@ -615,7 +605,7 @@ def correlation_surface(
 def locate_mark(
     image: NDArray[np.floating],
     pattern: MarkPattern | MarkExample,
-    mm_to_pixel: NDArray[np.float64],
+    mm_to_pixel: Floats,
     *,
     negative: bool = False,
     blur_px: float = 0.7,
@@ -678,10 +668,10 @@ def locate_mark(
 def best_blur(
     image: NDArray[np.floating],
     pattern: MarkPattern | MarkExample,
-    mm_to_pixel: NDArray[np.float64],
+    mm_to_pixel: Floats,
     at: tuple[float, float],
     negative: bool,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Highest correlation within a pixel of a place, for each of `BLURS`; NaN where the image is too small."""
     found = []
     for blur in BLURS:
@@ -761,7 +751,7 @@ def locate_target(image: NDArray[np.floating], *, bright: bool = True) -> MarkTa
     return MarkTarget(at, diameter, bright)
 
 
-def _area(grey: NDArray[np.float64], piece: NDArray[np.bool_]) -> float:
+def _area(grey: Floats, piece: Mask) -> float:
     """Area of a target in pixels: its grey values above the background, divided by its contrast."""
     wide = ndimage.binary_dilation(piece, iterations=4)
     ring = ndimage.binary_dilation(wide, iterations=2) & ~wide & np.isfinite(grey)

@@ -12,6 +12,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from photoplan.adjustment.least_squares import bisquare, solve, spread
+from photoplan.arrays import Floats, Floats32, Ints, Mask
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.errors import InputError
 from photoplan.orientation.marks.locate import Location, correlation_surface, locate_mark
@@ -38,11 +39,11 @@ _FLOOR = 0.3
 class PatternEdges:
     """Points on the edges of a mark's description."""
 
-    points: NDArray[np.float64]
+    points: Floats
     """Shape (n, 2), millimetres."""
-    normals: NDArray[np.float64]
+    normals: Floats
     """Unit vectors from dark to bright, shape (n, 2)."""
-    edge: NDArray[np.int64]
+    edge: Ints
     """Number of the straight piece on which each lies, shape (n,)."""
 
 
@@ -53,7 +54,7 @@ class MarkEdge:
     x: float
     y: float
     """Column and row of the reference point."""
-    covariance: NDArray[np.float64]
+    covariance: Floats
     """Of x and y, shape (2, 2), pixels²; points of one edge that lie close together count as one."""
     rotation: float
     """Anticlockwise as seen in the scan, beside what was given, radians."""
@@ -110,7 +111,7 @@ def pattern_edges(pattern: MarkPattern, spacing: float) -> PatternEdges:
 def fit_edges(
     image: NDArray[np.floating],
     pattern: MarkPattern,
-    mm_to_pixel: NDArray[np.float64],
+    mm_to_pixel: Floats,
     at: tuple[float, float],
     *,
     negative: bool = False,
@@ -162,18 +163,16 @@ def fit_edges(
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    shift: NDArray[np.float64]
-    turn: NDArray[np.float64]
+    shift: Floats
+    turn: Floats
     """Rotation from columns towards rows, radians, and change of scale."""
-    covariance: NDArray[np.float64]
+    covariance: Floats
     rms: float
     used: float
     count: int
 
 
-def _clipped(
-    a: NDArray[np.float64], b: NDArray[np.float64], box: tuple[float, float, float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _clipped(a: Floats, b: Floats, box: tuple[float, float, float, float]) -> tuple[Floats, Floats]:
     """The part of a line inside a box; of no length outside."""
     low, high = 0.0, 1.0
     for axis, (least, most) in enumerate(((box[0], box[2]), (box[1], box[3]))):
@@ -189,7 +188,7 @@ def _clipped(
     return a + low * (b - a), a + high * (b - a)
 
 
-def _tone(pattern: MarkPattern, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _tone(pattern: MarkPattern, points: Floats) -> Floats:
     """Tone of the description at points; NaN where it is not compared."""
     tone = np.full(len(points), pattern.background)
     for part in pattern.parts:
@@ -197,7 +196,7 @@ def _tone(pattern: MarkPattern, points: NDArray[np.float64]) -> NDArray[np.float
     return tone
 
 
-def _inside(outline: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _inside(outline: Floats, points: Floats) -> Mask:
     """Whether points lie in a polygon: an odd number of its edges lies to their right."""
     inside = np.zeros(len(points), bool)
     x, y = points.T
@@ -208,7 +207,7 @@ def _inside(outline: NDArray[np.float64], points: NDArray[np.float64]) -> NDArra
     return inside
 
 
-def _smoothed(image: NDArray[np.floating]) -> NDArray[np.float64]:
+def _smoothed(image: NDArray[np.floating]) -> Floats:
     """Grey values without grain; NaN stays and does not spread."""
     grey = np.asarray(image, np.float64)
     known = np.isfinite(grey)
@@ -219,9 +218,7 @@ def _smoothed(image: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.where(known, value / np.maximum(weight, 1e-9), np.nan)
 
 
-def _edge_offsets(
-    smooth: NDArray[np.float64], xy: NDArray[np.float64], normal: NDArray[np.float64], reach: float
-) -> NDArray[np.float64]:
+def _edge_offsets(smooth: Floats, xy: Floats, normal: Floats, reach: float) -> Floats:
     """Distance along each normal to the steepest rise, carried to the middle of both sides' levels; NaN: none."""
     fine = 0.25
     half = math.ceil((reach + _SIDE) / fine)
@@ -261,11 +258,7 @@ def _edge_offsets(
 
 
 def _adjust(
-    about: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    offset: NDArray[np.float64],
-    edge: NDArray[np.int64],
-    prior: tuple[NDArray[np.float64], NDArray[np.float64]],
+    about: Floats, normal: Floats, offset: Floats, edge: Ints, prior: tuple[Floats, Floats]
 ) -> _Solution | None:
     """Shift, rotation and scale from distances along normals, robust; covariance from clusters of points.
 
@@ -368,7 +361,7 @@ class AloneMark:
 def find_mark(
     image: NDArray[np.floating],
     pattern: MarkPattern | MarkExample,
-    mm_to_pixel: NDArray[np.float64],
+    mm_to_pixel: Floats,
     *,
     negative: bool = False,
     blur_px: float = 0.7,
@@ -435,16 +428,11 @@ def _nothing(why: str) -> AloneMark:
     )
 
 
-_Found = tuple[float, tuple[float, float], MarkEdge | None, NDArray[np.float64]]
+_Found = tuple[float, tuple[float, float], MarkEdge | None, Floats]
 
 
 def _by_edges(
-    grey: NDArray[np.float32],
-    pattern: MarkPattern | MarkExample,
-    matrix: NDArray[np.float64],
-    coarse: _Place,
-    negative: bool,
-    blur_px: float,
+    grey: Floats32, pattern: MarkPattern | MarkExample, matrix: Floats, coarse: _Place, negative: bool, blur_px: float
 ) -> _Found:
     """Correlation with finer pixels near a coarse place, where it is highest, the place by edges, and the matrix."""
     x, y, _, _, factor = coarse
@@ -511,7 +499,7 @@ def _judged(
     )
 
 
-def _disagreement(grey: NDArray[np.float32], template: Template, at: tuple[float, float]) -> float:
+def _disagreement(grey: Floats32, template: Template, at: tuple[float, float]) -> float:
     """How much better the worst quarter of a template correlates somewhere near than at a place; 1: not seen there."""
     part, origin = _around(grey, template, at, _NEAR)
     column, row = (round(at[k] - origin[k] - template.reference[k]) for k in (0, 1))
@@ -527,7 +515,7 @@ def _disagreement(grey: NDArray[np.float32], template: Template, at: tuple[float
     return worst
 
 
-def _turn(degrees: float) -> NDArray[np.float64]:
+def _turn(degrees: float) -> Floats:
     """Rotation anticlockwise as seen in the scan, in columns and rows."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[c, s], [-s, c]])
@@ -543,7 +531,7 @@ class _Place(NamedTuple):
     factor: int
 
 
-def _coarse(grey: NDArray[np.float32], template: Template) -> _Place:
+def _coarse(grey: Floats32, template: Template) -> _Place:
     """Where a template suits best, with coarse pixels."""
     factor = max(1, round(min(template.values.shape) / _COARSE))
     small, at = _shrunk_template(template, factor)
@@ -566,7 +554,7 @@ def _coarse(grey: NDArray[np.float32], template: Template) -> _Place:
     return _Place(x=x, y=y, correlation=float(surface[row, column]), second=second, factor=factor)
 
 
-def _shrunk(grey: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+def _shrunk(grey: Floats32, factor: int) -> Floats32:
     """Means of blocks; NaN where less than half of a block is valid."""
     rows, columns = (n // factor * factor for n in grey.shape)
     blocks = grey[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
@@ -590,8 +578,8 @@ def _shrunk_template(template: Template, factor: int) -> tuple[Template, tuple[f
 
 
 def _around(
-    grey: NDArray[np.float32], template: Template, at: tuple[float, float], margin: int
-) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    grey: Floats32, template: Template, at: tuple[float, float], margin: int
+) -> tuple[Floats32, tuple[int, int]]:
     """The part of a window that a template may cover, NaN outside the window; column and row of its first pixel."""
     rows, columns = template.values.shape
     col, row = (math.floor(at[k] - template.reference[k]) - margin for k in (0, 1))

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.arrays import Floats, Floats32
 from photoplan.cameras.fiducials import MarkExample, MarkPart, MarkPattern
 from photoplan.errors import InputError
 from photoplan.kernels.raster import polygon_coverage
@@ -29,9 +29,9 @@ matching would be drawn there by a quarter of a pixel."""
 class Template:
     """A mark in pixels."""
 
-    values: NDArray[np.float32]
+    values: Floats32
     """Grey values, shape (rows, columns); without meaning where the weight is 0."""
-    weights: NDArray[np.float32]
+    weights: Floats32
     """How much each pixel counts, at least 0; 0: not compared. Same shape."""
     reference: tuple[float, float]
     """Column and row of the mark's reference point in `values`; (0, 0) is the centre of the first pixel."""
@@ -41,7 +41,7 @@ class Template:
             raise InputError(f"template of shape {self.values.shape} with weights of shape {self.weights.shape}")
 
 
-def coverage(outline: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
+def coverage(outline: Floats, shape: tuple[int, int]) -> Floats:
     """Share of each pixel's area that a polygon covers, exact."""
     total = np.empty((shape[0], shape[1] + 1))
     polygon_coverage(np.asarray(outline, np.float64) + 0.5, total)
@@ -50,7 +50,7 @@ def coverage(outline: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np
 
 def render(
     pattern: MarkPattern | MarkExample,
-    mm_to_pixel: NDArray[np.float64] | Sequence[Sequence[float]],
+    mm_to_pixel: Floats | Sequence[Sequence[float]],
     *,
     negative: bool = False,
     blur_px: float = 0.7,
@@ -97,7 +97,7 @@ def render(
     return Template(values, weights, at)
 
 
-def _corners(pattern: MarkPattern | MarkExample) -> NDArray[np.float64]:
+def _corners(pattern: MarkPattern | MarkExample) -> Floats:
     """Corners of what is compared about the reference point, shape (4, 2), millimetres."""
     if isinstance(pattern, MarkPattern):
         x0, y0, x1, y1 = pattern.window
@@ -110,7 +110,7 @@ def _corners(pattern: MarkPattern | MarkExample) -> NDArray[np.float64]:
 
 
 def _frame(
-    pattern: MarkPattern | MarkExample, matrix: NDArray[np.float64], offset: tuple[float, float]
+    pattern: MarkPattern | MarkExample, matrix: Floats, offset: tuple[float, float]
 ) -> tuple[tuple[int, int], tuple[float, float]]:
     """Rows and columns of the template, and where the reference point is in it."""
     corners = _corners(pattern) @ matrix.T + offset
@@ -127,8 +127,8 @@ def _frame(
 
 
 def _draw(
-    pattern: MarkPattern, matrix: NDArray[np.float64], shape: tuple[int, int], at: tuple[float, float], blur_px: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    pattern: MarkPattern, matrix: Floats, shape: tuple[int, int], at: tuple[float, float], blur_px: float
+) -> tuple[Floats32, Floats32]:
     """Values and weights of a drawn pattern; each part covers those before it in proportion to its share of a pixel."""
     margin = int(np.ceil(4 * blur_px)) + 1
     wide = (shape[0] + 2 * margin, shape[1] + 2 * margin)
@@ -160,8 +160,8 @@ def _draw(
 
 
 def _resample(
-    example: MarkExample, matrix: NDArray[np.float64], shape: tuple[int, int], at: tuple[float, float]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    example: MarkExample, matrix: Floats, shape: tuple[int, int], at: tuple[float, float]
+) -> tuple[Floats32, Floats32]:
     """Values and weights of an example, cubic; smoothed first, more where the scan's pixels are larger than its own."""
     given = np.asarray(example.values, np.float64)
     valid = np.isfinite(given)
@@ -189,7 +189,7 @@ def _resample(
 
 def draw(
     pattern: MarkPattern | MarkExample,
-    mm_to_pixel: NDArray[np.float64] | Sequence[Sequence[float]],
+    mm_to_pixel: Floats | Sequence[Sequence[float]],
     *,
     negative: bool = False,
     blur_px: float = 0.7,
@@ -210,14 +210,14 @@ _SIDES = 120
 """Vertices of a circle: its radius is then right to 0.02 %, its area exact."""
 
 
-def disc(diameter: float, centre: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+def disc(diameter: float, centre: tuple[float, float] = (0.0, 0.0)) -> Floats:
     """Polygon with the area of a circle, shape (n, 2)."""
     angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
     radius = diameter / 2 * math.sqrt(2 * np.pi / _SIDES / math.sin(2 * np.pi / _SIDES))
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1) + centre
 
 
-def turned(outline: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+def turned(outline: Floats, degrees: float) -> Floats:
     """Points turned anticlockwise about the origin."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.asarray(outline, np.float64) @ np.array([[c, s], [-s, c]])
@@ -230,7 +230,7 @@ def mirrored(pattern: MarkPattern) -> MarkPattern:
     return MarkPattern(pattern.name, parts, pattern.background, (-x1, y0, -x0, y1))
 
 
-def box_of(outlines: Iterable[NDArray[np.float64]], margin: float) -> tuple[float, float, float, float]:
+def box_of(outlines: Iterable[Floats], margin: float) -> tuple[float, float, float, float]:
     """Window around outlines: xmin, ymin, xmax, ymax."""
     points = np.concatenate([*outlines])
     (x0, y0), (x1, y1) = points.min(axis=0) - margin, points.max(axis=0) + margin
@@ -304,7 +304,7 @@ def dot_cross(
 
 
 def polygon(
-    parts: Sequence[tuple[NDArray[np.float64], float]],
+    parts: Sequence[tuple[Floats, float]],
     *,
     background: float = math.nan,
     window: tuple[float, float, float, float] | None = None,
@@ -334,14 +334,14 @@ def polygon(
     return MarkPattern(name, tuple(made), background, box)
 
 
-def _ring(name: str, diameter: float, width: float) -> list[tuple[NDArray[np.float64], float]]:
+def _ring(name: str, diameter: float, width: float) -> list[tuple[Floats, float]]:
     _positive(name, diameter=diameter, width=width)
     if 2 * width >= diameter:
         raise InputError(f"{name}: width {width} mm; less than half of the diameter of {diameter} mm is needed")
     return [(disc(diameter), 1.0), (disc(diameter - 2 * width), 0.0)]
 
 
-def _arms(arm: float, width: float, free: float, rotation: float) -> list[tuple[NDArray[np.float64], float]]:
+def _arms(arm: float, width: float, free: float, rotation: float) -> list[tuple[Floats, float]]:
     half = width / 2
     first = np.array([(free, -half), (arm, -half), (arm, half), (free, half)])
     if free == 0:
@@ -351,7 +351,7 @@ def _arms(arm: float, width: float, free: float, rotation: float) -> list[tuple[
 
 
 def _mark(
-    name: str, parts: Sequence[tuple[NDArray[np.float64], float]], bright: bool, margin: float | None, least: float
+    name: str, parts: Sequence[tuple[Floats, float]], bright: bool, margin: float | None, least: float
 ) -> MarkPattern:
     """A pattern from parts that are 1 on ground 0."""
     if margin is not None and not (math.isfinite(margin) and margin >= 0):
@@ -513,7 +513,7 @@ def arc(
     return _silhouette("arc", outline, window, made, arms, corners=corners)
 
 
-def _arc(start: tuple[float, float], end: tuple[float, float]) -> NDArray[np.float64]:
+def _arc(start: tuple[float, float], end: tuple[float, float]) -> Floats:
     """Circular arc from a point to another one, where it is horizontal; its centre lies below the end."""
     (x0, y0), (x1, y1) = start, end
     radius = ((x1 - x0) ** 2 + (y1 - y0) ** 2) / (2 * (y1 - y0))
@@ -524,7 +524,7 @@ def _arc(start: tuple[float, float], end: tuple[float, float]) -> NDArray[np.flo
 
 def _silhouette(
     name: str,
-    outline: NDArray[np.float64],
+    outline: Floats,
     window: tuple[float, float, float, float],
     style: Style,
     extra: list[MarkPart],
@@ -566,7 +566,7 @@ def _finish(name: str, parts: list[MarkPart], window: tuple[float, float, float,
     return MarkPattern(name, made, math.nan, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))
 
 
-def _rectangle(a: tuple[float, ...], b: tuple[float, ...], left: float, right: float) -> NDArray[np.float64]:
+def _rectangle(a: tuple[float, ...], b: tuple[float, ...], left: float, right: float) -> Floats:
     """Along a line from a to b, so far to its left and right."""
     p, q = np.asarray(a, np.float64), np.asarray(b, np.float64)
     along = (q - p) / np.hypot(*(q - p))

@@ -15,9 +15,8 @@ from scipy import ndimage, optimize, special
 
 from photoplan.adjustment.least_squares import Decomposed, solve
 from photoplan.adjustment.statistics import chance_gain, chance_t
+from photoplan.arrays import Floats, Floats32, Ints, Mask
 from photoplan.errors import GeometryError, InputError
-
-Array = NDArray[np.float64]
 
 #: Values below which no exponential is fitted: its three unknowns need something that checks them.
 LEAST_VALUES = 8
@@ -58,7 +57,7 @@ class Approach:
         """Whether a change is real, with a chance of error of 1 %."""
         return self.probability < LEVEL
 
-    def at(self, time: Array | float) -> Array:
+    def at(self, time: Floats | float) -> Floats:
         """Values of the curve at times since the first value; the mean where there is no curve."""
         t = np.asarray(time, float)
         if self.start is None or self.end is None or self.time_constant is None:
@@ -74,7 +73,7 @@ class Approach:
         return max(0.0, self.time_constant * math.log(max(abs(self.change), 1e-300) / bound))
 
 
-def check_times(times: Array, what: str) -> Array:
+def check_times(times: Floats, what: str) -> Floats:
     """Times as finite, increasing numbers."""
     t = np.asarray(times, float)
     if t.ndim != 1:
@@ -92,7 +91,7 @@ def check_times(times: Array, what: str) -> Array:
     return t
 
 
-def fit_approach(times: Array, values: Array, what: str = "series") -> Approach:
+def fit_approach(times: Floats, values: Floats, what: str = "series") -> Approach:
     """Exponential by least squares, tested against a constant."""
     t, y = _checked(times, values, what)
     t = t - t[0]
@@ -121,7 +120,7 @@ def fit_approach(times: Array, values: Array, what: str = "series") -> Approach:
     )
 
 
-def _checked(times: Array, values: Array, what: str) -> tuple[Array, Array]:
+def _checked(times: Floats, values: Floats, what: str) -> tuple[Floats, Floats]:
     t, y = check_times(times, what), np.asarray(values, float)
     if y.shape != t.shape:
         raise InputError(f"{what}: {y.size} values at {t.size} times; as many of both are needed")
@@ -132,14 +131,14 @@ def _checked(times: Array, values: Array, what: str) -> tuple[Array, Array]:
     return t, y
 
 
-def _for_tau(t: Array, y: Array, tau: float) -> tuple[Array, float]:
+def _for_tau(t: Floats, y: Floats, tau: float) -> tuple[Floats, float]:
     """Start and end for a given time constant, and the sum of squares that remains."""
     decay = np.exp(-t / tau)
     fit = solve(np.column_stack([decay, 1.0 - decay]), y)
     return fit.unknowns, fit.square
 
 
-def _refined(t: Array, y: Array, taus: Array, best: int) -> tuple[float, float, float, float]:
+def _refined(t: Floats, y: Floats, taus: Floats, best: int) -> tuple[float, float, float, float]:
     low, high = taus[max(best - 1, 0)], taus[min(best + 1, len(taus) - 1)]
     found = optimize.minimize_scalar(
         lambda log_tau: _for_tau(t, y, math.exp(log_tau))[1],
@@ -152,7 +151,7 @@ def _refined(t: Array, y: Array, taus: Array, best: int) -> tuple[float, float, 
     return float(start), float(end), tau, rss
 
 
-def _probability(rss0: float, rss1: float, n: int, taus: Array) -> float:
+def _probability(rss0: float, rss1: float, n: int, taus: Floats) -> float:
     """Of the F-test; as the best of many time constants was taken, the chances of independent ones add up."""
     if rss1 <= 1e-24 * max(rss0, 1e-300):
         return 0.0 if rss0 > 0.0 else 1.0
@@ -160,7 +159,7 @@ def _probability(rss0: float, rss1: float, n: int, taus: Array) -> float:
     return min(1.0, trials * chance_gain(rss0, rss1, 2, n - 3))
 
 
-def _sigmas(t: Array, found: tuple[float, float, float], rms: float) -> tuple[float, float, float, float]:
+def _sigmas(t: Floats, found: tuple[float, float, float], rms: float) -> tuple[float, float, float, float]:
     """Of start, end, time constant and change."""
     start, end, tau = found
     decay = np.exp(-t / tau)
@@ -173,7 +172,7 @@ def _sigmas(t: Array, found: tuple[float, float, float], rms: float) -> tuple[fl
     return math.sqrt(Q[0, 0]), math.sqrt(Q[1, 1]), math.sqrt(Q[2, 2]), math.sqrt(max(of_change, 0.0))
 
 
-def _verdict(t: Array, tau: float, sigma_tau: float, change: tuple[float, float]) -> str:
+def _verdict(t: Floats, tau: float, sigma_tau: float, change: tuple[float, float]) -> str:
     step = float(np.median(np.diff(t)))
     if tau > 2.0 * t[-1] or (tau > t[-1] / 2.0 and not sigma_tau < _KNOWN * tau):
         return (
@@ -199,9 +198,9 @@ class Course:
 
     name: str
     unit: str
-    values: Array
+    values: Floats
     """Against the reference, shape (m,)."""
-    sigmas: Array
+    sigmas: Floats
     approach: Approach | None
     """Exponential course; None: too few epochs."""
     largest: float
@@ -213,7 +212,7 @@ class Movement:
     """How far each target moved."""
 
     name: str
-    shift: Array
+    shift: Floats
     """Against the reference, shape (m, 2), pixels."""
     largest: tuple[float, float]
     """Largest minus smallest column and row."""
@@ -223,7 +222,7 @@ class Movement:
 class WarmUp:
     """Drift of the camera's coordinate system against the targets."""
 
-    times: Array
+    times: Floats
     """Of the epochs since the first, seconds, shape (m,)."""
     model: str
     courses: tuple[Course, ...]
@@ -244,7 +243,7 @@ class WarmUp:
 
 
 def warm_up(
-    times: Array, positions: Mapping[str, Array], *, model: str | None = None, reference: str = "first"
+    times: Floats, positions: Mapping[str, Floats], *, model: str | None = None, reference: str = "first"
 ) -> WarmUp:
     """Separate shift, scale and rotation of targets over time.
 
@@ -287,11 +286,11 @@ def warm_up(
     )
 
 
-def _known(values: Array) -> Array:
+def _known(values: Floats) -> Floats:
     return values[np.isfinite(values)]
 
 
-def _stacked(t: Array, positions: Mapping[str, Array]) -> tuple[tuple[str, ...], Array]:
+def _stacked(t: Floats, positions: Mapping[str, Floats]) -> tuple[tuple[str, ...], Floats]:
     """Names, and positions of shape (targets, epochs, repetitions, 2)."""
     if not positions:
         raise InputError("warm-up: no target is given")
@@ -324,7 +323,7 @@ def _check_model(model: str, names: tuple[str, ...], reference: str) -> None:
         )
 
 
-def _repeatability(P: Array) -> tuple[tuple[float, float] | None, int]:
+def _repeatability(P: Floats) -> tuple[tuple[float, float] | None, int]:
     """Pooled standard deviation within the epochs, and its redundancy per coordinate."""
     counts = np.isfinite(P).all(axis=3).sum(axis=2)
     redundancy = int(np.clip(counts - 1, 0, None).sum())
@@ -336,7 +335,7 @@ def _repeatability(P: Array) -> tuple[tuple[float, float] | None, int]:
     return (float(x), float(y)), redundancy
 
 
-def _design(d: Array, model: str) -> Array:
+def _design(d: Floats, model: str) -> Floats:
     """Columns and rows of offsets d (k, 2) from the centre: derivatives by the unknowns, shape (2 k, u)."""
     k = len(d)
     A = np.zeros((2, k, 2 + len(MODELS[model])))
@@ -358,14 +357,14 @@ def _design(d: Array, model: str) -> Array:
 class _Epochs:
     """Parameters of every epoch, their cofactors; sums of squares of columns and rows, redundancy and weights."""
 
-    values: Array
-    cofactors: Array
-    squares: Array
+    values: Floats
+    cofactors: Floats
+    squares: Floats
     freedom: int
-    weights: Array
+    weights: Floats
 
 
-def _epochs(d: Array, moved: Array, model: str, repeat: tuple[float, float] | None) -> _Epochs:
+def _epochs(d: Floats, moved: Floats, model: str, repeat: tuple[float, float] | None) -> _Epochs:
     A = _design(d, model)
     k, m, u = len(d), moved.shape[1], A.shape[1]
     parts = Decomposed.of(A)
@@ -391,7 +390,7 @@ def _epochs(d: Array, moved: Array, model: str, repeat: tuple[float, float] | No
     return _Epochs(values=values, cofactors=cofactors, squares=squares, freedom=max(freedom, 0), weights=weights)
 
 
-def _weights(repeat: tuple[float, float] | None) -> Array:
+def _weights(repeat: tuple[float, float] | None) -> Floats:
     """Of columns and rows, from the repetitions."""
     if repeat is None or not min(repeat) > 0.0:
         return np.ones(2)
@@ -399,8 +398,8 @@ def _weights(repeat: tuple[float, float] | None) -> Array:
 
 
 def _sigmas_warm_up(
-    epochs: _Epochs, repeat: tuple[float, float] | None, P: Array, reference: str
-) -> tuple[Array, tuple[float, float]]:
+    epochs: _Epochs, repeat: tuple[float, float] | None, P: Floats, reference: str
+) -> tuple[Floats, tuple[float, float]]:
     """Standard deviations of the parameters against the reference, and sigma0 of an epoch's columns and rows.
 
     The variance of unit weight comes from residuals where these have redundancy, else from repetitions.
@@ -423,7 +422,7 @@ def _sigmas_warm_up(
     return sigmas, sigma0
 
 
-def _courses(t: Array, values: Array, sigmas: Array, model: str) -> tuple[Course, ...]:
+def _courses(t: Floats, values: Floats, sigmas: Floats, model: str) -> tuple[Course, ...]:
     names = ("shift_x", "shift_y", *MODELS[model])
     units = {"shift_x": "px", "shift_y": "px", "rotation": "rad", "shear": "rad"}
     out = []
@@ -472,13 +471,13 @@ _CLASSES = 12
 class Variation:
     """How much grey values differ over a lapse of time: from flicker, where it is short, to drift."""
 
-    lapse: Array
+    lapse: Floats
     """Seconds, shape (k,)."""
-    structure: Array
+    structure: Floats
     """Root of half the mean squared difference of two values this lapse apart; for white noise, its sigma; (k,)."""
-    pairs: NDArray[np.int64]
+    pairs: Ints
     """Of values, shape (k,)."""
-    allan: Array
+    allan: Floats
     """Allan deviation of means over the lapse; for white noise it falls by its root; NaN: not enough means, (k,)."""
 
 
@@ -516,8 +515,8 @@ class BrightnessDrift:
     pixel_noise: float | None
     """σ that the noise of the pixels leaves in the mean of the window; None: not known."""
     variation: Variation
-    times: Array
-    values: Array
+    times: Floats
+    values: Floats
 
     @property
     def drifts(self) -> bool:
@@ -531,7 +530,7 @@ class BrightnessDrift:
 
 
 def brightness_drift(
-    times: Array, values: Array, pixel_noise: float | None = None, name: str = "series"
+    times: Floats, values: Floats, pixel_noise: float | None = None, name: str = "series"
 ) -> BrightnessDrift:
     """Figures of repeated measurements of one constant brightness."""
     t, y = check_times(times, name), np.asarray(values, float)
@@ -575,7 +574,7 @@ def brightness_drift(
     )
 
 
-def _trend(t: Array, y: Array) -> tuple[float, float, float]:
+def _trend(t: Floats, y: Floats) -> tuple[float, float, float]:
     """Slope per hour, its standard deviation and the chance of as much without trend.
 
     Successive residuals of a drifting brightness resemble each other: n of them count as n (1 − r) / (1 + r), with r
@@ -597,7 +596,7 @@ def _trend(t: Array, y: Array) -> tuple[float, float, float]:
     return slope, sigma, chance_t(slope / sigma, freedom)
 
 
-def _variation(t: Array, y: Array) -> Variation:
+def _variation(t: Floats, y: Floats) -> Variation:
     """Structure function over classes of lapse that double, and Allan deviation where the intervals are equal."""
     n = len(t)
     intervals = np.diff(t)
@@ -620,7 +619,7 @@ def _variation(t: Array, y: Array) -> Variation:
     return Variation(np.array(lapses), np.array(structure), np.array(pairs, np.int64), np.array(allan))
 
 
-def _allan(y: Array, m: int) -> float:
+def _allan(y: Floats, m: int) -> float:
     """Deviation of overlapping means of m values: root of half the mean square of differences of adjacent means."""
     total = np.concatenate([[0.0], np.cumsum(y - y.mean())])
     means = (total[m:] - total[:-m]) / m
@@ -650,11 +649,11 @@ class Blooming:
     onset_dn_sigma: float
     last_without: float
     """Object's grey value above black at the longest exposure without blooming."""
-    object_dn: NDArray[np.float64]
+    object_dn: Floats
     """Grey value of the object above black that its response promises at each exposure."""
-    excess_dn: NDArray[np.float64]
+    excess_dn: Floats
     """Grey value of the neighbours above what was expected."""
-    excess_sigma: NDArray[np.float64]
+    excess_sigma: Floats
     extent_rows: int
     """Pixels beyond the object along columns (up or down) that are lifted at `extent_exposure`."""
     extent_columns: int
@@ -732,9 +731,7 @@ def _brightest(image: NDArray[Any]) -> float:
     return float(ndimage.median_filter(np.asarray(image, np.float32), 3, mode="nearest").max())
 
 
-def _response(
-    exposures: Sequence[float], lights: Sequence[NDArray[np.float32]], safe: Sequence[int]
-) -> NDArray[np.float64]:
+def _response(exposures: Sequence[float], lights: Sequence[Floats32], safe: Sequence[int]) -> Floats:
     """Grey values per exposure of every pixel, from the exposures without saturation."""
     total = np.zeros(lights[0].shape)
     weight = 0.0
@@ -744,7 +741,7 @@ def _response(
     return total / weight
 
 
-def _object(response: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _object(response: Floats) -> Mask:
     """Pixels of the brightest object: over half of the largest response, the largest connected patch."""
     top = _brightest(response)
     patches, count = ndimage.label(response > 0.5 * top)
@@ -760,13 +757,13 @@ def _object(response: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(found)
 
 
-def _grown(bright: NDArray[np.bool_], full: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _grown(bright: Mask, full: Mask) -> Mask:
     """The object with the full pixels that are connected to it."""
     patches, _ = ndimage.label(bright | full)
     return np.isin(patches, np.unique(patches[bright]))
 
 
-def _neighbours(response: NDArray[np.float64], bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _neighbours(response: Floats, bright: Mask) -> Mask:
     """Dark pixels close to the object."""
     square = np.ones((3, 3), bool)
     far = ndimage.binary_dilation(bright, square, _FAR)
@@ -777,13 +774,8 @@ def _neighbours(response: NDArray[np.float64], bright: NDArray[np.bool_]) -> NDA
 
 
 def _sigmas_blooming(
-    lights: Sequence[NDArray[np.float32]],
-    times: NDArray[np.float64],
-    response: NDArray[np.float64],
-    near: NDArray[np.bool_],
-    safe: Sequence[int],
-    step: float,
-) -> NDArray[np.float64]:
+    lights: Sequence[Floats32], times: Floats, response: Floats, near: Mask, safe: Sequence[int], step: float
+) -> Floats:
     """Standard deviation of the mean excess: noise of the neighbours, and that of their responses."""
     residual = np.concatenate([(lights[k][near] - response[near] * times[k]) for k in safe])
     freedom = max(residual.size - near.sum(), 1)
@@ -795,9 +787,7 @@ def _sigmas_blooming(
     return np.asarray(np.sqrt(grown**2 + (of_response * times) ** 2) / sqrt(near.sum()))
 
 
-def _onset(
-    level: NDArray[np.float64], excess: NDArray[np.float64], sigma: NDArray[np.float64], usable: NDArray[np.bool_]
-) -> tuple[float, float, float]:
+def _onset(level: Floats, excess: Floats, sigma: Floats, usable: Mask) -> tuple[float, float, float]:
     """Where the excess leaves zero by the line through the first levels with blooming, its sigma, last without."""
     above = excess > _SIGNIFICANT * sigma
     without = np.flatnonzero(~above)
@@ -817,18 +807,18 @@ def _onset(
     return (last + upper) / 2, (upper - last) / sqrt(12.0), last
 
 
-def _crossing(level: NDArray[np.float64], excess: NDArray[np.float64]) -> float:
+def _crossing(level: Floats, excess: Floats) -> float:
     """Where the line through two levels has no excess; NaN where it does not grow."""
     slope = (excess[1] - excess[0]) / (level[1] - level[0])
     return float(level[0] - excess[0] / slope) if slope > 0 else nan
 
 
-def _extent(lifted: NDArray[np.bool_], bright: NDArray[np.bool_], grown: NDArray[np.bool_]) -> tuple[int, int]:
+def _extent(lifted: Mask, bright: Mask, grown: Mask) -> tuple[int, int]:
     """Longest unbroken run of lifted pixels from the grown object along the object's columns and along its rows."""
     return _run(lifted, bright, grown), _run(lifted.T, bright.T, grown.T)
 
 
-def _run(lifted: NDArray[np.bool_], bright: NDArray[np.bool_], grown: NDArray[np.bool_]) -> int:
+def _run(lifted: Mask, bright: Mask, grown: Mask) -> int:
     longest = 0
     for col in np.flatnonzero(bright.any(axis=0)):
         rows = np.flatnonzero(grown[:, col])

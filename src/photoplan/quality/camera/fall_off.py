@@ -11,10 +11,9 @@ import scipy
 from numpy.typing import NDArray
 
 from photoplan.adjustment.least_squares import bisquare, by_differences, solve, spread
+from photoplan.arrays import Floats, Floats32
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.grid import Window
-
-Array = NDArray[np.float64]
 
 _AT_ONCE = 1 << 21
 """Pixels whose gain is computed at once."""
@@ -63,14 +62,14 @@ class FallOffModel:
         """The unit of the radius, pixels."""
         return math.hypot(*self.size) / 2.0
 
-    def natural(self, x: Array, y: Array) -> Array:
+    def natural(self, x: Floats, y: Floats) -> Floats:
         """cos⁴ω at columns and rows; 1 where there is no natural part."""
         x, y = np.asarray(x, float) - self.principal_point[0], np.asarray(y, float) - self.principal_point[1]
         if self.camera_constant is None:
             return np.ones(np.broadcast_shapes(x.shape, y.shape))
         return (1.0 + (x**2 + y**2) / self.camera_constant**2) ** -2
 
-    def artificial(self, x: Array, y: Array) -> Array:
+    def artificial(self, x: Floats, y: Floats) -> Floats:
         """What the natural part leaves, 1 at the principal point."""
         unit = self.half_diagonal
         u = (np.asarray(x, float) - self.principal_point[0]) / unit
@@ -80,12 +79,12 @@ class FallOffModel:
             total += factor * term_values(u, v, term)
         return total
 
-    def relative(self, x: Array, y: Array) -> Array:
+    def relative(self, x: Floats, y: Floats) -> Floats:
         """Brightness at columns and rows, 1 at the principal point."""
         return self.natural(x, y) * self.artificial(x, y)
 
 
-def term_values(u: Array, v: Array, term: tuple[int, int]) -> Array:
+def term_values(u: Floats, v: Floats, term: tuple[int, int]) -> Floats:
     """r^n cos(m θ), or for negative m r^n sin(|m| θ), of u = r cos θ and v = r sin θ."""
     n, m = term
     square = u * u + v * v
@@ -128,7 +127,7 @@ def correct_fall_off(pixels: NDArray[Any], window: Window, model: FallOffModel) 
     return out, clipped
 
 
-def gain_image(model: FallOffModel, factor: int = 1) -> NDArray[np.float32]:
+def gain_image(model: FallOffModel, factor: int = 1) -> Floats32:
     """Gains 1 / relative brightness at the middles of blocks of `factor` × `factor` pixels, shape (h, w) / factor.
 
     Blocks at the right and lower border may reach beyond the image.
@@ -151,7 +150,7 @@ def largest_gain(model: FallOffModel) -> float:
     return float(_gain(model, x[None, :], y[:, None]).max())
 
 
-def _gain(model: FallOffModel, x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:
+def _gain(model: FallOffModel, x: NDArray[np.floating], y: NDArray[np.floating]) -> Floats:
     relative = model.relative(np.asarray(x, float), np.asarray(y, float))
     if relative.min() < _FAINT:
         raise InputError(
@@ -211,21 +210,21 @@ class FallOffFit:
     """Unknowns: those of the natural part first, see `moved`, then level and level · coefficients."""
 
     model: FallOffModel
-    linear: Array
-    covariance: Array
-    weights: Array
-    residuals: Array
+    linear: Floats
+    covariance: Floats
+    weights: Floats
+    residuals: Floats
     free: tuple[str, ...]
 
 
-def design(blocks: Blocks, model: FallOffModel) -> Array:
+def design(blocks: Blocks, model: FallOffModel) -> Floats:
     """Columns of the linear unknowns for all known blocks, shape (n, 1 + terms): the level, then each term."""
     u, v = ((at - p) / model.half_diagonal for at, p in zip((blocks.x, blocks.y), model.principal_point))
     natural = model.natural(blocks.x, blocks.y)
     return natural[:, None] * np.column_stack([np.ones_like(u), *(term_values(u, v, t) for t in model.terms)])
 
 
-def moved(model: FallOffModel, free: tuple[str, ...], step: Array) -> FallOffModel:
+def moved(model: FallOffModel, free: tuple[str, ...], step: Floats) -> FallOffModel:
     """A model whose natural part has gone a step: log of the camera constant, principal point in half diagonals."""
     by, unit, c, point = dict(zip(free, step)), model.half_diagonal, model.camera_constant, list(model.principal_point)
     if CONSTANT in by and c is not None:
@@ -237,7 +236,7 @@ def moved(model: FallOffModel, free: tuple[str, ...], step: Array) -> FallOffMod
 
 
 def adjust(
-    blocks: Blocks, settings: FallOffSettings, terms: tuple[tuple[int, int], ...], weights: Array | None = None
+    blocks: Blocks, settings: FallOffSettings, terms: tuple[tuple[int, int], ...], weights: Floats | None = None
 ) -> FallOffFit:
     """Gauss-Newton for the unknowns of the natural part beside the linear ones.
 
@@ -299,13 +298,13 @@ def _start_constant(blocks: Blocks, point: tuple[float, float]) -> float:
     return plain.half_diagonal * math.sqrt(2.0 / fall)
 
 
-def _design_with(blocks: Blocks, model: FallOffModel, linear: Array, free: tuple[str, ...]) -> Array:
+def _design_with(blocks: Blocks, model: FallOffModel, linear: Floats, free: tuple[str, ...]) -> Floats:
     """Derivatives by all unknowns, those of the natural part by differences."""
     by = by_differences(lambda step: design(blocks, moved(model, free, step)) @ linear, np.zeros(len(free)), 1e-4)
     return np.column_stack([by, design(blocks, model)])
 
 
-def _covariance(blocks: Blocks, J: Array, residuals: Array, w: Array) -> Array:
+def _covariance(blocks: Blocks, J: Floats, residuals: Floats, w: Floats) -> Floats:
     """Of all unknowns; larger by what neighbouring residuals resemble each other, as fewer blocks are independent."""
     used = w > 0.0
     freedom = max(int(used.sum()) - J.shape[1], 1)
@@ -369,21 +368,21 @@ class Blocks:
     """Of a block, pixels."""
     offset: tuple[int, int]
     """Column and row of the first block's first pixel."""
-    values: Array
+    values: Floats
     """Shape (rows, columns); NaN: not known."""
 
     @property
-    def known(self) -> Array:
+    def known(self) -> Floats:
         """Values of the blocks that have one, shape (n,)."""
         return self.values[np.isfinite(self.values)]
 
     @property
-    def x(self) -> Array:
+    def x(self) -> Floats:
         """Columns of their middles, shape (n,)."""
         return self._middles(1)
 
     @property
-    def y(self) -> Array:
+    def y(self) -> Floats:
         """Rows of their middles, shape (n,)."""
         return self._middles(0)
 
@@ -391,17 +390,17 @@ class Blocks:
         """Column and row of the upper left corner of a block."""
         return self.offset[0] + column * self.side - 0.5, self.offset[1] + row * self.side - 0.5
 
-    def spread_out(self, known: Array) -> Array:
+    def spread_out(self, known: Floats) -> Floats:
         """Values of the known blocks where they lie, NaN elsewhere, shape (rows, columns)."""
         out = np.full(self.values.shape, np.nan)
         out[np.isfinite(self.values)] = known
         return out
 
-    def neighbour_correlation(self, known: Array) -> float:
+    def neighbour_correlation(self, known: Floats) -> float:
         """Correlation of values of blocks beside and below each other; NaN among them is left out."""
         return float(np.mean(self._correlations(known)))
 
-    def inflation(self, known: Array) -> float:
+    def inflation(self, known: Floats) -> float:
         """By how much variances grow as neighbours are not independent (first-order Markov process in both ways)."""
         count = int(np.isfinite(known).sum())
         factor = 1.0
@@ -411,7 +410,7 @@ class Blocks:
                 factor *= (1.0 + r) / (1.0 - r)
         return factor
 
-    def _correlations(self, known: Array) -> tuple[float, float]:
+    def _correlations(self, known: Floats) -> tuple[float, float]:
         field = self.spread_out(known)
         field = field - np.nanmean(field)
         variance = float(np.nanmean(field**2))
@@ -421,7 +420,7 @@ class Blocks:
         below = float(np.nanmean(field[1:] * field[:-1])) / variance
         return beside, below
 
-    def _middles(self, axis: int) -> Array:
+    def _middles(self, axis: int) -> Floats:
         index = np.indices(self.values.shape)[axis][np.isfinite(self.values)]
         return self.offset[1 - axis] + index * self.side + (self.side - 1) / 2.0
 
@@ -522,7 +521,7 @@ class FallOff:
     """Brightest minus darkest block before the correction, part of the level."""
     dirt: tuple[Dirt, ...] = ()
     blocks: Blocks | None = None
-    residuals: Array | None = None
+    residuals: Floats | None = None
     """Relative residuals of the blocks, measured minus model, shape (h, w); NaN: block not known."""
 
     @property
@@ -604,7 +603,7 @@ def _rank(fit: FallOffFit, shares: dict[str, float], settings: FallOffSettings) 
     )
 
 
-def _result(blocks: Blocks, fit: FallOffFit, of_corners: Array, rank: str, shares: dict[str, float]) -> FallOff:
+def _result(blocks: Blocks, fit: FallOffFit, of_corners: Floats, rank: str, shares: dict[str, float]) -> FallOff:
     k, level, C, model = len(fit.free), float(fit.linear[0]), fit.covariance, fit.model
     factors, c = np.array(model.coefficients), model.camera_constant
     # a_k = (level · a_k) / level
@@ -638,18 +637,18 @@ def _result(blocks: Blocks, fit: FallOffFit, of_corners: Array, rank: str, share
     )
 
 
-def _corner_places(size: tuple[int, int]) -> tuple[Array, Array]:
+def _corner_places(size: tuple[int, int]) -> tuple[Floats, Floats]:
     """Columns and rows of the centres of the four corner pixels."""
     right, lower = size[0] - 1.0, size[1] - 1.0
     return np.array([0.0, right, 0.0, right]), np.array([0.0, 0.0, lower, lower])
 
 
-def _corner_sigmas(fit: FallOffFit) -> Array:
+def _corner_sigmas(fit: FallOffFit) -> Floats:
     """Standard deviations of the brightness in the corners, by differences."""
     x, y = _corner_places(fit.model.size)
     k, linear = len(fit.free), fit.linear
 
-    def relative(unknowns: Array) -> Array:
+    def relative(unknowns: Floats) -> Floats:
         model = moved(fit.model, fit.free, unknowns[:k])
         return replace(model, coefficients=tuple(unknowns[k + 1 :] / unknowns[k])).relative(x, y)
 
@@ -658,7 +657,7 @@ def _corner_sigmas(fit: FallOffFit) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.diag(J @ fit.covariance @ J.T), 0.0)))
 
 
-def _corners(model: FallOffModel, sigmas: Array) -> tuple[Corner, ...]:
+def _corners(model: FallOffModel, sigmas: Floats) -> tuple[Corner, ...]:
     """Fall-off in the centres of the four corner pixels."""
     names = ("upper left", "upper right", "lower left", "lower right")
     places = _corner_places(model.size)
@@ -670,7 +669,7 @@ def _corners(model: FallOffModel, sigmas: Array) -> tuple[Corner, ...]:
     )
 
 
-def _dirt(blocks: Blocks, residuals: Array, relative: Array) -> tuple[Dirt, ...]:
+def _dirt(blocks: Blocks, residuals: Floats, relative: Floats) -> tuple[Dirt, ...]:
     """Connected blocks that stand out, the deepest first."""
     known = np.isfinite(residuals)
     # In grey values: the relative noise is larger in the corners.

@@ -13,10 +13,9 @@ from scipy import special
 
 from photoplan.adjustment.least_squares import Fit, by_differences, solve
 from photoplan.adjustment.statistics import chance_chi_square, chance_f, chance_gain
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.cameras.fiducials import Affine2D, AffineFacts, affine_facts
 from photoplan.errors import GeometryError, InputError
-
-Array = NDArray[np.float64]
 
 #: Points of a calibration: three determine an affine transformation, the fourth checks it. More than
 #: the most are no targets that somebody measured.
@@ -34,17 +33,17 @@ class StageCalibration:
     """Affine transformation between stage and image, and what it means."""
 
     names: tuple[str, ...]
-    stage: Array
+    stage: Floats
     """Stage coordinates, shape (n, 2)."""
-    measured: Array
+    measured: Floats
     """Columns and rows, shape (n, 2), pixels."""
     to_image: Affine2D
     """From stage to image: X = a1 x + a2 y + a3, Y = a4 x + a5 y + a6."""
     to_stage: Affine2D
     """From image to stage."""
-    covariance: Array
+    covariance: Floats
     """Of a1 … a6, shape (6, 6)."""
-    residuals: Array
+    residuals: Floats
     """Measured minus transformed, shape (n, 2), pixels; of all points."""
     sigma: tuple[float, float]
     """Standard deviation of a column and of a row."""
@@ -67,7 +66,7 @@ class StageCalibration:
         return -(self.facts.direction_x + self.facts.direction_y) * _GON
 
 
-def stage_calibration(names: Iterable[str], stage: Array, measured: Array) -> StageCalibration:
+def stage_calibration(names: Iterable[str], stage: Floats, measured: Floats) -> StageCalibration:
     """Adjust the affine transformation from a stage's coordinates to columns and rows.
 
     A point whose studentised residual is beyond chance is left out, one after the other.
@@ -112,7 +111,7 @@ def stage_calibration(names: Iterable[str], stage: Array, measured: Array) -> St
     )
 
 
-def _checked(names: Iterable[str], stage: Array, measured: Array) -> tuple[tuple[str, ...], Array, Array]:
+def _checked(names: Iterable[str], stage: Floats, measured: Floats) -> tuple[tuple[str, ...], Floats, Floats]:
     labels = tuple(names)
     S, P = np.asarray(stage, float), np.asarray(measured, float)
     if S.shape != (len(labels), 2) or P.shape != S.shape:
@@ -145,7 +144,7 @@ def _checked(names: Iterable[str], stage: Array, measured: Array) -> tuple[tuple
     return labels, S, P
 
 
-def _worst(fit: Fit, used: NDArray[np.bool_]) -> int | None:
+def _worst(fit: Fit, used: Mask) -> int | None:
     """The point whose residual is farthest beyond what the others allow; None: no gross error."""
     freedom = fit.redundancy
     if freedom < 6 or not fit.square > 1e-18 * float((fit.A**2).mean()):
@@ -157,11 +156,11 @@ def _worst(fit: Fit, used: NDArray[np.bool_]) -> int | None:
     return int(np.flatnonzero(used)[k]) if chance_f(ratio[k], 2, freedom - 2) * len(square) < LEVEL else None
 
 
-def _sigmas(forward: Affine2D, covariance: Array) -> tuple[tuple[float, float], tuple[float, float], float]:
+def _sigmas(forward: Affine2D, covariance: Floats) -> tuple[tuple[float, float], tuple[float, float], float]:
     """Of pixel sizes, directions and shear, by differences."""
     start = np.array([forward.a1, forward.a2, forward.a3, forward.a4, forward.a5, forward.a6])
 
-    def figures(elements: Array) -> Array:
+    def figures(elements: Floats) -> Floats:
         f = affine_facts(Affine2D(*(float(v) for v in elements)))
         # Next to their values, whose turn does not matter, angles have no jump.
         near = [math.remainder(a - b, math.tau) for a, b in zip(_angles(f), _angles(affine_facts(forward)))]
@@ -176,7 +175,7 @@ def _angles(facts: AffineFacts) -> tuple[float, float, float]:
     return facts.direction_x, facts.direction_y, facts.shear
 
 
-def _systematic(S: Array, residuals: Array) -> float | None:
+def _systematic(S: Floats, residuals: Floats) -> float | None:
     """F-test of second-order terms in the residuals (figs. B.2 and B.3 let one suspect them)."""
     n = len(S)
     if n < 9:
@@ -254,7 +253,7 @@ class StraightLine:
         """Standard deviation of the slope."""
         return sqrt(self.covariance[2])
 
-    def at(self, x: ArrayLike) -> NDArray[np.float64]:
+    def at(self, x: ArrayLike) -> Floats:
         """y at x, same shape."""
         return np.asarray(self.offset + self.slope * np.asarray(x, float))
 
@@ -288,12 +287,12 @@ def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike) -> StraightLine:
 class GreyWedge:
     """Result for one wedge at one illumination."""
 
-    density: NDArray[np.float64]
+    density: Floats
     """Increasing."""
-    signal: NDArray[np.float64]
+    signal: Floats
     """Grey values above black."""
-    transmission: NDArray[np.float64]
-    used: NDArray[np.bool_]
+    transmission: Floats
+    used: Mask
     """Patches that are neither saturated nor black."""
     gamma: float
     """Slope of the logarithm of the signal over that of the transmission; 1 for a linear sensor."""
@@ -371,9 +370,9 @@ class EdgeLines:
 
     method: str
     """`correlation` or `least squares`."""
-    position: Array
+    position: Floats
     """Column in the window, shape (n,); NaN: no edge in this line."""
-    sigma: Array
+    sigma: Floats
     """Standard deviations as the fit to the line's pixels states them; NaN where the method states none, (n,)."""
     contrast: float
     """Bright side minus dark side, grey values."""
@@ -395,12 +394,12 @@ class EdgeLines:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    position: Array
-    contrast: Array
+    position: Floats
+    contrast: Floats
     width: float
-    residuals: Array
-    sigma: Array
-    sigma_contrast: Array
+    residuals: Floats
+    sigma: Floats
+    sigma_contrast: Floats
 
 
 def fit_edge(grey: NDArray[np.floating], *, name: str = "edge", saturation: float | None = None) -> EdgeLines:
@@ -458,7 +457,7 @@ def correlate_edge(grey: NDArray[np.floating], fitted: EdgeLines, *, name: str =
     )
 
 
-def _window(grey: NDArray[np.floating], name: str) -> Array:
+def _window(grey: NDArray[np.floating], name: str) -> Floats:
     if grey.ndim != 2 or grey.shape[0] < LEAST_LINES or grey.shape[1] < 2 * _REACH + 4:
         raise InputError(
             f"{name}: a window of {grey.shape[-1]} columns and {len(grey)} lines; at least {2 * _REACH + 4} columns "
@@ -472,7 +471,7 @@ def _window(grey: NDArray[np.floating], name: str) -> Array:
     return np.asarray(grey, float)
 
 
-def _coarse(g: Array, name: str) -> tuple[NDArray[np.int64], float]:
+def _coarse(g: Floats, name: str) -> tuple[Ints, float]:
     """Column of the greatest step in every line, all steps of the direction that most have; signed contrast."""
     total = np.concatenate([np.zeros((len(g), 1)), np.nancumsum(g, axis=1)], axis=1)
     means = (total[:, _STEP:] - total[:, :-_STEP]) / _STEP
@@ -491,7 +490,7 @@ def _coarse(g: Array, name: str) -> tuple[NDArray[np.int64], float]:
     return column.astype(np.int64), sign * max(up, down)
 
 
-def _sides(g: Array, coarse: NDArray[np.int64]) -> tuple[Array, Array]:
+def _sides(g: Floats, coarse: Ints) -> tuple[Floats, Floats]:
     """Pixels on the left and on the right of the edge, four to seven pixels away."""
     offsets = np.arange(3, _REACH)
     rows = np.arange(len(g))[:, None]
@@ -500,7 +499,7 @@ def _sides(g: Array, coarse: NDArray[np.int64]) -> tuple[Array, Array]:
     return left.ravel(), right.ravel()
 
 
-def _refuse_cut(g: Array, coarse: NDArray[np.int64], contrast: float, name: str, saturation: float | None) -> None:
+def _refuse_cut(g: Floats, coarse: Ints, contrast: float, name: str, saturation: float | None) -> None:
     """Raise where one side of the edge lies at the end of the range: its place would be wrong."""
     left, right = _sides(g, coarse)
     dark, bright = (left, right) if contrast > 0.0 else (right, left)
@@ -522,7 +521,7 @@ def _refuse_cut(g: Array, coarse: NDArray[np.int64], contrast: float, name: str,
         )
 
 
-def _adjusted(g: Array, coarse: NDArray[np.int64]) -> _Fit:
+def _adjusted(g: Floats, coarse: Ints) -> _Fit:
     """g = base + contrast Φ((x − p) / s) for every line, s common."""
     n, m = len(g), 2 * _REACH
     columns = coarse[:, None] + np.arange(-_REACH, _REACH)
@@ -565,7 +564,7 @@ def _adjusted(g: Array, coarse: NDArray[np.int64]) -> _Fit:
     )
 
 
-def _solve(A: Array, y: Array) -> tuple[Array, Array]:
+def _solve(A: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Least squares of many lines at once: unknowns and cofactors."""
     N = np.einsum("nij,nik->njk", A, A)
     N += 1e-12 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(A.shape[2])
@@ -573,7 +572,7 @@ def _solve(A: Array, y: Array) -> tuple[Array, Array]:
     return np.einsum("njk,nik,ni->nj", Q, A, y), Q
 
 
-def _typical_square(residuals: Array) -> float:
+def _typical_square(residuals: Floats) -> float:
     """Variance of a grey value from the median line, so that lines that fit badly do not count."""
     if not len(residuals):
         return math.inf
@@ -582,13 +581,13 @@ def _typical_square(residuals: Array) -> float:
     return float(np.median((residuals**2).sum(axis=1))) / (freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3)
 
 
-def _calm(residuals: Array) -> Array:
+def _calm(residuals: Floats) -> Floats:
     """Weights of lines: 0 where they fit far worse than most of them."""
     rms = np.sqrt((residuals**2).mean(axis=1))
     return (rms <= 4.0 * np.median(rms)).astype(float)
 
 
-def _correlations(g: Array, pattern: Array) -> Array:
+def _correlations(g: Floats, pattern: Floats) -> Floats:
     """Coefficients of the pattern at every place of every line, eq. 4.1; NaN where grey values do not vary."""
     windows = np.lib.stride_tricks.sliding_window_view(g, PATTERN, axis=1)
     centred = pattern - pattern.mean()
@@ -598,7 +597,7 @@ def _correlations(g: Array, pattern: Array) -> Array:
         return np.where(variance > 0.0, product / np.sqrt(variance * float(centred @ centred)), np.nan)
 
 
-def _refuse_missing(seen: NDArray[np.bool_], name: str) -> None:
+def _refuse_missing(seen: Mask, name: str) -> None:
     lost = np.flatnonzero(~seen)
     if len(lost) > _MISSING * len(seen) or len(seen) - len(lost) < LEAST_LINES:
         listed = ", ".join(str(i) for i in lost[:8]) + (" …" if len(lost) > 8 else "")

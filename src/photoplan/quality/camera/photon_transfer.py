@@ -12,6 +12,7 @@ from scipy.special import erfc
 
 from photoplan.adjustment.least_squares import solve, spread
 from photoplan.adjustment.statistics import chance_chi_square, chance_t
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.findings import with_sigma
 from photoplan.quality.camera.geometry import fit_line
@@ -63,7 +64,7 @@ class VarianceCurve:
         """Chance that a response without bend looks as bent."""
         return 1.0 if len(self.covariance) < 3 else chance_t(self.bend / sqrt(self.covariance[2][2]), self.degrees)
 
-    def at(self, mean: ArrayLike) -> NDArray[np.float64]:
+    def at(self, mean: ArrayLike) -> Floats:
         """Variance at mean grey values, same shape."""
         x = np.asarray(mean, float) - self.origin
         return np.asarray(self.value + x * (self.slope + x * self.bend))
@@ -91,10 +92,10 @@ class PhotonTransfer:
     bias_dn: float
     """Grey value without signal; NaN if unknown."""
     curve: VarianceCurve
-    mean: NDArray[np.float64]
+    mean: Floats
     """Grey values of the levels, increasing."""
-    variance: NDArray[np.float64]
-    used: NDArray[np.bool_]
+    variance: Floats
+    used: Mask
     """Levels that the curve was fitted to."""
 
     @property
@@ -215,9 +216,7 @@ def photon_transfer(
     )
 
 
-def _curve(
-    mean: NDArray[np.float64], variance: NDArray[np.float64], degrees: NDArray[np.int_], origin: float
-) -> VarianceCurve:
+def _curve(mean: Floats, variance: Floats, degrees: NDArray[np.int_], origin: float) -> VarianceCurve:
     """A line, or a parabola where that is significantly better and not all of the levels are needed for it."""
     bent = _polynomial(mean, variance, degrees, origin, 2) if len(mean) > 4 else None
     return (
@@ -227,9 +226,7 @@ def _curve(
     )
 
 
-def _polynomial(
-    mean: NDArray[np.float64], variance: NDArray[np.float64], degrees: NDArray[np.int_], origin: float, degree: int
-) -> VarianceCurve:
+def _polynomial(mean: Floats, variance: Floats, degrees: NDArray[np.int_], origin: float, degree: int) -> VarianceCurve:
     """Variance over mean; weights by the variance of a variance, from the curve itself."""
     reach = float(np.abs(mean - origin).max()) or 1.0
     design = np.vander((mean - origin) / reach, degree + 1, increasing=True)
@@ -259,7 +256,7 @@ def _polynomial(
     return found if found.fits else replace(found, covariance=tuple(map(tuple, (Q * found.scatter**2).tolist())))
 
 
-def _peak(mean: NDArray[np.float64], variance: NDArray[np.float64], degrees: NDArray[np.int_]) -> int | None:
+def _peak(mean: Floats, variance: Floats, degrees: NDArray[np.int_]) -> int | None:
     """Level of the largest variance, if the variance falls significantly behind it."""
     if not len(mean):
         return None
@@ -338,22 +335,22 @@ LOW, HIGH = 0.05, 0.95
 class Linearity:
     """Result for one series of levels."""
 
-    exposure: NDArray[np.float64]
+    exposure: Floats
     """Exposures of the levels, increasing, in the unit that was given (ms, photons …)."""
-    signal: NDArray[np.float64]
+    signal: Floats
     """Grey values above black."""
-    response: NDArray[np.float64]
+    response: Floats
     """Signal over exposure."""
-    response_sigma: NDArray[np.float64]
-    segment: NDArray[np.float64]
+    response_sigma: Floats
+    segment: Floats
     """Slope between each level and the one before; NaN for the first."""
-    used: NDArray[np.bool_]
+    used: Mask
     """Levels between 5 % and 95 % of saturation."""
     offset: float
     slope: float
     """Line of least relative deviations."""
     slope_sigma: float
-    deviation_percent: NDArray[np.float64]
+    deviation_percent: Floats
     """Relative deviation from the line, %."""
     error_percent: float
     """Linearity error: mean absolute deviation of the used levels."""
@@ -410,7 +407,7 @@ def linearity(
     )
 
 
-def _error_sigma(deviation: NDArray[np.float64], residual: NDArray[np.float64], sigma: NDArray[np.float64]) -> float:
+def _error_sigma(deviation: Floats, residual: Floats, sigma: Floats) -> float:
     """Standard deviation of a mean of absolute deviations, which share the noise of the line.
 
     Noise alone makes an amount larger than 0, so what it is expected to add to each counts as well.
@@ -425,7 +422,7 @@ def _error_sigma(deviation: NDArray[np.float64], residual: NDArray[np.float64], 
     return float(np.hypot(np.sqrt(scatter @ scatter), added.mean()))
 
 
-def _refuse_falling(x: NDArray[np.float64], y: NDArray[np.float64], s: NDArray[np.float64], top: float) -> None:
+def _refuse_falling(x: Floats, y: Floats, s: Floats, top: float) -> None:
     """A signal that falls while the exposure grows is no series of exposures."""
     noise = 5 * np.hypot(s[1:], s[:-1]) + 0.01 * np.maximum(np.abs(y[:-1]), 1.0)
     falls = (np.diff(y) < -np.nan_to_num(noise)) & (y[:-1] < top)
@@ -522,21 +519,21 @@ def find_saturation(
     )
 
 
-def _black_of_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+def _black_of_line(x: Floats, y: Floats) -> float:
     """Grey value at no exposure of the line of least relative deviations; not below 0, nor above the darkest level."""
     below = np.maximum(y, 1e-300)
     offset, _ = solve(np.column_stack([1 / below, x / below]), np.ones_like(x)).unknowns
     return float(np.clip(offset, 0.0, max(0.0, float(y[0]))))
 
 
-def _first(signs: NDArray[np.bool_]) -> int | None:
+def _first(signs: Mask) -> int | None:
     """The first level from which on all show the sign."""
     without = np.flatnonzero(~signs)
     first = int(without[-1]) + 1 if without.size else 0
     return first if first < signs.size else None
 
 
-def _first_departure(x: NDArray[np.float64], signal: NDArray[np.float64]) -> int | None:
+def _first_departure(x: Floats, signal: Floats) -> int | None:
     """Level from which on the response stays below that of the darker ones, with a flat end."""
     with np.errstate(invalid="ignore", divide="ignore"):
         response = signal / x
@@ -548,7 +545,7 @@ def _first_departure(x: NDArray[np.float64], signal: NDArray[np.float64]) -> int
     return first if last_slope < 0.1 * reference else None
 
 
-def _first_collapse(variance: NDArray[np.float64]) -> int | None:
+def _first_collapse(variance: Floats) -> int | None:
     """Level behind the largest variance, where the last is less than half of it."""
     if not np.isfinite(variance).all():
         return None
@@ -563,15 +560,15 @@ def _first_collapse(variance: NDArray[np.float64]) -> int | None:
 class EmvaPoints:
     """Levels of one measurement: bright and dark at the same exposure; arrays of shape (n,)."""
 
-    photons: NDArray[np.float64]
+    photons: Floats
     """Mean photons per pixel; NaN: unknown (then neither efficiency nor threshold)."""
-    mean: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    dark_mean: NDArray[np.float64]
-    dark_variance: NDArray[np.float64]
-    samples: NDArray[np.float64]
+    mean: Floats
+    variance: Floats
+    dark_mean: Floats
+    dark_variance: Floats
+    samples: Floats
     """Degrees of freedom of each variance."""
-    mean_sigma: NDArray[np.float64]
+    mean_sigma: Floats
     """Standard deviation of the signal (mean less dark mean), the flicker of the lamp included."""
 
     def __post_init__(self) -> None:
@@ -618,7 +615,7 @@ class EmvaSheet:
     linearity: Linearity | None
     saturation_index: int
     """Level of the largest variance."""
-    used: NDArray[np.bool_]
+    used: Mask
     """Levels between 0 and 70 % of saturation."""
     refused: Mapping[str, str]
 
@@ -684,7 +681,7 @@ def _db(ratio: float) -> float:
     return 20 * log10(ratio) if isfinite(ratio) and ratio > 0 else nan
 
 
-def _through_origin(x: NDArray[np.float64], y: NDArray[np.float64], sigma: ArrayLike) -> tuple[float, float]:
+def _through_origin(x: Floats, y: Floats, sigma: ArrayLike) -> tuple[float, float]:
     """Slope of an unweighted line through the origin, and its sigma by propagation, or by the scatter where larger."""
     slope = float(x @ y / (x @ x))
     stated = float(np.sqrt(np.sum((x * np.asarray(sigma)) ** 2)) / (x @ x))
@@ -694,9 +691,7 @@ def _through_origin(x: NDArray[np.float64], y: NDArray[np.float64], sigma: Array
     return slope, max(stated, scatter)
 
 
-def _responsivity(
-    p: EmvaPoints, signal: NDArray[np.float64], used: NDArray[np.bool_], refused: dict[str, str]
-) -> tuple[float, float]:
+def _responsivity(p: EmvaPoints, signal: Floats, used: Mask, refused: dict[str, str]) -> tuple[float, float]:
     if not np.isfinite(p.photons).all() or not (p.photons > 0).all():
         refused["quantum efficiency"] = (
             "photons per pixel are not stated; give photons_per_pixel, or irradiance_uw_cm2 with wavelength_nm, "
@@ -728,7 +723,7 @@ def _dark_noise(
 
 
 def _saturation(
-    p: EmvaPoints, signal: NDArray[np.float64], top: int | None, gain: float, gain_sigma: float, responsivity: float
+    p: EmvaPoints, signal: Floats, top: int | None, gain: float, gain_sigma: float, responsivity: float
 ) -> tuple[float, float, float]:
     """Saturation capacity in photons and electrons, and the sigma of the latter by the spacing of the levels."""
     if top is None:
@@ -743,9 +738,7 @@ def _saturation(
     return nan, electrons, electrons * relative
 
 
-def _linearity(
-    p: EmvaPoints, signal: NDArray[np.float64], top: int | None, refused: dict[str, str]
-) -> Linearity | None:
+def _linearity(p: EmvaPoints, signal: Floats, top: int | None, refused: dict[str, str]) -> Linearity | None:
     if not np.isfinite(p.photons).all():
         refused["linearity error"] = "photons per pixel are not stated"
         return None

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, special
 
 from photoplan.adjustment.least_squares import spread
+from photoplan.arrays import Floats, Ints, Mask
 from photoplan.errors import InputError
 from photoplan.findings import with_sigma
 from photoplan.quality.camera.geometry import StraightLine, fit_line
@@ -106,14 +107,14 @@ class FrameStack:
     """Images of the frames of one condition."""
 
     level: Level
-    mean: NDArray[np.float64]
+    mean: Floats
     """Mean image, shape (h, w)."""
-    variance: NDArray[np.float64] | None
+    variance: Floats | None
     """Temporal variance of every pixel; None for a single frame."""
-    counted: NDArray[np.bool_] | None
+    counted: Mask | None
     """Pixels that the summary counts; None: all."""
 
-    def only_counted(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
+    def only_counted(self, image: Floats) -> Floats:
         """Mean image or variance with NaN where pixels do not count."""
         return image if self.counted is None else np.where(self.counted, image, np.nan)
 
@@ -121,13 +122,13 @@ class FrameStack:
 class StackSums:
     """Gathers frames one after the other: memory holds two images, however many frames there are."""
 
-    def __init__(self, saturation: float, counted: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, saturation: float, counted: Mask | None = None) -> None:
         self._saturation, self._counted = saturation, counted
         self._means: list[float] = []
         self._saturated = self._zero = 0
         self._largest, self._smallest = -np.inf, np.inf
-        self._mean: NDArray[np.float64] | None = None
-        self._squares: NDArray[np.float64] | None = None
+        self._mean: Floats | None = None
+        self._squares: Floats | None = None
 
     def add(self, frame: NDArray[Any]) -> None:
         """One more frame, shape (h, w)."""
@@ -279,9 +280,7 @@ class PatternVariance:
     """True if the slow variation was taken out."""
 
 
-def pattern_variance(
-    mean: NDArray[np.float64], temporal_variance: float, frames: int, *, filtered: bool = False
-) -> PatternVariance:
+def pattern_variance(mean: Floats, temporal_variance: float, frames: int, *, filtered: bool = False) -> PatternVariance:
     """Spatial variances of the mean image of several frames."""
     height, width = mean.shape
     if min(height, width) < _LEAST_SIDE:
@@ -344,9 +343,9 @@ def prnu_percent(bright: PatternVariance, dark: PatternVariance | float = 0.0) -
 class Spectrogram:
     """Spectrum along rows or columns, mean over them."""
 
-    frequency: NDArray[np.float64]
+    frequency: Floats
     """Cycles per pixel of the plane, without 0."""
-    amplitude: NDArray[np.float64]
+    amplitude: Floats
     """Root of the power, grey values; white noise of standard deviation s has s everywhere."""
     white: float
     """Level of the white part: the median."""
@@ -356,7 +355,7 @@ class Spectrogram:
     """Frequency of the largest peak that stands out (5 times its neighbourhood); NaN: there is none."""
 
 
-def spectrogram(mean: NDArray[np.float64], axis: int) -> Spectrogram:
+def spectrogram(mean: Floats, axis: int) -> Spectrogram:
     """Spectrogram of a mean image along an axis: 1 along rows (horizontal), 0 along columns."""
     values = mean - mean.mean()
     length = values.shape[axis]
@@ -383,7 +382,7 @@ _BINOMIAL = (0.25, 0.5, 0.25)
 BLOCK = 16
 
 
-def _smooth(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smooth(image: Floats) -> Floats:
     for side in _BOXES:
         image = ndimage.uniform_filter(image, side, mode="reflect")
     for axis in (0, 1):
@@ -391,11 +390,11 @@ def _smooth(image: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(image)
 
 
-def _share(image: NDArray[np.float64]) -> float:
+def _share(image: Floats) -> float:
     return float(np.sum((image - _smooth(image))[:, 20] ** 2))
 
 
-def _impulse() -> NDArray[np.float64]:
+def _impulse() -> Floats:
     impulse = np.zeros((41, 41))
     impulse[20, 20] = 1.0
     return impulse
@@ -407,18 +406,18 @@ LINE_SHARE = _share(np.repeat(_impulse()[:, 20:21], 41, axis=1))
 """Part of the variance of independent offsets of rows, or of columns, that it leaves."""
 
 
-def high_pass(image: NDArray[Any]) -> NDArray[np.float64]:
+def high_pass(image: NDArray[Any]) -> Floats:
     """An image without its slow variation, shape (h, w); white noise keeps `WHITE_SHARE` of its variance."""
     values = np.asarray(image, np.float64)
     return values - _smooth(values)
 
 
-def _median(block: NDArray[np.float64]) -> float:
+def _median(block: Floats) -> float:
     known = block[~np.isnan(block)]
     return float(np.median(known)) if known.size else float("nan")
 
 
-def background(image: NDArray[Any]) -> NDArray[np.float64]:
+def background(image: NDArray[Any]) -> Floats:
     """Slow variation of an image by medians of blocks of 16 × 16 pixels, linear between their middles.
 
     NaN does not count; a block without a value takes that of the nearest block with one.
@@ -479,11 +478,11 @@ class DefectList:
     """Grey values; the median where it differs from place to place."""
     scatter: float
     """Standard deviation of what most pixels show, grey values."""
-    deviation: NDArray[np.float64] | None
+    deviation: Floats | None
     """Deviation of every pixel; None for lines and blinking."""
 
 
-def _scatter(values: NDArray[np.float64], least: float) -> float:
+def _scatter(values: Floats, least: float) -> float:
     """Robust standard deviation, not below `least`."""
     return max(spread(values, None), least)
 
@@ -494,7 +493,7 @@ def _factor(count: int) -> float:
 
 
 def find_defects(
-    mean: NDArray[np.float64],
+    mean: Floats,
     temporal_variance: float,
     frames: int,
     kinds: tuple[Kind, ...],
@@ -541,9 +540,7 @@ def find_defects(
     )
 
 
-def _strongest(
-    found: NDArray[np.bool_], kind: Callable[[int, int], Kind], value: NDArray[np.float64], ratio: NDArray[np.float64]
-) -> tuple[Defect, ...]:
+def _strongest(found: Mask, kind: Callable[[int, int], Kind], value: Floats, ratio: Floats) -> tuple[Defect, ...]:
     """The pixels that were found, by how far they are beyond the threshold."""
     rows, cols = np.nonzero(found)
     order = np.argsort(-ratio[rows, cols], kind="stable")[:MOST]
@@ -553,7 +550,7 @@ def _strongest(
     )
 
 
-def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0) -> DefectList:
+def find_blinking(variance: Floats, frames: int, step: float = 1.0) -> DefectList:
     """Pixels whose grey value changes from frame to frame far more than that of most."""
     if frames < 4:
         raise InputError(f"{frames} frames at a setting; blinking pixels need four or more")
@@ -573,7 +570,7 @@ def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0)
     )
 
 
-def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
+def find_lines(mean: Floats, step: float = 1.0) -> DefectList:
     """Whole rows and columns brighter or darker than their neighbours: by their medians against running ones.
 
     `step` is the distance of neighbouring grey values. NaN does not count, nor do lines with fewer than 16 values.
@@ -617,14 +614,14 @@ def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
 class LogHistogram:
     """Histogram of deviations of pixels, measured and expected for Gaussian noise."""
 
-    deviation: NDArray[np.float64]
+    deviation: Floats
     """Middles of the classes, grey values."""
-    count: NDArray[np.int64]
-    model: NDArray[np.float64]
+    count: Ints
+    model: Floats
     """Expected counts of a Gaussian with the robust scatter."""
 
 
-def log_histogram(deviation: NDArray[np.float64], scatter: float) -> LogHistogram:
+def log_histogram(deviation: Floats, scatter: float) -> LogHistogram:
     """Histogram for a logarithmic axis, over the whole range; classes of a third of the scatter, 4000 at most."""
     low, high = float(deviation.min()), float(deviation.max())
     classes = int(np.clip(3 * (high - low) / scatter, 20, 4000)) if scatter > 0 else 200
@@ -632,9 +629,6 @@ def log_histogram(deviation: NDArray[np.float64], scatter: float) -> LogHistogra
     count, _ = np.histogram(deviation, edges)
     model = np.diff(special.ndtr((edges - float(np.median(deviation))) / scatter)) * deviation.size
     return LogHistogram((edges[:-1] + edges[1:]) / 2, count, model)
-
-
-Array = NDArray[np.float64]
 
 
 def line_resolution(points: float) -> float:
@@ -652,18 +646,18 @@ def pixel_um(reference_mm: float, pixels: float) -> float:
     return 1000.0 * reference_mm / pixels
 
 
-def nyquist(period_um: ArrayLike) -> Array:
+def nyquist(period_um: ArrayLike) -> Floats:
     """Highest frequency that a period of sampling carries, LP/mm (Behr 1989, eq. 3.23)."""
     return np.asarray(1000.0 / (2.0 * np.asarray(period_um, float)))
 
 
-def transfer_modulation(product: float, signal_to_clock: ArrayLike) -> Array:
+def transfer_modulation(product: float, signal_to_clock: ArrayLike) -> Floats:
     """Modulation that is left after shifting charges (Behr 1989, eq. 3.15)."""
     turn = 2.0 * pi * np.asarray(signal_to_clock, float)
     return np.asarray(np.exp(-product * (1.0 - np.cos(turn))))
 
 
-def transfer_phase(product: float, signal_to_clock: ArrayLike) -> Array:
+def transfer_phase(product: float, signal_to_clock: ArrayLike) -> Floats:
     """Shift of phase by shifting charges, radians (Behr 1989, eq. 3.16); parameters as `transfer_modulation`.
 
     It is the lag that is left over when the delay that low frequencies have, the product in elements, is taken away;
@@ -695,7 +689,7 @@ def jitter_grey(jitter_s: float, grey_step: float, rise_s: float) -> float:
     return jitter_s * grey_step / rise_s
 
 
-def aperture_mtf(frequency: ArrayLike, width_um: float) -> Array:
+def aperture_mtf(frequency: ArrayLike, width_um: float) -> Floats:
     """MTF of the sensitive width of an element: \\|sin(π f w) / (π f w)\\|; frequency in LP/mm."""
     return np.asarray(np.abs(np.sinc(np.asarray(frequency, float) * width_um / 1000.0)))
 
@@ -705,7 +699,7 @@ def diffraction_cutoff(f_number: float, wavelength_nm: float) -> float:
     return 1e6 / (wavelength_nm * f_number)
 
 
-def diffraction_mtf(frequency: ArrayLike, cutoff: float) -> Array:
+def diffraction_mtf(frequency: ArrayLike, cutoff: float) -> Floats:
     """MTF of a perfect lens with a circular stop in incoherent light, see `pupil_transfer`."""
     if not cutoff > 0.0:
         raise InputError(f"a diffraction limit of {cutoff:g} LP/mm; it is positive")

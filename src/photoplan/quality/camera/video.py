@@ -7,16 +7,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.adjustment.least_squares import levenberg, solve, spread
 from photoplan.adjustment.statistics import chance_f, chance_normal, chance_t
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.quality.camera.drift import LEAST_VALUES, Approach, check_times, fit_approach
 from photoplan.quality.camera.geometry import LEAST_LINES
-
-Array = NDArray[np.float64]
 
 #: Frames before the step below which nothing is said about the noise there.
 LEAST_BEFORE = 3
@@ -53,8 +51,8 @@ class GainControl:
     noise: NoiseChange
     first: int
     """Index of the first frame after the step."""
-    times: Array
-    values: Array
+    times: Floats
+    values: Floats
 
     @property
     def step(self) -> float:
@@ -79,7 +77,7 @@ class Asymmetry:
     """Chance that equal changes differ as much."""
 
 
-def gain_control(times: Array, values: Array, *, step_time: float | None = None, name: str = "series") -> GainControl:
+def gain_control(times: Floats, values: Floats, *, step_time: float | None = None, name: str = "series") -> GainControl:
     """Follow the grey values after a step of brightness.
 
     The scene is the same in all frames after the step, so a change of the grey values is the camera's.
@@ -130,7 +128,7 @@ def compare_transitions(dark: GainControl, bright: GainControl) -> Asymmetry:
     return Asymmetry(difference, sigma, probability)
 
 
-def _first_after(t: Array, y: Array, step_time: float | None, name: str) -> int:
+def _first_after(t: Floats, y: Floats, step_time: float | None, name: str) -> int:
     if step_time is not None:
         first = int(np.searchsorted(t, step_time))
         if not 0 < first < len(t):
@@ -186,7 +184,7 @@ class Harmonic:
     probability: float
     """Chance that noise alone makes as strong an oscillation at any of the frequencies that were tried."""
 
-    def at(self, t: Array) -> Array:
+    def at(self, t: Floats) -> Floats:
         """Its part at lines."""
         return self.amplitude * np.sin(2.0 * math.pi * np.asarray(t, float) / self.period + self.phase)
 
@@ -199,9 +197,9 @@ class Harmonic:
 class Spectrum:
     """Share of the sum of squares that an oscillation of each frequency explains beside the base functions."""
 
-    frequency: Array
+    frequency: Floats
     """Cycles per line, shape (k,)."""
-    power: Array
+    power: Floats
     """0 to 1, shape (k,)."""
     level: float
     """Power that noise alone exceeds anywhere with a chance of 1 ‰."""
@@ -215,7 +213,7 @@ class Spectrum:
 class Waves:
     """Cosines and sines of all frequencies at the lines of one series; kept where they are few."""
 
-    def __init__(self, t: Array) -> None:
+    def __init__(self, t: Floats) -> None:
         extent = float(t[-1] - t[0]) + 1.0
         low, high = _LONGEST / extent, 0.5 - 1.0 / extent
         self.extent = extent
@@ -223,18 +221,18 @@ class Waves:
         self._t = t - t[0]
         self._kept = list(self._parts()) if len(t) * len(self.frequency) <= _KEPT else None
 
-    def parts(self) -> Iterable[tuple[slice, Array, Array]]:
+    def parts(self) -> Iterable[tuple[slice, Floats, Floats]]:
         """Some frequencies at a time: which, cosines and sines of shape (n, some)."""
         return self._parts() if self._kept is None else self._kept
 
-    def _parts(self) -> Iterator[tuple[slice, Array, Array]]:
+    def _parts(self) -> Iterator[tuple[slice, Floats, Floats]]:
         for first in range(0, len(self.frequency), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
             angle = 2.0 * math.pi * np.multiply.outer(self._t, self.frequency[part])
             yield part, np.cos(angle), np.sin(angle)
 
 
-def spectrum(waves: Waves, y: Array, base: Array) -> Spectrum:
+def spectrum(waves: Waves, y: Floats, base: Floats) -> Spectrum:
     """Least-squares spectrum: at every frequency the base functions are adjusted anew (Lomb, Scargle)."""
     frequency = waves.frequency
     Q, _ = np.linalg.qr(base)
@@ -256,7 +254,7 @@ def false_alarm(found: Spectrum, freedom: int, extent: float) -> float:
     return -math.expm1(trials * math.log1p(-min(single, 1.0 - 1e-12)))
 
 
-def _explained(c: Array, s: Array, Q: Array, rest: Array) -> Array:
+def _explained(c: Floats, s: Floats, Q: Floats, rest: Floats) -> Floats:
     """Sum of squares that cosine and sine explain, after both are freed of what the base can do."""
     of_c, of_s = Q.T @ c, Q.T @ s
     cc = np.einsum("ij,ij->j", c, c) - (of_c * of_c).sum(axis=0)
@@ -274,28 +272,30 @@ def _explained(c: Array, s: Array, Q: Array, rest: Array) -> Array:
 class AdjustedPeriod:
     """Base functions and oscillations adjusted together."""
 
-    unknowns: Array
+    unknowns: Floats
     """Of the base functions, shape (k,)."""
-    sigmas: Array
+    sigmas: Floats
     harmonics: tuple[Harmonic, ...]
-    residuals: Array
+    residuals: Floats
     """Computed minus measured, shape (n,)."""
     sigma0: float
     """Standard deviation of one value."""
 
 
-def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], chances: list[float]) -> AdjustedPeriod:
+def adjust_periods(
+    t: Floats, y: Floats, base: Floats, frequencies: list[float], chances: list[float]
+) -> AdjustedPeriod:
     """Adjust the base functions and the frequency, amplitude and phase of every oscillation by least squares."""
     # About its middle, frequency and phase of an oscillation are nearly uncorrelated.
     middle = float(t.mean())
     limit, k = 0.5 / (float(t[-1] - t[0]) + 1.0), base.shape[1]
 
-    def equations(f: Array) -> tuple[Array, Array]:
+    def equations(f: Floats) -> tuple[Floats, Floats]:
         A = _design(t - middle, base, f)
         found = solve(A, y)
         return np.column_stack([A, _by_frequency(t - middle, f, found.unknowns[k:])]), found.residuals
 
-    def moved(f: Array, step: Array) -> Array:
+    def moved(f: Floats, step: Floats) -> Floats:
         return np.clip(f + np.clip(step[len(step) - len(f) :], -limit, limit), 1e-6, 0.5 - 1e-6)
 
     found = levenberg(np.array(frequencies), equations, moved)
@@ -312,14 +312,14 @@ def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], ch
     )
 
 
-def _design(t: Array, base: Array, f: Array) -> Array:
+def _design(t: Floats, base: Floats, f: Floats) -> Floats:
     angle = 2.0 * math.pi * np.multiply.outer(t, f)
     return np.column_stack(
         [base, *(part for i in range(len(f)) for part in (np.cos(angle[:, i]), np.sin(angle[:, i])))]
     )
 
 
-def _by_frequency(t: Array, f: Array, found: Array) -> Array:
+def _by_frequency(t: Floats, f: Floats, found: Floats) -> Floats:
     """Derivatives of every oscillation with respect to its frequency."""
     angle = 2.0 * math.pi * np.multiply.outer(t, f)
     a, b = found[0::2], found[1::2]
@@ -327,7 +327,7 @@ def _by_frequency(t: Array, f: Array, found: Array) -> Array:
 
 
 def _harmonic(
-    i: int, k: int, f: Array, found: Array, covariance: Array, middle: float, chances: list[float]
+    i: int, k: int, f: Floats, found: Floats, covariance: Floats, middle: float, chances: list[float]
 ) -> Harmonic:
     """Amplitude, phase and period with their standard deviations; the phase is moved to line 0."""
     a, b = found[k + 2 * i], found[k + 2 * i + 1]
@@ -377,15 +377,15 @@ class Spike:
 class LineJitter:
     """Deviations of an edge from a straight line, taken apart."""
 
-    line: Array
+    line: Floats
     """Lines with an edge, counted from 0 in the window, shape (n,)."""
-    position: Array
+    position: Floats
     """Columns in the window, shape (n,)."""
-    deviation: Array
+    deviation: Floats
     """d_i: measured minus adjusted straight line (curve, if `degree` > 1), spikes included, shape (n,)."""
-    regular: Array
+    regular: Floats
     """The part of them that fields and oscillations explain, shape (n,)."""
-    used: NDArray[np.bool_]
+    used: Mask
     """False for spikes, shape (n,)."""
     degree: int
     """1: straight; 2, 3: the edge is curved beyond chance, and a polynomial of this degree was adjusted."""
@@ -418,7 +418,7 @@ class LineJitter:
         return self.field_probability < LEVEL
 
 
-def line_jitter(position: Array, name: str = "edge", degree: int | None = None) -> LineJitter:
+def line_jitter(position: Floats, name: str = "edge", degree: int | None = None) -> LineJitter:
     """Adjust a straight line to the positions of an edge, and take apart what is left.
 
     Spikes are set aside; polynomial, offset between even and odd lines and up to three oscillations are adjusted
@@ -470,13 +470,13 @@ def line_jitter(position: Array, name: str = "edge", degree: int | None = None) 
     )
 
 
-def _base(t: Array, degree: int, lines: int) -> tuple[Array, Array]:
+def _base(t: Floats, degree: int, lines: int) -> tuple[Floats, Floats]:
     """Legendre polynomials over the window, and the parity of the lines (−½ even, +½ odd)."""
     u = 2.0 * t / max(lines - 1, 1) - 1.0
     return np.asarray(np.polynomial.legendre.legvander(u, degree), float), np.where(t % 2 == 0, -0.5, 0.5)
 
 
-def _chosen(t: Array, y: Array, degree: int | None, lines: int) -> tuple[int, AdjustedPeriod, Spectrum]:
+def _chosen(t: Floats, y: Floats, degree: int | None, lines: int) -> tuple[int, AdjustedPeriod, Spectrum]:
     """Degree of the polynomial with the adjustment, and the spectrum beside this polynomial."""
     waves = Waves(t)
     tried = {d: _adjusted(waves, t, y, (d, lines)) for d in ([degree] if degree else range(1, _MOST_DEGREE + 1))}
@@ -490,7 +490,7 @@ def _chosen(t: Array, y: Array, degree: int | None, lines: int) -> tuple[int, Ad
     return best, *tried[best]
 
 
-def _adjusted(waves: Waves, t: Array, y: Array, shape: tuple[int, int]) -> tuple[AdjustedPeriod, Spectrum]:
+def _adjusted(waves: Waves, t: Floats, y: Floats, shape: tuple[int, int]) -> tuple[AdjustedPeriod, Spectrum]:
     """Oscillations one after the other, each searched beside all that were found before."""
     base = np.column_stack(_base(t, *shape))
     first = found = spectrum(waves, y, base)
@@ -511,7 +511,7 @@ def _adjusted(waves: Waves, t: Array, y: Array, shape: tuple[int, int]) -> tuple
     return fit, first
 
 
-def _spikes(t: Array, y: Array) -> NDArray[np.bool_]:
+def _spikes(t: Floats, y: Floats) -> Mask:
     """Lines far from the running median of their neighbours, after a robust straight line is taken off."""
     step = max(1, len(t) // 200)
     i, j = np.triu_indices(len(t[::step]), 1)
@@ -523,7 +523,7 @@ def _spikes(t: Array, y: Array) -> NDArray[np.bool_]:
     return np.abs(rest) > max(_SPIKE * scale, _LEAST_SPIKE)
 
 
-def _neighbours(t: Array, deviation: Array) -> float:
+def _neighbours(t: Floats, deviation: Floats) -> float:
     """Root mean square difference of lines that follow each other."""
     next_to = np.diff(t) == 1.0
     if not next_to.any():
@@ -647,7 +647,7 @@ def _by_line(jitter: LineJitter, offset: int, periodic: bool) -> dict[int, float
     return dict(zip((jitter.line[jitter.used].astype(int) + offset).tolist(), values[jitter.used].tolist()))
 
 
-def _effective(x: Array, y: Array, n: int) -> float:
+def _effective(x: Floats, y: Floats, n: int) -> float:
     """Number of independent lines: n / (1 + 2 Σ ρx(k) ρy(k)) (Bartlett), summed while both are positive."""
     total = 1.0
     for k in range(1, max(2, int(_FARTHEST * n))):

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from photoplan.adjustment.least_squares import MEDIAN_1D, huber, spread
 from photoplan.adjustment.statistics import chance_chi_square
+from photoplan.arrays import Floats, Floats32, Mask
 from photoplan.errors import InputError
 from photoplan.findings import with_sigma
 from photoplan.kernels.raster import gradient_ridge, join_chains
-
-Array = NDArray[np.float64]
 
 #: Standard deviation of the Gaussian before the gradient, pixels.
 SMOOTHING = 1.2
@@ -77,7 +76,7 @@ class StraightEdge:
         return cls(x=(a[0] + b[0]) / 2, y=(a[1] + b[1]) / 2, tx=tx, ty=ty, length=length, strength=strength)
 
 
-def range_of(grey: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
+def range_of(grey: Floats32, valid: Mask | None = None) -> float:
     """Range of the values of a picture without half a percent at either end; 0 if nothing is valid."""
     known = grey.ravel() if valid is None else grey[valid]
     if known.size == 0:
@@ -86,7 +85,7 @@ def range_of(grey: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) 
     return float(high - low)
 
 
-def noise_of(grey: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
+def noise_of(grey: Floats32, valid: Mask | None = None) -> float:
     """Standard deviation of the noise, from second differences in the smoothest parts of a picture.
 
     The mask is that of Immerkær 1996 (Fast noise variance estimation), which is blind to planes; of the medians of
@@ -106,9 +105,7 @@ def noise_of(grey: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) 
     return float(np.quantile(np.median(blocks, axis=1), 0.2) / MEDIAN_1D / 6)
 
 
-def find_lines(
-    grey: NDArray[np.float32], valid: NDArray[np.bool_] | None, least_length: float
-) -> tuple[list[StraightEdge], Counter[str]]:
+def find_lines(grey: Floats32, valid: Mask | None, least_length: float) -> tuple[list[StraightEdge], Counter[str]]:
     """Straight edges of a picture, the longest first; no test yet of what lies beside them."""
     if min(grey.shape) < 5:
         return [], Counter()
@@ -118,7 +115,7 @@ def find_lines(
         return [], Counter()
     row, col = np.nonzero(np.isfinite(offset))
     u = np.stack([gx[row, col], gy[row, col]], 1).astype(float)
-    size: Array = np.hypot(*u.T)
+    size: Floats = np.hypot(*u.T)
     order = np.argsort(-size, kind="stable")
     row, col, u, size = row[order], col[order], (u / size[:, None])[order], size[order]
     index = np.full(grey.shape, -1, np.int32)
@@ -127,13 +124,11 @@ def find_lines(
     chains = int(join_chains(index, np.stack([row, col], 1).astype(np.int32), u, cos(_TURN), label))
     steep = np.abs(u[:, 0]) >= np.abs(u[:, 1])
     part = offset[row, col].astype(float)
-    points: Array = np.stack([col + np.where(steep, part, 0.0), row + np.where(steep, 0.0, part)], 1)
+    points: Floats = np.stack([col + np.where(steep, part, 0.0), row + np.where(steep, 0.0, part)], 1)
     return _lines(points, u, size, label, chains, least_length)
 
 
-def _gradient(
-    grey: NDArray[np.float32], valid: NDArray[np.bool_] | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+def _gradient(grey: Floats32, valid: Mask | None) -> tuple[Floats32, Floats32, float]:
     """Gradient of the smoothed picture, 0 where it saw invalid pixels, and the least one of an edge."""
     filled = np.asarray(grey, np.float32)
     if valid is not None:
@@ -158,7 +153,7 @@ def _gradient(
 
 
 def _lines(
-    points: Array, u: Array, size: Array, label: NDArray[np.int32], chains: int, least_length: float
+    points: Floats, u: Floats, size: Floats, label: NDArray[np.int32], chains: int, least_length: float
 ) -> tuple[list[StraightEdge], Counter[str]]:
     counts = np.bincount(label, minlength=chains)
     order = np.argsort(label, kind="stable")
@@ -177,7 +172,7 @@ def _lines(
     return lines, reasons
 
 
-def _straight(points: Array, normal: Array, size: Array, least_length: float) -> Iterator[StraightEdge]:
+def _straight(points: Floats, normal: Floats, size: Floats, least_length: float) -> Iterator[StraightEdge]:
     """Straight parts of a chain."""
     waiting = [np.arange(len(points))]
     while waiting:
@@ -200,7 +195,7 @@ def _straight(points: Array, normal: Array, size: Array, least_length: float) ->
         yield from _solid(middle, along, (t, d), float(np.median(size[of])), least_length)
 
 
-def _cut(t: Array, d: Array) -> float | None:
+def _cut(t: Floats, d: Floats) -> float | None:
     """Return the place at which a chain must be parted to be straight; None if it is."""
     order = np.argsort(t)
     ts, ds = t[order], d[order]
@@ -220,7 +215,7 @@ def _cut(t: Array, d: Array) -> float | None:
 
 
 def _solid(
-    middle: Array, along: Array, td: tuple[Array, Array], strength: float, least_length: float
+    middle: Floats, along: Floats, td: tuple[Floats, Floats], strength: float, least_length: float
 ) -> Iterator[StraightEdge]:
     """Parts of a straight chain without gaps of more than three pixels, fitted robustly."""
     t, d = td
@@ -280,18 +275,18 @@ class Strip:
     """Length of a block, pixels."""
     half: int
     """Bins to each side."""
-    count: Array
+    count: Floats
     """Pixels used, shape (blocks, 2 half); the bins go from the dark to the bright side."""
-    total: Array
+    total: Floats
     """Their sum."""
-    square: Array
+    square: Floats
     """Their sum of squares."""
-    saturated: Array
+    saturated: Floats
     """Saturated pixels."""
-    invalid: Array
+    invalid: Floats
     """Invalid pixels, those outside the image included."""
 
-    def profile(self) -> Array:
+    def profile(self) -> Floats:
         """Medians over the blocks of the means of the bins, shape (2 half,); NaN where there is nothing."""
         with np.errstate(invalid="ignore", divide="ignore"):
             means = np.where(self.count >= 2, self.total / self.count, np.nan)
@@ -348,7 +343,7 @@ class Sides:
     dark: slice
     bright: slice
     window: slice
-    means: tuple[Array, Array]
+    means: tuple[Floats, Floats]
     """Means of the blocks, on the dark and on the bright side; NaN without a pixel."""
     noises: tuple[float, float]
     """Medians over the blocks of the deviation of pixels about the means of their bins, of both sides."""
@@ -360,7 +355,7 @@ class Sides:
         noises = _noise(strip, dark), _noise(strip, bright)
         return cls(strip=strip, dark=dark, bright=bright, window=window, means=means, noises=noises)
 
-    def blocks(self, chosen: NDArray[np.bool_]) -> Sides:
+    def blocks(self, chosen: Mask) -> Sides:
         """Only the blocks that are chosen."""
         s = self.strip
         sums = (each[chosen] for each in (s.count, s.total, s.square, s.saturated, s.invalid))
@@ -383,7 +378,7 @@ class Sides:
         contrast = self.contrast
         return contrast / max(self.noise, 1e-4 * contrast) if contrast > 0.0 else 0.0
 
-    def good_blocks(self, evenness: float) -> tuple[NDArray[np.bool_], Counter[str]]:
+    def good_blocks(self, evenness: float) -> tuple[Mask, Counter[str]]:
         """Return which blocks are clean, and what the others are."""
         s = self.strip
         everything = (s.count + s.saturated + s.invalid)[:, self.window].sum(axis=1)
@@ -451,7 +446,7 @@ class Sides:
         return sqrt(max(float(np.mean(apart**2)) - expected, 0.0))
 
 
-def _means(s: Strip, side: slice) -> Array:
+def _means(s: Strip, side: slice) -> Floats:
     count = s.count[:, side].sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(count > 0, s.total[:, side].sum(axis=1) / count, np.nan)
@@ -467,7 +462,7 @@ def _noise(s: Strip, side: slice) -> float:
     return sqrt(max(float(_median(inner[some] / free[some])), 0.0))
 
 
-def _scatter(values: Array) -> float:
+def _scatter(values: Floats) -> float:
     """Standard deviation about a straight line; 0 for no more than two values."""
     if len(values) <= 2:
         return 0.0
@@ -476,7 +471,7 @@ def _scatter(values: Array) -> float:
     return sqrt(float(rest @ rest) / (len(values) - 2))
 
 
-def _median(values: Array) -> Array:
+def _median(values: Floats) -> Floats:
     """Medians of the last axis without NaN; NaN where there is nothing else."""
     ordered = np.sort(values, axis=-1).ravel()
     known = np.isfinite(values).sum(axis=-1)
@@ -485,7 +480,7 @@ def _median(values: Array) -> Array:
     return np.asarray(np.where(known > 0, middle, np.nan))
 
 
-def _running_median(values: Array, width: int) -> Array:
+def _running_median(values: Floats, width: int) -> Floats:
     """Medians of so many neighbours along the last axis, fewer at the ends."""
     half = width // 2
     padded = np.full((*values.shape[:-1], values.shape[-1] + 2 * half), np.nan)
@@ -494,11 +489,7 @@ def _running_median(values: Array, width: int) -> Array:
 
 
 def strip_along(
-    grey: NDArray[np.float32],
-    valid: NDArray[np.bool_] | None,
-    saturated: NDArray[np.bool_] | None,
-    line: StraightEdge,
-    half: int,
+    grey: Floats32, valid: Mask | None, saturated: Mask | None, line: StraightEdge, half: int
 ) -> Strip | None:
     """Sum the pixels beside a line."""
     xs, ys = zip(*line.ends)
@@ -532,7 +523,7 @@ def strip_along(
     base = float(np.median(values)) if values.size else 0.0
     values -= base
 
-    def summed(of: NDArray[np.bool_], weights: Array | None = None) -> Array:
+    def summed(of: Mask, weights: Floats | None = None) -> Floats:
         return np.bincount(cell[of], weights, minlength=shape[0] * shape[1]).astype(float).reshape(shape)
 
     return Strip(
@@ -595,17 +586,17 @@ class EdgeSettings:
 class EdgeResiduals:
     """Residuals of the pixels after a profile, relative to the step, with their places; shape (n,) each."""
 
-    across: NDArray[np.float64]
-    along: NDArray[np.float64]
-    distance: NDArray[np.float64]
-    value: NDArray[np.float64]
-    spread: NDArray[np.float64]
+    across: Floats
+    along: Floats
+    distance: Floats
+    value: Floats
+    spread: Floats
     """Line spread function at the pixels, per pixel."""
     width: float
     """Standard deviation of the line spread function, pixels."""
 
 
-def check_region(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def check_region(image: Floats, valid: Mask) -> Mask:
     """Mask of the valid and finite pixels; refuse what is no region: wrong shape, too small, too large, empty."""
     if image.ndim != 2 or valid.shape != image.shape:
         raise InputError(
@@ -624,9 +615,7 @@ def check_region(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArra
     return valid
 
 
-def check_clipping(
-    light: NDArray[np.float64], distance: NDArray[np.float64], limits: tuple[float, float] | None, most: float
-) -> None:
+def check_clipping(light: Floats, distance: Floats, limits: tuple[float, float] | None, most: float) -> None:
     """Refuse an edge with a clipped side: its profile is cut off, and no figure of it is right."""
     if limits is None:
         return
@@ -665,7 +654,7 @@ def check_step(step: float, noise: float, grain: float, settings: EdgeSettings) 
         )
 
 
-def check_one_peak(positions: NDArray[np.float64], line: NDArray[np.float64], sigma: NDArray[np.float64]) -> None:
+def check_one_peak(positions: Floats, line: Floats, sigma: Floats) -> None:
     """Refuse a line spread function with a second peak: a second edge beside the first.
 
     A peak counts if it lies 3 pixels or more from the main one, has a sixth of its height and four standard deviations,
@@ -703,7 +692,7 @@ def check_certainty(mtf50: float, reach: float, most: float) -> None:
         )
 
 
-def grain(pixels: NDArray[np.float64], along: NDArray[np.float64], across: NDArray[np.float64]) -> float:
+def grain(pixels: Floats, along: Floats, across: Floats) -> float:
     """Noise of a pixel from differences of neighbours along the edge; robust, so that the edge itself hardly counts."""
     order = np.lexsort((along, across))
     near = (np.diff(along[order]) == 1.0) & (np.diff(across[order]) == 0.0)
@@ -834,11 +823,11 @@ class EdgeRules:
 class EdgePicture:
     """A picture, or a part of one, in which edges are sought."""
 
-    grey: NDArray[np.float32]
+    grey: Floats32
     """Values proportional to light, shape (h, w)."""
-    valid: NDArray[np.bool_] | None = None
+    valid: Mask | None = None
     """True = may be used; None: all."""
-    saturated: NDArray[np.bool_] | None = None
+    saturated: Mask | None = None
     """True = at an end of the range of values; None: none."""
     span: float = field(default=float("nan"))
     """Range of the values of the whole picture; NaN: that of this part."""
@@ -885,7 +874,7 @@ class EdgeRegion:
         right, bottom = min(size[0], ceil(max(xs)) + reach + 1), min(size[1], ceil(max(ys)) + reach + 1)
         return col, row, right - col, bottom - row
 
-    def mask(self, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+    def mask(self, window: tuple[int, int, int, int]) -> Mask:
         """Its pixels in a window (column, row, width, height), shape (height, width), True = belongs to it."""
         col, row, width, height = window
         line = self.line
@@ -978,7 +967,7 @@ def _clean_part(
     ), ""
 
 
-def _bridged(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _bridged(good: Mask) -> Mask:
     """Good blocks, and one or two others between long runs of good ones: the edge goes on behind a spot."""
     bridged = good.copy()
     for k in range(_RUN, len(good) - _RUN):
@@ -989,7 +978,7 @@ def _bridged(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return bridged
 
 
-def _longest(good: NDArray[np.bool_]) -> tuple[int, int]:
+def _longest(good: Mask) -> tuple[int, int]:
     """First and last + 1 of the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
     if not edges.size:

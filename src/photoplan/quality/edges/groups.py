@@ -8,17 +8,15 @@ from math import cos, inf, isfinite, nan, radians, sqrt
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtri, stdtrit
 
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.plain import pick
 from photoplan.quality.edges.response import EdgeMeasurement, spread_from_response
 from photoplan.quality.mtf_curve import MtfCurve, gaussian_modulation
 from photoplan.quality.restoration.design import Sharpness
-
-Array = NDArray[np.float64]
 
 #: Residuals beyond so many standard deviations count less.
 _CRITICAL = 2.5
@@ -113,7 +111,7 @@ def combine(
     )
 
 
-def _between(v: Array, s: Array, keep: Array) -> float:
+def _between(v: Floats, s: Floats, keep: Floats) -> float:
     """Variance between edges: that with which the weighted squares add up to their expectation."""
     n = len(v)
 
@@ -359,7 +357,7 @@ def _along(edges: Sequence[EdgeMeasurement], axis: float) -> Sharpness | None:
     return _together([edge for edge, kept in zip(used, keep, strict=True) if kept], strength[keep])
 
 
-def _sharp(edges: Sequence[EdgeMeasurement], strength: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _sharp(edges: Sequence[EdgeMeasurement], strength: Floats) -> Mask:
     """Which edges agree with the upper quartile of all; at least the three that are nearest to it."""
     mtf50 = np.array([edge.mtf50 for edge in edges])
     sigma = np.array([sigma_of_interval(edge.mtf50_interval, edge.confidence, edge.freedom) for edge in edges])
@@ -375,7 +373,7 @@ def _sharp(edges: Sequence[EdgeMeasurement], strength: NDArray[np.float64]) -> N
     return np.asarray(keep)
 
 
-def _together(edges: Sequence[EdgeMeasurement], weights: NDArray[np.float64]) -> Sharpness:
+def _together(edges: Sequence[EdgeMeasurement], weights: Floats) -> Sharpness:
     responses = [
         np.interp(_POSITIONS, edge.esf.positions, edge.esf.values, left=np.nan, right=np.nan) for edge in edges
     ]
@@ -398,16 +396,14 @@ def _together(edges: Sequence[EdgeMeasurement], weights: NDArray[np.float64]) ->
     return Sharpness(spread, MtfCurve(_FREQUENCIES[:end], curve[:end], sigma[:end]))
 
 
-def _own_sigma(curve: MtfCurve) -> NDArray[np.float64]:
+def _own_sigma(curve: MtfCurve) -> Floats:
     """Standard deviations that an edge states; 0 if it states none."""
     if curve.sigma is None:
         return np.zeros(_FREQUENCIES.size)
     return np.interp(_FREQUENCIES, curve.frequency, np.nan_to_num(curve.sigma))
 
 
-def _sigma_of_mean(
-    apart: NDArray[np.float64], own: NDArray[np.float64], weights: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _sigma_of_mean(apart: Floats, own: Floats, weights: Floats) -> Floats:
     """Standard deviation of a mean curve: the larger of what edges state and what they differ by; all (edges, n)."""
     known = np.isfinite(apart)
     share = np.where(known, weights, 0.0)
@@ -418,7 +414,7 @@ def _sigma_of_mean(
     return np.asarray(np.sqrt(np.maximum(stated, scatter)))
 
 
-def _mean(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mean(values: Floats, weights: Floats) -> Floats:
     """Weighted mean over the edges that know a place; NaN where too few do. Shapes (edges, n) to (n,)."""
     known = np.isfinite(values)
     each = np.where(known, weights, 0.0)

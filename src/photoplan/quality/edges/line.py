@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import exp1, ndtr
 
 from photoplan.adjustment.least_squares import Decomposed, levenberg, solve
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 
 #: A side of the pixel shorter than this, seen along the edge, is replaced by its variance (an error below 1e-13).
@@ -47,9 +48,7 @@ class PixelEdge:
         """Standard deviation of the whole line spread function, pixels: Gaussian and pixel, which add 1/12."""
         return sqrt(self.blur**2 + 1.0 / 12.0)
 
-    def profile(
-        self, distance: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def profile(self, distance: Floats) -> tuple[Floats, Floats, Floats]:
         """Edge profile from 0 to 1, line spread function and its derivative at distances in pixels, same shape."""
         wide, narrow = self.sides
         if narrow < SHORT_SIDE:
@@ -62,18 +61,18 @@ class PixelEdge:
         rise = [(t[0] - t[1] - t[2] + t[3]) / (wide * narrow) for t in zip(*terms)]
         return rise[2], rise[1], rise[0]
 
-    def transfer(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+    def transfer(self, frequency: Floats) -> Floats:
         """Transfer function at cycles per pixel along the normal, same shape, real: it is symmetric."""
         wide, narrow = self.sides
         gaussian = np.exp(-2.0 * (pi * self.blur * frequency) ** 2)
         return np.asarray(gaussian * np.sinc(frequency * wide) * np.sinc(frequency * narrow))
 
 
-def _density(x: NDArray[np.float64], blur: float) -> NDArray[np.float64]:
+def _density(x: Floats, blur: float) -> Floats:
     return np.asarray(np.exp(-0.5 * (x / blur) ** 2) / (blur * sqrt(2.0 * pi)))
 
 
-def _integrals(x: NDArray[np.float64], blur: float) -> tuple[NDArray[np.float64], ...]:
+def _integrals(x: Floats, blur: float) -> tuple[Floats, ...]:
     """The normal distribution function, its integral and its second integral."""
     share, density = ndtr(x / blur), blur**2 * _density(x, blur)
     return share, x * share + density, 0.5 * ((x * x + blur * blur) * share + x * density)
@@ -105,7 +104,7 @@ class EdgeLine:
     rising: int
     """1 where brightness rises with *across*, −1 where it falls."""
 
-    def distance(self, across: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distance(self, across: Floats, along: Floats) -> Floats:
         """Distance from the line, pixels, positive on the bright side.
 
         Exact for a straight line; for a parabola to first order in its curvature (the next term is
@@ -143,23 +142,23 @@ class EdgeLine:
 class EdgePixels:
     """The pixels of a region in the frame of its edge, as rows: shape (n,) each."""
 
-    across: NDArray[np.float64]
-    along: NDArray[np.float64]
-    light: NDArray[np.float64]
+    across: Floats
+    along: Floats
+    light: Floats
 
     @classmethod
-    def of(cls, image: NDArray[np.float64], valid: NDArray[np.bool_], direction: str) -> EdgePixels:
+    def of(cls, image: Floats, valid: Mask, direction: str) -> EdgePixels:
         """Valid pixels of a region, ordered along the edge."""
         frame, mask = (image, valid) if direction == "x" else (image.T, valid.T)
         along, across = np.nonzero(mask)
         return cls(across.astype(float), along.astype(float), frame[mask])
 
-    def where(self, chosen: NDArray[np.bool_]) -> EdgePixels:
+    def where(self, chosen: Mask) -> EdgePixels:
         """Those that are chosen."""
         return EdgePixels(self.across[chosen], self.along[chosen], self.light[chosen])
 
 
-def find_line(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> EdgeLine:
+def find_line(image: Floats, valid: Mask) -> EdgeLine:
     """Line through the strongest brightness steps of a region, to about a pixel.
 
     A line of least squares through the smoothed gradients, weighted with their squares, of which those that lie far
@@ -202,7 +201,7 @@ def find_line(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> EdgeLine:
 
 def fit_line(
     pixels: EdgePixels, line: EdgeLine, curve: int, shading: bool, most: int = MOST_STEPS
-) -> tuple[EdgeLine, PixelEdge, NDArray[np.float64]]:
+) -> tuple[EdgeLine, PixelEdge, Floats]:
     """Line and blur of least squares for the pixels of an edge, by the profile of a Gaussian and the pixel.
 
     Offset, slope (and bend), blur, both levels and, where asked, their slopes are adjusted together (Levenberg and
@@ -230,7 +229,7 @@ class _LineState:
     line: EdgeLine
     blur: float
 
-    def moved(self, step: NDArray[np.float64], curve: int) -> _LineState:
+    def moved(self, step: Floats, curve: int) -> _LineState:
         old = self.line
         bend = old.bend + (float(step[2]) if curve > 1 else 0.0)
         slope = float(np.clip(old.slope + step[1], -3.0, 3.0))
@@ -246,9 +245,7 @@ class _LineState:
         return _LineState(line, blur)
 
 
-def _linearised(
-    pixels: EdgePixels, state: _LineState, curve: int, shading: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _linearised(pixels: EdgePixels, state: _LineState, curve: int, shading: bool) -> tuple[Floats, Floats, Floats]:
     """Design matrix (n, unknowns) with the levels in it, residuals (n,) computed minus observed, levels of a state."""
     line = state.line
     t = pixels.along - line.middle
@@ -308,7 +305,7 @@ class ProfileBasis:
     model: PixelEdge
     low: float
     high: float
-    knots: NDArray[np.float64]
+    knots: Floats
 
     @classmethod
     def between(cls, model: PixelEdge, low: float, high: float) -> ProfileBasis:
@@ -325,7 +322,7 @@ class ProfileBasis:
         return TREND + self.knots.size - 4
 
     @property
-    def centres(self) -> NDArray[np.float64]:
+    def centres(self) -> Floats:
         """Where the functions of the signal have their middle, pixels, shape (size − 3,)."""
         return self.knots[2:-2]
 
@@ -342,7 +339,7 @@ class ProfileBasis:
         )
 
     @cached_property
-    def _tails(self) -> NDArray[np.float64]:
+    def _tails(self) -> Floats:
         """Light of the functions of the signal beyond both ends, where they fade with the square, shape (2, k)."""
         ends = np.array([self.low, self.high])
         return np.asarray(np.abs(ends)[:, None] * self._signal(ends))
@@ -357,7 +354,7 @@ class ProfileBasis:
         """Edge profiles of the signal, but for constants."""
         return self._signal.antiderivative()
 
-    def edge(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    def edge(self, distance: Floats) -> Floats:
         """Edge profiles of all functions at distances (n,), shape (n, size)."""
         wide, narrow, difference = self._wider
         rise, spread, _ = self.model.profile(distance)
@@ -366,7 +363,7 @@ class ProfileBasis:
         signal = inside - self._rise(np.array([self.low])) + self._tails[0]
         return np.concatenate([rise[:, None], spread[:, None] * self.model.total, width[:, None], signal], axis=1)
 
-    def line(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    def line(self, distance: Floats) -> Floats:
         """Line spread functions of all functions at distances (n,) within the nodes, shape (n, size)."""
         wide, narrow, difference = self._wider
         _, spread, tilt = self.model.profile(distance)
@@ -374,7 +371,7 @@ class ProfileBasis:
         signal = np.nan_to_num(self._signal(distance))
         return np.concatenate([spread[:, None], tilt[:, None] * self.model.total, width[:, None], signal], axis=1)
 
-    def transfer(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def transfer(self, frequency: Floats) -> NDArray[np.complex128]:
         """Fourier transforms of the line spread functions at cycles per pixel (m,), shape (m, size).
 
         Those of the trend in closed form, those of the signal by Gauss' quadrature between the nodes, to 1e-9, and
@@ -393,17 +390,17 @@ class ProfileBasis:
         return np.concatenate([own[:, None], shift[:, None], width[:, None], signal], axis=1)
 
     @cached_property
-    def steps(self) -> NDArray[np.float64]:
+    def steps(self) -> Floats:
         """What each function adds to the step from dark to bright, shape (size,)."""
         inside = np.diff(self._rise(np.array([self.low, self.high])), axis=0)[0]
         return np.concatenate([[1.0, 0.0, 0.0], inside + self._tails.sum(axis=0)])
 
     @cached_property
-    def tails(self) -> NDArray[np.float64]:
+    def tails(self) -> Floats:
         """What each function adds to the step beyond the window, shape (size,)."""
         return np.asarray(self.steps - np.diff(self.edge(np.array([self.low, self.high])), axis=0)[0])
 
-    def root(self, correlation: float) -> NDArray[np.float64]:
+    def root(self, correlation: float) -> Floats:
         """Matrix R with R Rᵀ the covariance of the signal's coefficients, for unit variance in the middle.
 
         Twice differentiable (Matérn 5/2) in a coordinate that grows like the logarithm of the distance in the tails,
@@ -424,15 +421,15 @@ class EdgeFit:
     """Coefficients of a profile, from all pixels and with each block of the edge left out, and their covariance."""
 
     basis: ProfileBasis
-    levels: NDArray[np.float64]
+    levels: Floats
     """Unknowns beside the shape: the dark level (far away, without `missing`), then slopes of the levels."""
-    shape: NDArray[np.float64]
+    shape: Floats
     """Coefficients of the basis, shape (size,)."""
-    covariance: NDArray[np.float64]
+    covariance: Floats
     """Of the shape's coefficients: noise and what the prior hides, shape (size, size)."""
-    hidden: NDArray[np.float64]
+    hidden: Floats
     """Directions (k, size) in which the shape may be wrong by one standard deviation without the blocks telling."""
-    left_out: NDArray[np.float64]
+    left_out: Floats
     """Coefficients of the basis with one block left out, shape (blocks, size)."""
     noise: float
     """Standard deviation of a pixel with weight 1."""
@@ -461,10 +458,7 @@ class EdgeFit:
 
 
 def fit_profile(
-    basis: ProfileBasis,
-    observed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
-    extra: NDArray[np.float64],
-    blocks: NDArray[np.intp],
+    basis: ProfileBasis, observed: tuple[Floats, Floats, Floats], extra: Floats, blocks: NDArray[np.intp]
 ) -> EdgeFit:
     """Adjust a profile to pixels."""
     distance, light, weight = observed
@@ -505,8 +499,8 @@ def fit_profile(
 
 
 def _best_prior(
-    basis: ProfileBasis, normal: NDArray[np.float64], right: NDArray[np.float64], square: float, number: int, trend: int
-) -> tuple[NDArray[np.float64], float, float]:
+    basis: ProfileBasis, normal: Floats, right: Floats, square: float, number: int, trend: int
+) -> tuple[Floats, float, float]:
     """Covariance root, scale and noise: smoothness of the best restricted likelihood, scale as large as it allows.
 
     With the unknowns of the trend eliminated, the signal's normal equations are brought to diagonal form, in which
@@ -533,7 +527,7 @@ def _best_prior(
     return best[1], best[2], best[3]
 
 
-def _looked_up(basis: ProfileBasis, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _looked_up(basis: ProfileBasis, distance: Floats) -> Floats:
     """`ProfileBasis.edge` at many distances by a fine table: linear between its lines, an error below 1e-5."""
     step = min(basis.model.total / 40.0, max(basis.model.blur / 8.0, 0.005))
     first = float(distance.min())
@@ -547,7 +541,7 @@ def _looked_up(basis: ProfileBasis, distance: NDArray[np.float64]) -> NDArray[np
     return np.asarray(table[at] * (1.0 - part) + table[at + 1] * part)
 
 
-def _quadrature(knots: NDArray[np.float64], most: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _quadrature(knots: Floats, most: float) -> tuple[Floats, Floats]:
     """Places and weights of Gauss' quadrature between nodes, for cubic pieces times waves up to a frequency."""
     places, weights = [], []
     for a, b in pairwise(knots):
@@ -557,13 +551,13 @@ def _quadrature(knots: NDArray[np.float64], most: float) -> tuple[NDArray[np.flo
     return np.concatenate(places), np.concatenate(weights)
 
 
-def _faded(angle: NDArray[np.float64]) -> NDArray[np.complex128]:
+def _faded(angle: Floats) -> NDArray[np.complex128]:
     """Transform of 1 / t² from 1 on, at angles for each unit of t: the exponential integral E₂ (DLMF 8.19.12)."""
     wave = 1j * np.where(angle == 0.0, 1.0, angle)
     return np.where(angle == 0.0, 1.0, np.exp(-wave) - wave * exp1(wave))
 
 
 @lru_cache(maxsize=64)
-def _gauss(order: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _gauss(order: int) -> tuple[Floats, Floats]:
     places, weights = np.polynomial.legendre.leggauss(order)
     return places, weights

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from photoplan.adjustment.least_squares import solve
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.quality.edges.find import (
     EdgeResiduals,
@@ -56,14 +57,14 @@ class EdgeShape:
     it is never less than none.
     """
 
-    at: NDArray[np.float64]
-    edge: NDArray[np.float64]
-    ends: NDArray[np.float64]
-    line: NDArray[np.float64]
-    frequency: NDArray[np.float64]
+    at: Floats
+    edge: Floats
+    ends: Floats
+    line: Floats
+    frequency: Floats
     transfer: NDArray[np.complex128]
-    steps: NDArray[np.float64]
-    tails: NDArray[np.float64]
+    steps: Floats
+    tails: Floats
 
     @classmethod
     def of(cls, fit: EdgeFit, highest: float) -> EdgeShape:
@@ -89,17 +90,17 @@ class EdgeShape:
             tails=np.append(basis.tails, 1.0),
         )
 
-    def allowed(self, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+    def allowed(self, shapes: Floats) -> Floats:
         """Coefficients (k, size + 1) with what makes negative tails none."""
         filled = shapes.copy()
         filled[:, -1] += np.maximum(0.0, -(shapes @ self.tails))
         return filled
 
-    def modulation(self, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+    def modulation(self, shapes: Floats) -> Floats:
         """Modulation (k, frequencies) of coefficients (k, size + 1): 1 at frequency 0."""
         return np.asarray(np.abs(shapes @ self.transfer.T) / (shapes @ self.steps)[:, None])
 
-    def figures(self, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+    def figures(self, shapes: Floats) -> Floats:
         """MTF50, MTF10, FWHM, overshoot, undershoot, modulation at 0.5: shape (k, 6) for coefficients (k, size + 1)."""
         step = (shapes @ self.steps)[:, None]
         edges, ends, lines = (shapes @ each.T / step for each in (self.edge, self.ends, self.line))
@@ -115,10 +116,10 @@ class EdgeShape:
 class EdgeFigures:
     """What `edge_figures` returns; standard deviations and intervals as in `EdgeMeasurement`."""
 
-    values: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    modulation: NDArray[np.float64]
-    modulation_sigma: NDArray[np.float64]
+    values: Floats
+    sigma: Floats
+    modulation: Floats
+    modulation_sigma: Floats
     factor: float
     """How many standard deviations the interval reaches to each side."""
     freedom: int
@@ -163,7 +164,7 @@ def gaussian_width(mtf50: float) -> float:
     return GAUSSIAN_WIDTH * sqrt(log(2.0) / 2.0) / (pi * mtf50) if mtf50 > 0.0 else nan
 
 
-def _spread(values: NDArray[np.float64], blocks: int) -> NDArray[np.float64]:
+def _spread(values: Floats, blocks: int) -> Floats:
     left_out = values[1 : blocks + 1]
     hidden = (values.shape[0] - blocks - 1) // 2
     plus, minus = values[blocks + 1 : blocks + 1 + hidden], values[blocks + 1 + hidden :]
@@ -171,7 +172,7 @@ def _spread(values: NDArray[np.float64], blocks: int) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(jackknife + (((plus - minus) / 2.0) ** 2).sum(axis=0)))
 
 
-def _width(at: NDArray[np.float64], line: NDArray[np.float64]) -> float:
+def _width(at: Floats, line: Floats) -> float:
     """Distance between the outermost crossings of half the maximum; NaN if a side does not fall so low."""
     top = int(np.argmax(line))
     half = _peak(line, top) / 2.0
@@ -184,7 +185,7 @@ def _width(at: NDArray[np.float64], line: NDArray[np.float64]) -> float:
     return float(end - start)
 
 
-def _peak(line: NDArray[np.float64], top: int) -> float:
+def _peak(line: Floats, top: int) -> float:
     """Height of the parabola through the largest value and its neighbours."""
     if top in (0, line.size - 1):
         return float(line[top])
@@ -193,7 +194,7 @@ def _peak(line: NDArray[np.float64], top: int) -> float:
     return float(middle + (right - left) ** 2 / (8.0 * curvature)) if curvature > 0.0 else float(middle)
 
 
-def _beyond(at: NDArray[np.float64], edge: NDArray[np.float64], ends: NDArray[np.float64]) -> tuple[float, float]:
+def _beyond(at: Floats, edge: Floats, ends: Floats) -> tuple[float, float]:
     """How far the profile rises above what it is at the bright end, and falls below the dark one; not below 0."""
     bright, dark = edge[at > 0.0], edge[at < 0.0]
     over = float(bright.max() - ends[1]) if bright.size else 0.0
@@ -223,11 +224,11 @@ _LEVELS = 0.02
 class EdgeProfile:
     """A function of the distance from the edge."""
 
-    positions: NDArray[np.float64]
+    positions: Floats
     """Distances from the line in pixels, positive on the bright side, shape (n,)."""
-    values: NDArray[np.float64]
+    values: Floats
     """Shape (n,)."""
-    sigma: NDArray[np.float64]
+    sigma: Floats
     """Standard deviations, shape (n,)."""
 
 
@@ -317,8 +318,8 @@ class EdgeMeasurement:
 
 
 def measure_edge(
-    pixels: NDArray[np.float64],
-    valid: NDArray[np.bool_] | None = None,
+    pixels: Floats,
+    valid: Mask | None = None,
     *,
     limits: tuple[float, float] | None = None,
     origin: tuple[float, float] = (0.0, 0.0),
@@ -377,7 +378,7 @@ def measure_edge(
 @dataclass(frozen=True, eq=False)
 class _Context:
     pixels: EdgePixels
-    distance: NDArray[np.float64]
+    distance: Floats
     line: EdgeLine
     fit: EdgeFit
     span: tuple[float, float]
@@ -385,7 +386,7 @@ class _Context:
     settings: EdgeSettings
 
 
-def _window(distance: NDArray[np.float64], model: PixelEdge, reach: float) -> tuple[float, float]:
+def _window(distance: Floats, model: PixelEdge, reach: float) -> tuple[float, float]:
     """Distances within a reach up to which every step of a pixel holds a third as many pixels as the edge itself."""
     if not distance.min() < 0.0 < distance.max():
         raise InputError("no edge: the line that suits the brightness best lies outside the region")
@@ -407,7 +408,7 @@ def _window(distance: NDArray[np.float64], model: PixelEdge, reach: float) -> tu
 
 
 def _span(
-    pixels: EdgePixels, distance: NDArray[np.float64], model: PixelEdge, line: EdgeLine, settings: EdgeSettings
+    pixels: EdgePixels, distance: Floats, model: PixelEdge, line: EdgeLine, settings: EdgeSettings
 ) -> tuple[float, float]:
     """First and last row (or column) in which the edge lies in the region."""
     rows = pixels.along[np.abs(distance) <= max(model.total, 0.5)]
@@ -417,9 +418,7 @@ def _span(
     return float(rows.min()), float(rows.max())
 
 
-def _weights(
-    pixels: EdgePixels, distance: NDArray[np.float64], line: EdgeLine, model: PixelEdge
-) -> tuple[NDArray[np.float64], float]:
+def _weights(pixels: EdgePixels, distance: Floats, line: EdgeLine, model: PixelEdge) -> tuple[Floats, float]:
     """Weights of pixels whose noise differs between dark and bright side, and their mean noise.
 
     The variance of photon noise grows in proportion to the light, so it is interpolated between both sides.
@@ -438,9 +437,7 @@ def _weights(
     return usual / (low + (high - low) * np.clip(rise, 0.0, 1.0)), float(np.sqrt(usual))
 
 
-def _levels(
-    pixels: EdgePixels, distance: NDArray[np.float64], line: EdgeLine, rise: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _levels(pixels: EdgePixels, distance: Floats, line: EdgeLine, rise: Floats) -> Floats:
     """Columns of the dark level and of the changes of both levels along the edge: across it, a slope can hardly be told
     from stray light."""
     t = (pixels.along - line.middle) / max(float(np.ptp(pixels.along)), 1.0)
@@ -448,12 +445,7 @@ def _levels(
 
 
 def _fit(
-    pixels: EdgePixels,
-    distance: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    line: EdgeLine,
-    basis: ProfileBasis,
-    settings: EdgeSettings,
+    pixels: EdgePixels, distance: Floats, weight: Floats, line: EdgeLine, basis: ProfileBasis, settings: EdgeSettings
 ) -> EdgeFit:
     model = basis.model
     extra = _levels(pixels, distance, line, model.profile(distance)[0])
@@ -547,7 +539,7 @@ def _with_phase(interval: tuple[float, float], gap: float, samples: EdgeProfile)
     return interval
 
 
-def _phase_gap(distance: NDArray[np.float64], model: PixelEdge) -> float:
+def _phase_gap(distance: Floats, model: PixelEdge) -> float:
     """Largest distance between neighbouring samples within 1.5 standard deviations of the edge."""
     reach = max(1.5 * model.total, 1.0)
     core = np.sort(distance[np.abs(distance) <= reach])
@@ -617,7 +609,7 @@ class EdgeSpread:
 
 
 def spread_from_response(
-    position: NDArray[np.float64], response: NDArray[np.float64], half: int, sigma: NDArray[np.float64] | None = None
+    position: Floats, response: Floats, half: int, sigma: Floats | None = None
 ) -> tuple[SpreadFunction, float]:
     """Discrete spread function from a finely sampled edge spread function.
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, special
 
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.quality.formation.optics import (
     Aperture,
@@ -45,7 +46,6 @@ from photoplan.quality.formation.optics import (
 from photoplan.quality.formation.scenes import LightScene
 from photoplan.quality.mtf_curve import MtfCurve
 
-_Array = NDArray[np.float64]
 #: Times that circular overflow spreads again where it meets full elements; what is left then goes along the columns.
 _ROUNDS = 60
 
@@ -54,13 +54,13 @@ _ROUNDS = 60
 class Pattern:
     """What is the same in all frames; arrays of shape (height, width)."""
 
-    response: _Array
+    response: Floats
     """Sensitivity relative to the mean; 0 where an element is dead."""
-    offset: _Array
+    offset: Floats
     """Electrons that are added, independent of time."""
-    dark_rate: _Array
+    dark_rate: Floats
     """Electrons per second."""
-    stuck: _Array
+    stuck: Floats
     """Electrons of elements that do not react; NaN elsewhere."""
 
 
@@ -75,7 +75,7 @@ def fixed_pattern(
     width, height = size
     shape = (height, width)
 
-    def normal(sigma: float, of: tuple[int, int]) -> _Array:
+    def normal(sigma: float, of: tuple[int, int]) -> Floats:
         # Drawn also where sigma is 0, so that switching a part on does not change the others.
         return sigma * rng.standard_normal(of)
 
@@ -99,7 +99,7 @@ def fixed_pattern(
     return Pattern(response, offset, rate, stuck)
 
 
-def add_shot_noise(electrons: _Array, rng: np.random.Generator) -> _Array:
+def add_shot_noise(electrons: Floats, rng: np.random.Generator) -> Floats:
     """Numbers of electrons drawn from Poisson distributions; huge means by the normal distribution they tend to."""
     mean = np.maximum(electrons, 0.0)
     few = mean < 1e9
@@ -111,7 +111,7 @@ def add_shot_noise(electrons: _Array, rng: np.random.Generator) -> _Array:
 class Overflow:
     """Charge after overflowing, and where the excess went."""
 
-    electrons: _Array
+    electrons: Floats
     """Shape (height, width), nowhere above the capacity."""
     excess: float
     """Electrons that found no room in their own element."""
@@ -119,11 +119,11 @@ class Overflow:
     """Of these, taken away by the drain."""
     lost: float
     """Of these, flown over the border of the sensor."""
-    touched: NDArray[np.bool_]
+    touched: Mask
     """True where an element received charge of others."""
 
 
-def overflow(electrons: _Array, well: Well) -> Overflow:
+def overflow(electrons: Floats, well: Well) -> Overflow:
     """Let wells overflow: into the drain, around, along the line, along the column (Behr 1989, section 3.6.5).
 
     Charge is kept: sum before = sum after + drained + lost.
@@ -148,7 +148,7 @@ def overflow(electrons: _Array, well: Well) -> Overflow:
     )
 
 
-def _around(held: _Array, excess: _Array, well: Well) -> tuple[_Array, _Array]:
+def _around(held: Floats, excess: Floats, well: Well) -> tuple[Floats, Floats]:
     """Let excess spread to all sides, again where it meets full elements; charge, and what found no room."""
     most = 1e-6 * float(excess.sum())
     for _ in range(_ROUNDS):
@@ -161,7 +161,7 @@ def _around(held: _Array, excess: _Array, well: Well) -> tuple[_Array, _Array]:
     return held, excess
 
 
-def _flow(held: _Array, excess: _Array, capacity: float) -> _Array:
+def _flow(held: Floats, excess: Floats, capacity: float) -> Floats:
     """Let excess run towards higher rows, filling what room it finds; what leaves the last row is gone."""
     out = np.empty_like(held)
     carried = np.zeros(held.shape[1])
@@ -172,7 +172,7 @@ def _flow(held: _Array, excess: _Array, capacity: float) -> _Array:
     return out
 
 
-def moved_charge(electrons: _Array, readout: Readout) -> _Array:
+def moved_charge(electrons: Floats, readout: Readout) -> Floats:
     """What moving the charge to the output does: smear along columns, transfer losses along lines.
 
     A charge that is moved n times with the inefficiency ε arrives late by k elements with a share e^(−nε) (nε)^k / k!:
@@ -203,14 +203,14 @@ def next_gain(automatic: AutomaticGain, gain: float, mean: float) -> float:
     return gain + (wanted - gain) * share
 
 
-def enhanced(grey: _Array, enhancement: EnhancementPart) -> _Array:
+def enhanced(grey: Floats, enhancement: EnhancementPart) -> Floats:
     """Grey values of one band with over- and undershoot beside edges."""
     width = (enhancement.width if enhancement.direction == "both" else 0.0, enhancement.width)
     smooth = ndimage.gaussian_filter(grey, width, mode="nearest")
     return np.asarray(grey + enhancement.amount * (grey - smooth))
 
 
-def toned(grey: _Array, tone: ToneCurve) -> _Array:
+def toned(grey: Floats, tone: ToneCurve) -> Floats:
     """Stored grey values of linear ones."""
     if tone.curve == "table":
         points = np.array(tone.table)
@@ -223,7 +223,7 @@ def toned(grey: _Array, tone: ToneCurve) -> _Array:
     return np.asarray(tone.white * curve)
 
 
-def quantised(grey: _Array, quantisation: Quantisation) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def quantised(grey: Floats, quantisation: Quantisation) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Whole grey values within the range, as the smallest unsigned type that holds them."""
     whole = np.clip(np.floor(grey + 0.5), 0, quantisation.most)
     return whole.astype(np.uint8) if quantisation.bits <= 8 else whole.astype(np.uint16)
@@ -272,10 +272,10 @@ class FormedImage:
     values: NDArray[Any]
     """Grey values, shape (height, width), or (bands, height, width) where the scene has several bands; uint8 or uint16
     with a quantisation, else float64."""
-    light: _Array
+    light: Floats
     """What fell on the pixels in the units of the scene, without noise, after spread, aperture and fall-off; same
     shape."""
-    line_shift: _Array
+    line_shift: Floats
     """By how many pixels each line was moved to the right, shape (height,)."""
     gain: float
     """Automatic gain of this frame, relative to the fixed one."""
@@ -306,7 +306,7 @@ def _random(model: ImageModel, *key: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence([model.seed, *key]))
 
 
-def _shift(model: ImageModel, lines: int, frame: int) -> _Array:
+def _shift(model: ImageModel, lines: int, frame: int) -> Floats:
     """By how many pixels each line of a frame is moved to the right."""
     return line_displacements(model.jitter, lines, _random(model, 1, frame))
 
@@ -317,7 +317,7 @@ def frame_light(model: ImageModel, scene: LightScene, frame: int) -> Light:
     return Light(scene, model.optics, model.falloff, shift if shift.any() else None)
 
 
-def exposed(model: ImageModel, light: _Array, frame: FormedFrame) -> FormedImage:
+def exposed(model: ImageModel, light: Floats, frame: FormedFrame) -> FormedImage:
     """Image of light on the pixels, shape (bands, height, width), see `frame_light`."""
     bands, height, width = light.shape
     grey = np.empty_like(light)
@@ -350,12 +350,12 @@ def exposed(model: ImageModel, light: _Array, frame: FormedFrame) -> FormedImage
 
 def _electrons(
     model: ImageModel,
-    light: _Array,
+    light: Floats,
     pattern: Pattern,
     exposure: float,
     noise: np.random.Generator,
     facts: dict[str, float],
-) -> _Array:
+) -> Floats:
     """Charge that is read, shape (height, width); sums are added to the facts."""
     source = model.exposure
     signal = light * (source.light * source.quantum_efficiency * exposure) * pattern.response
@@ -379,7 +379,7 @@ def _electrons(
     return np.asarray(charge)
 
 
-def _grey(model: ImageModel, grey: _Array, frame: FormedFrame) -> NDArray[Any]:
+def _grey(model: ImageModel, grey: Floats, frame: FormedFrame) -> NDArray[Any]:
     """Stored grey values of the amplified signal, shape (bands, height, width)."""
     if model.gain.noise:
         grey = grey + _random(model, 4, frame.number).normal(0.0, model.gain.noise, grey.shape)
@@ -392,7 +392,7 @@ def _grey(model: ImageModel, grey: _Array, frame: FormedFrame) -> NDArray[Any]:
 
 
 def model_transfer(
-    model: ImageModel, frequency: _Array, angle_deg: float = 0.0, radius: float = 0.0
+    model: ImageModel, frequency: Floats, angle_deg: float = 0.0, radius: float = 0.0
 ) -> NDArray[np.complex128]:
     """Optical transfer function of spread and aperture together, of a continuous scene."""
     f = np.asarray(frequency, float)
@@ -401,7 +401,7 @@ def model_transfer(
     return np.asarray(spread_transfer(model.spread, fx, fy, scale) * aperture_transfer(model.aperture, fx, fy))
 
 
-def model_modulation(model: ImageModel, frequency: _Array, angle_deg: float = 0.0, radius: float = 0.0) -> _Array:
+def model_modulation(model: ImageModel, frequency: Floats, angle_deg: float = 0.0, radius: float = 0.0) -> Floats:
     """Modulus of `model_transfer`, which says what the arguments are: the MTF."""
     return np.abs(model_transfer(model, frequency, angle_deg, radius))
 

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage, signal
 
+from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.quality.formation.scenes import LightScene, disc_share
 from photoplan.quality.mtf_curve import disc_transfer, pupil_transfer
 
-Radius = TypeVar("Radius", float, NDArray[np.float64])
+Radius = TypeVar("Radius", float, Floats)
 #: Widths beyond this many pixels come from a wrong unit rather than from optics.
 MOST_WIDTH_PX = 200.0
 
@@ -388,8 +389,7 @@ class Quantisation(FormationPart, name="quantisation"):
         return int(2**self.bits - 1)
 
 
-_Array = NDArray[np.float64]
-_Transfer = Callable[[_Array, _Array], NDArray[Any]]
+_Transfer = Callable[[Floats, Floats], NDArray[Any]]
 #: Modulation that counts as none.
 _NOTHING = 1e-4
 #: Repetitions of the spectrum to each side that are added: a kernel of cells is a sampled function.
@@ -402,11 +402,11 @@ _TAIL_REACH = 8.0
 _AIRY_REACH = 40.0
 
 
-def _sinc(x: _Array) -> _Array:
+def _sinc(x: Floats) -> Floats:
     return np.asarray(np.sinc(x))
 
 
-def _smooth_transfer(spread: Spread, fx: _Array, fy: _Array, scale: float) -> _Array:
+def _smooth_transfer(spread: Spread, fx: Floats, fy: Floats, scale: float) -> Floats:
     """Transfer function of the parts that are functions of continuous place, without the tail; cycles per pixel."""
     sx, sy = (sigma * scale for sigma in spread.gaussian)
     result = np.exp(-2.0 * pi**2 * ((sx * fx) ** 2 + (sy * fy) ** 2))
@@ -421,13 +421,13 @@ def _smooth_transfer(spread: Spread, fx: _Array, fy: _Array, scale: float) -> _A
     return np.asarray(result)
 
 
-def _tail_transfer(spread: Spread, fx: _Array, fy: _Array, scale: float) -> _Array:
+def _tail_transfer(spread: Spread, fx: Floats, fy: Floats, scale: float) -> Floats:
     """Transfer function of exp(−r / L) / (2π L²)."""
     length = spread.tail_length * scale
     return np.asarray((1.0 + (2.0 * pi * length) ** 2 * (fx**2 + fy**2)) ** -1.5)
 
 
-def spread_transfer(spread: Spread, fx: _Array, fy: _Array, scale: float = 1.0) -> NDArray[np.complex128]:
+def spread_transfer(spread: Spread, fx: Floats, fy: Floats, scale: float = 1.0) -> NDArray[np.complex128]:
     """Optical transfer function of a spread function, without the pixel's aperture."""
     result = _smooth_transfer(spread, fx, fy, scale).astype(complex)
     for values, f in ((spread.along_x, fx), (spread.along_y, fy)):
@@ -446,7 +446,7 @@ def spread_transfer(spread: Spread, fx: _Array, fy: _Array, scale: float = 1.0) 
     return result
 
 
-def aperture_transfer(aperture: Aperture, fx: _Array, fy: _Array) -> _Array:
+def aperture_transfer(aperture: Aperture, fx: Floats, fy: Floats) -> Floats:
     """Transfer function of a pixel's aperture at frequencies in cycles per pixel."""
     wx, wy = aperture.width
     if aperture.shape == "square":
@@ -469,14 +469,14 @@ def _is_smooth(transfer: _Transfer, cells: int) -> bool:
     return bool(highest < _NOTHING)
 
 
-def _of_smooth(transfer: _Transfer, cells: int, reach: float) -> _Array:
+def _of_smooth(transfer: _Transfer, cells: int, reach: float) -> Floats:
     """Kernel on cells of a transfer function that is smooth; odd sides, sum 1."""
     half, base = _grid(cells, reach)
     fx, fy = np.meshgrid(np.abs(base[: 2 * half + 1]), base)
     return _cut(transfer(fx, fy), half)
 
 
-def _of_squares(transfer: _Transfer, cells: int, reach: float) -> _Array:
+def _of_squares(transfer: _Transfer, cells: int, reach: float) -> Floats:
     """Kernel between even cells: the light that the mean of a cell receives from another, for each offset.
 
     It is the spread function convolved with a cell twice and sampled once per cell; in frequencies: times sinc², and
@@ -492,7 +492,7 @@ def _of_squares(transfer: _Transfer, cells: int, reach: float) -> _Array:
     return _cut(spectrum, half)
 
 
-def _grid(cells: int, reach: float) -> tuple[int, _Array]:
+def _grid(cells: int, reach: float) -> tuple[int, Floats]:
     """Half a kernel's side in cells, and frequencies of a grid twice as wide: nothing returns from its other side."""
     half = max(1, ceil(reach * cells) + 1)
     if 2 * half + 1 > MOST_CELLS:
@@ -503,13 +503,13 @@ def _grid(cells: int, reach: float) -> tuple[int, _Array]:
     return half, np.asarray(np.fft.fftfreq(4 * half) * cells, np.float64)
 
 
-def _cut(spectrum: NDArray[Any], half: int) -> _Array:
+def _cut(spectrum: NDArray[Any], half: int) -> Floats:
     n = 4 * half
     kernel = np.fft.fftshift(np.fft.irfft2(spectrum, (n, n)))[half : 3 * half + 1, half : 3 * half + 1]
     return np.asarray(kernel / kernel.sum())
 
 
-def _spaced(values: _Array, spacing: float) -> _Array:
+def _spaced(values: Floats, spacing: float) -> Floats:
     """Values at whole pixels put on cells `spacing` apart, each divided between the two cells beside its place."""
     half = values.size // 2
     middle = ceil(half * spacing) + 1
@@ -522,7 +522,7 @@ def _spaced(values: _Array, spacing: float) -> _Array:
     return out
 
 
-def _discrete(spread: Spread, spacing: float) -> _Array:
+def _discrete(spread: Spread, spacing: float) -> Floats:
     """The discrete parts on cells, shape of odd sides; [[1]] if there are none."""
     result = np.ones((1, 1))
     if spread.along_x:
@@ -539,9 +539,9 @@ def _discrete(spread: Spread, spacing: float) -> _Array:
 class PixelKernel:
     """How cells become the values of pixels: they are spread, then summed with weights."""
 
-    spread: _Array
+    spread: Floats
     """Kernel with odd sides, sum 1."""
-    weights: _Array
+    weights: Floats
     """Weights of the cells of a pixel, sum 1."""
     row: int
     """Cell of ``weights[0, 0]``, counted from the first cell of the pixel; negative for wide apertures."""
@@ -558,13 +558,13 @@ def pixel_kernel(spread: Spread, aperture: Aperture, scale: float, cells: int, c
     that the aperture cuts are taken as even.
     """
 
-    def smooth(fx: _Array, fy: _Array) -> NDArray[Any]:
+    def smooth(fx: Floats, fy: Floats) -> NDArray[Any]:
         return _smooth_transfer(spread, fx, fy, scale)
 
-    def tail(fx: _Array, fy: _Array) -> NDArray[Any]:
+    def tail(fx: Floats, fy: Floats) -> NDArray[Any]:
         return _tail_transfer(spread, fx, fy, scale)
 
-    def with_aperture(fx: _Array, fy: _Array) -> NDArray[Any]:
+    def with_aperture(fx: Floats, fy: Floats) -> NDArray[Any]:
         # The middle of a pixel lies between cells where their number is even.
         turn = np.exp(-1j * np.pi * (fx + fy) / cells) if cells % 2 == 0 else 1.0
         averaging = _sinc(np.clip(fx / cells, -0.5, 0.5)) * _sinc(np.clip(fy / cells, -0.5, 0.5))
@@ -587,7 +587,7 @@ def pixel_kernel(spread: Spread, aperture: Aperture, scale: float, cells: int, c
     return PixelKernel(_trimmed(kernel), weights, row, column)
 
 
-def _trimmed(kernel: _Array) -> _Array:
+def _trimmed(kernel: Floats) -> Floats:
     """Without borders that hold nothing, and with the sum 1."""
     for axis in (0, 1):
         lines = np.abs(kernel).sum(1 - axis)
@@ -599,7 +599,7 @@ def _trimmed(kernel: _Array) -> _Array:
 
 
 @lru_cache(maxsize=64)
-def _aperture_weights(aperture: Aperture, cells: int) -> tuple[_Array, int, int]:
+def _aperture_weights(aperture: Aperture, cells: int) -> tuple[Floats, int, int]:
     """Shares of the cells in a pixel's value, and the cell of the first weight."""
     (wx, wy), middle = aperture.width, cells / 2.0
     if aperture.shape == "point":
@@ -625,7 +625,7 @@ def _aperture_weights(aperture: Aperture, cells: int) -> tuple[_Array, int, int]
     return weights, first[1], first[0]
 
 
-def _ellipse(x: NDArray[Any], y: NDArray[Any], radii: tuple[float, float]) -> _Array:
+def _ellipse(x: NDArray[Any], y: NDArray[Any], radii: tuple[float, float]) -> Floats:
     """Share of cells of side 1 that an ellipse covers; by parts of cells where it is no circle."""
     rx, ry = radii
     if rx == ry:
@@ -659,7 +659,7 @@ class Optics:
     lateral: tuple[Lateral, ...] = ()
 
 
-def falloff_factors(falloff: Falloff, size: tuple[int, int], rows: slice | None = None) -> _Array:
+def falloff_factors(falloff: Falloff, size: tuple[int, int], rows: slice | None = None) -> Floats:
     """Light of every pixel relative to the axis, shape (height, width); at least 0."""
     width, height = size
     cx, cy = falloff.centre if falloff.centre is not None else ((width - 1) / 2.0, (height - 1) / 2.0)
@@ -678,7 +678,7 @@ def falloff_factors(falloff: Falloff, size: tuple[int, int], rows: slice | None 
     return np.maximum(factors, 0.0)
 
 
-def line_displacements(jitter: LineJitterPart, lines: int, rng: np.random.Generator) -> _Array:
+def line_displacements(jitter: LineJitterPart, lines: int, rng: np.random.Generator) -> Floats:
     """By how many pixels each line of a frame is moved to the right, shape (lines,)."""
     line = np.arange(lines)
     moved = jitter.amplitude * np.sin(2.0 * np.pi * line / jitter.period + np.radians(jitter.phase_deg))
@@ -695,7 +695,7 @@ class Light:
     scene: LightScene
     optics: Optics
     falloff: Falloff = field(default_factory=Falloff)
-    moved: _Array | None = None
+    moved: Floats | None = None
     """By how many pixels each line shows the scene further right, shape (height,); None: not at all."""
     _transforms: _Transforms = field(default_factory=lambda: _Transforms(), repr=False)
 
@@ -706,7 +706,7 @@ class Light:
         tiles = Window(0, 0, width, height).tiles(_tile_side(self.scene, self.optics))
         return sorted(tiles, key=lambda t: np.hypot(2 * t.col + t.width - width, 2 * t.row + t.height - height))
 
-    def __call__(self, tile: Window) -> _Array:
+    def __call__(self, tile: Window) -> Floats:
         """Light on a tile, shape (bands, height, width); may be called from several threads."""
         rows = slice(tile.row, tile.stop[1])
         moved = None if self.moved is None else self.moved[rows]
@@ -715,7 +715,7 @@ class Light:
             found *= falloff_factors(self.falloff, self.scene.size, rows)[:, tile.col : tile.stop[0]]
         return found
 
-    def whole(self, known: Iterable[_Array] | None = None) -> _Array:
+    def whole(self, known: Iterable[Floats] | None = None) -> Floats:
         """All tiles in their places, shape (bands, height, width); those of `tiles` that are known, or computed now."""
         width, height = self.scene.size
         out = np.empty((self.scene.bands, height, width))
@@ -763,8 +763,8 @@ class _Transforms:
 
 
 def _displacement(
-    lateral: tuple[Lateral, ...], band: int, size: tuple[int, int], tile: Window, moved: _Array | None
-) -> tuple[_Array, _Array] | None:
+    lateral: tuple[Lateral, ...], band: int, size: tuple[int, int], tile: Window, moved: Floats | None
+) -> tuple[Floats, Floats] | None:
     """Where a band's pixels take their light: distances (dx, dy) of that place from the pixel; None: none at all."""
     mine = [each for each in lateral if each.band == band + 1]
     if not mine and moved is None:
@@ -784,7 +784,7 @@ def _displacement(
     return dx, dy
 
 
-def _tile(scene: LightScene, optics: Optics, tile: Window, moved: _Array | None, transforms: _Transforms) -> _Array:
+def _tile(scene: LightScene, optics: Optics, tile: Window, moved: Floats | None, transforms: _Transforms) -> Floats:
     """Light on the pixels of a tile, shape (bands, height, width)."""
     k = scene.oversampling
     moves = [_displacement(optics.lateral, b, scene.size, tile, moved) for b in range(scene.bands)]
@@ -808,7 +808,7 @@ def _tile(scene: LightScene, optics: Optics, tile: Window, moved: _Array | None,
     return light
 
 
-def _means(cells: _Array, kernels: list[PixelKernel], transforms: _Transforms, k: int, step: int) -> Iterator[_Array]:
+def _means(cells: Floats, kernels: list[PixelKernel], transforms: _Transforms, k: int, step: int) -> Iterator[Floats]:
     """For each kernel the values of pixels that begin at the cells, or at every `step`-th cell.
 
     The margin of the cells is wider than the kernels: what a periodic convolution brings from the other side stays
@@ -836,7 +836,7 @@ def _is_direct(kernel: PixelKernel) -> bool:
     return kernel.spread.size <= 9 and separable
 
 
-def _convolved(cells: _Array, kernel: PixelKernel) -> _Array:
+def _convolved(cells: Floats, kernel: PixelKernel) -> Floats:
     """Values of pixels that begin at the cells, for a small kernel and weights that are a product."""
     if kernel.spread.size > 1:
         cells = ndimage.convolve(cells, kernel.spread)
@@ -849,8 +849,8 @@ def _convolved(cells: _Array, kernel: PixelKernel) -> _Array:
 
 
 def _at_pixels(
-    means: _Array, margin: int, k: int, shape: tuple[int, int], move: tuple[_Array, _Array] | None
-) -> _Array:
+    means: Floats, margin: int, k: int, shape: tuple[int, int], move: tuple[Floats, Floats] | None
+) -> Floats:
     """Values at the pixels of a tile: chosen from one for each pixel, or from one for each cell by cubic splines."""
     height, width = shape
     if move is None:
@@ -871,19 +871,19 @@ def _levels(spread: Spread, size: tuple[int, int], tile: Window) -> list[float]:
     return [float(_SCALE_STEP**step) for step in range(first, max(last, first) + 1)]
 
 
-def _scales(spread: Spread, size: tuple[int, int], tile: Window) -> _Array:
+def _scales(spread: Spread, size: tuple[int, int], tile: Window) -> Floats:
     """Scale of the spread function at the pixels of a tile."""
     u, v = _from_middle(size, tile)
     return np.asarray(spread.scale_at(np.hypot(u, v) / (np.hypot(*size) / 2.0)))
 
 
-def _from_middle(size: tuple[int, int], tile: Window) -> tuple[_Array, _Array]:
+def _from_middle(size: tuple[int, int], tile: Window) -> tuple[Floats, Floats]:
     """Columns and rows of a tile's pixels from the image's middle; they broadcast."""
     y, x = np.ogrid[tile.row : tile.stop[1], tile.col : tile.stop[0]]
     return x - (size[0] - 1) / 2.0, y - (size[1] - 1) / 2.0
 
 
-def _level_share(spread: Spread, levels: list[float], index: int, size: tuple[int, int], tile: Window) -> _Array:
+def _level_share(spread: Spread, levels: list[float], index: int, size: tuple[int, int], tile: Window) -> Floats:
     """Share of one scale in each pixel: linear in the square of the scale between neighbouring levels."""
     if len(levels) == 1:
         return np.ones((tile.height, tile.width))

@@ -14,18 +14,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.arrays import Floats, Floats32, Mask
 from photoplan.cameras.base import Rays
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.base import Hits, Terrain
 from photoplan.surfaces.shifted import ray_paths
 
-_Array = NDArray[np.float64]
 #: A side seen at less than this share of the other counts as none; the share is then wrong by less than that.
 _THIN = 1e-7
 
 
-def _over_cell(t: _Array, normal: tuple[float, float], side: float, first: _Wave, second: _Wave) -> _Array:
+def _over_cell(t: Floats, normal: tuple[float, float], side: float, first: _Wave, second: _Wave) -> Floats:
     """Mean over a square cell of a function of the distance t along a normal, from its first and second integrals.
 
     Seen along the normal a square is the convolution of two intervals, so the mean is a second difference.
@@ -37,27 +37,27 @@ def _over_cell(t: _Array, normal: tuple[float, float], side: float, first: _Wave
     return (second(t + outer) - second(t + inner) - second(t - inner) + second(t - outer)) / (long * short)
 
 
-_Wave = Callable[[_Array], _Array]
+_Wave = Callable[[Floats], Floats]
 
 
-def edge_share(x: _Array, y: _Array, side: float, angle_deg: float) -> _Array:
+def edge_share(x: Floats, y: Floats, side: float, angle_deg: float) -> Floats:
     """Share to the right of a line through (0, 0) that is turned against the columns."""
     normal = (cos(radians(angle_deg)), sin(radians(angle_deg)))
     t = np.clip(normal[0] * x + normal[1] * y, -2.0 * side, 2.0 * side)
     return _over_cell(t, normal, side, lambda s: np.maximum(s, 0.0), lambda s: np.maximum(s, 0.0) ** 2 / 2.0)
 
 
-def bar_share(x: _Array, y: _Array, side: float, period: float, angle_deg: float) -> _Array:
+def bar_share(x: Floats, y: Floats, side: float, period: float, angle_deg: float) -> Floats:
     """Share of bars that are half a period wide; a bar begins at (0, 0) and lies to its right."""
     normal = (cos(radians(angle_deg)), sin(radians(angle_deg)))
     half = period / 2.0
 
-    def triangle(s: _Array) -> _Array:
+    def triangle(s: Floats) -> Floats:
         # Integral of the wave ±1 from 0; its mean is half / 2.
         inside = np.mod(s, period)
         return np.asarray(np.minimum(inside, period - inside))
 
-    def parabolas(s: _Array) -> _Array:
+    def parabolas(s: Floats) -> Floats:
         # Integral of the triangle less its mean: periodic.
         inside = np.mod(s, period)
         rest = np.maximum(inside - half, 0.0)
@@ -70,7 +70,7 @@ def bar_share(x: _Array, y: _Array, side: float, period: float, angle_deg: float
     return 0.5 + 0.5 * mean
 
 
-def sector_share(x: _Array, y: _Array, side: float, sectors: int) -> _Array:
+def sector_share(x: Floats, y: Floats, side: float, sectors: int) -> Floats:
     """Share of `sectors` bright sectors around (0, 0), as wide as the dark ones between them.
 
     Exact where no cell meets two borders; the cells at the middle are cut into 64 for that.
@@ -87,7 +87,7 @@ def sector_share(x: _Array, y: _Array, side: float, sectors: int) -> _Array:
     return share
 
 
-def _one_border(x: _Array, y: _Array, side: float, sectors: int) -> _Array:
+def _one_border(x: Floats, y: Floats, side: float, sectors: int) -> Floats:
     """Share of bright sectors in cells, each with regard to the nearest border only."""
     step = pi / sectors
     number = np.round(np.arctan2(y, x) / step)
@@ -98,27 +98,27 @@ def _one_border(x: _Array, y: _Array, side: float, sectors: int) -> _Array:
     long, short = np.maximum(a, b), np.maximum(np.minimum(a, b), 1e-4 * side)
     outer, inner = (long + short) / 2.0, (long - short) / 2.0
 
-    def second(s: _Array) -> _Array:
+    def second(s: Floats) -> Floats:
         return np.asarray(np.maximum(s, 0.0) ** 2 / 2.0)
 
     share = (second(t + outer) - second(t + inner) - second(t - inner) + second(t - outer)) / (long * short)
     return np.where(np.mod(number, 2) == 0, share, 1.0 - share)
 
 
-def step_mean(x: _Array, side: float, steps: int, width: int) -> _Array:
+def step_mean(x: Floats, side: float, steps: int, width: int) -> Floats:
     """Mean of a staircase from 0 to 1 with `steps` equal steps over `width`, x from its middle; outside its ends."""
     levels = np.arange(steps) / (steps - 1.0)
     borders = np.linspace(0.0, width, steps + 1)
     integral = np.concatenate([[0.0], np.cumsum(levels * width / steps)])
 
-    def below(t: _Array) -> _Array:
+    def below(t: Floats) -> Floats:
         return np.asarray(np.interp(t, borders, integral) + np.maximum(t - width, 0.0))
 
     middle = x + width / 2.0
     return (below(middle + side / 2.0) - below(middle - side / 2.0)) / side
 
 
-def disc_share(x: _Array, y: _Array, side: float, radius: float) -> _Array:
+def disc_share(x: Floats, y: Floats, side: float, radius: float) -> Floats:
     """Share of cells that a disc around (0, 0) covers; the area of disc and square in closed form."""
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
     distance = np.hypot(x, y)
@@ -135,7 +135,7 @@ def disc_share(x: _Array, y: _Array, side: float, radius: float) -> _Array:
     return share
 
 
-def _quarter(a: _Array, b: _Array, radius: float) -> _Array:
+def _quarter(a: Floats, b: Floats, radius: float) -> Floats:
     """Area of the part of a disc with x ≤ a and y ≤ b."""
     a, b = np.clip(a, -radius, radius), np.clip(b, -radius, radius)
     level = np.abs(b)
@@ -150,7 +150,7 @@ def _quarter(a: _Array, b: _Array, radius: float) -> _Array:
     return _half_chords(a, radius) + np.sign(b) * capped
 
 
-def _half_chords(a: _Array, radius: float) -> _Array:
+def _half_chords(a: Floats, radius: float) -> Floats:
     """∫ √(r² − x²) dx from −r to a."""
     s = np.sqrt(np.maximum(radius**2 - a**2, 0.0))
     return (a * s + radius**2 * np.arcsin(np.clip(a / radius, -1.0, 1.0))) / 2.0 + pi * radius**2 / 4.0
@@ -190,7 +190,7 @@ class LightScene(Protocol):
         """Whether the cells are means of a continuous scene; else the scene consists of even squares."""
         ...
 
-    def cells(self, window: Window) -> _Array:
+    def cells(self, window: Window) -> Floats:
         """Cells of a window of pixels, shape (bands, height · k, width · k); it may reach beyond the image."""
         ...
 
@@ -260,7 +260,7 @@ class PatternScene:
         """Column and row of the pattern's middle."""
         return (self.size[0] - 1) / 2.0 + self.phase[0], (self.size[1] - 1) / 2.0 + self.phase[1]
 
-    def centres(self) -> _Array:
+    def centres(self) -> Floats:
         """Column and row of the discs whose centres lie in the image, shape (n, 2), row by row."""
         pitch = self.numbers[0]
         axes = []
@@ -270,7 +270,7 @@ class PatternScene:
         y, x = np.meshgrid(axes[1], axes[0], indexing="ij")
         return np.stack([x.ravel(), y.ravel()], 1)
 
-    def cells(self, window: Window) -> _Array:
+    def cells(self, window: Window) -> Floats:
         """Cells of a window of pixels, shape (bands, height · k, width · k)."""
         k = self.oversampling
         x = (np.arange(window.col * k, window.stop[0] * k) + 0.5) / k - 0.5 - self.middle[0]
@@ -281,14 +281,14 @@ class PatternScene:
         return np.repeat(values[None], self.bands, 0)
 
 
-def _discs(scene: PatternScene, x: _Array, y: _Array, side: float) -> _Array:
+def _discs(scene: PatternScene, x: Floats, y: Floats, side: float) -> Floats:
     pitch = scene.numbers[0]
     near = [v - np.round(v / pitch) * pitch for v in (x, y)]
     return 1.0 - disc_share(near[0], near[1], side, scene.diameter / 2.0)
 
 
 #: Share of a pattern's bright part in cells of a side at x and y from its middle.
-_SHARES: dict[str, Callable[[PatternScene, _Array, _Array, float], _Array]] = {
+_SHARES: dict[str, Callable[[PatternScene, Floats, Floats, float], Floats]] = {
     "flat": lambda scene, x, y, side: np.ones((1, 1)),
     "edge": lambda scene, x, y, side: edge_share(x, y, side, scene.numbers[0]),
     "bars": lambda scene, x, y, side: bar_share(x, y, side, scene.numbers[0], scene.numbers[1]),
@@ -337,7 +337,7 @@ class FromAbove:
         """Columns and rows."""
         return self.grid.width, self.grid.height
 
-    def rays(self, xy: ArrayLike, height: float | None = None) -> tuple[_Array, _Array]:
+    def rays(self, xy: ArrayLike, height: float | None = None) -> tuple[Floats, Floats]:
         """Points above the pixels, and the way down."""
         XY = self.grid.to_map(xy)
         origin = np.concatenate([XY, np.full((*XY.shape[:-1], 1), self.top)], axis=-1)
@@ -352,7 +352,7 @@ class Texture(Protocol):
         """Number of bands."""
         ...
 
-    def __call__(self, hits: Hits) -> _Array:
+    def __call__(self, hits: Hits) -> Floats:
         """Grey values, 0 to 255, of what neighbouring rays meet, shape (bands, n); 0 where they meet nothing."""
         ...
 
@@ -372,7 +372,7 @@ class SolidTexture:
     bands: int = 3
 
     @cached_property
-    def _waves(self) -> tuple[_Array, _Array]:
+    def _waves(self) -> tuple[Floats, Floats]:
         """Wave vectors (3, m), radians per metre, and phases (m,)."""
         rng = np.random.default_rng([self.seed, 0])
         way = rng.normal(size=(3, _WAVES))
@@ -380,11 +380,11 @@ class SolidTexture:
         return way / np.linalg.norm(way, axis=0) * (2 * np.pi / length), rng.uniform(0, 2 * np.pi, _WAVES)
 
     @cached_property
-    def _tints(self) -> _Array:
+    def _tints(self) -> Floats:
         """Mean grey values of objects, shape (_TINTS, bands)."""
         return np.random.default_rng([self.seed, 1]).uniform(*_OBJECTS, (_TINTS, self.bands))
 
-    def __call__(self, hits: Hits) -> _Array:
+    def __call__(self, hits: Hits) -> Floats:
         """Grey values, see `Texture`."""
         waves, phases = self._waves
         pattern = np.cos(hits.XYZ @ waves + phases).sum(axis=1) * (_CONTRAST * np.sqrt(2.0 / _WAVES))
@@ -424,7 +424,7 @@ class RenderedScene:
         """The scene is no mosaic of squares."""
         return True
 
-    def cells(self, window: Window) -> _Array:
+    def cells(self, window: Window) -> Floats:
         """Cells of a window of pixels, shape (bands, height · k, width · k); where rays meet nothing they are 0."""
         k = self.oversampling
         x = (np.arange(window.width * k) + 0.5) / k - 0.5 + window.col
@@ -437,14 +437,14 @@ class RenderedScene:
             out[:, part] = self.texture(self.hits(xy)).reshape(self.bands, -1, len(x))
         return out
 
-    def means(self, window: Window) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    def means(self, window: Window) -> tuple[NDArray[np.uint8], Mask]:
         """Means of the cells of pixels, shape (bands, height, width), and those that show something everywhere."""
         k = self.oversampling
         cells = self.cells(window).reshape(self.bands, window.height, k, window.width, k)
         valid = np.asarray((cells > 0).all(axis=(0, 2, 4)))
         return np.rint(cells.mean(axis=(2, 4)) * valid).astype(np.uint8), valid
 
-    def places(self, window: Window, origin: _Array) -> NDArray[np.float32]:
+    def places(self, window: Window, origin: Floats) -> Floats32:
         """X, Y, Z from an origin (3,) and object at the middles of pixels, shape (4, height, width); NaN: nothing."""
         y, x = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].astype(float)
         hits = self.hits(np.stack([x, y], axis=-1).reshape(-1, 2))

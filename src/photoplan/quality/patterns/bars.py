@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.adjustment.least_squares import solve
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.findings import with_sigma
 from photoplan.quality.mtf_curve import MtfCurve
-
-Array = NDArray[np.float64]
 
 #: Share of clipped pixels from which on a pattern is refused.
 MOST_CLIPPED = 0.005
@@ -24,7 +23,7 @@ MOST_CLIPPED = 0.005
 MOST_SIDE = 8192
 
 
-def clipped_pixels(stored: NDArray[Any]) -> NDArray[np.bool_]:
+def clipped_pixels(stored: NDArray[Any]) -> Mask:
     """Pixels that are cut off at an end of the range, same shape.
 
     They are at a limit of an integer type; or they all have the highest (lowest) value, one in a hundred of them or
@@ -46,14 +45,14 @@ def clipped_pixels(stored: NDArray[Any]) -> NDArray[np.bool_]:
     return clipped
 
 
-def _heaped(stored: NDArray[Any], end: float, step: int, at_end: NDArray[np.bool_]) -> bool:
+def _heaped(stored: NDArray[Any], end: float, step: int, at_end: Mask) -> bool:
     """An end of integers is cut off if it holds far more pixels than the value beside it: noise rounds to both."""
     return not np.issubdtype(stored.dtype, np.integer) or at_end.sum() >= 4 * (stored == end + step).sum()
 
 
 def pattern_window(
-    light: NDArray[Any], clipped: NDArray[np.bool_] | None, what: str, least: int = 12, most: int = MOST_SIDE
-) -> Array:
+    light: NDArray[Any], clipped: Mask | None, what: str, least: int = 12, most: int = MOST_SIDE
+) -> Floats:
     """The window of a pattern as float64, checked."""
     values = np.asarray(light, np.float64)
     if values.ndim != 2 or min(values.shape, default=0) < least:
@@ -77,7 +76,7 @@ def pattern_window(
     return values
 
 
-def white_noise(values: Array) -> float:
+def white_noise(values: Floats) -> float:
     """Standard deviation of uncorrelated noise of a picture without its structure.
 
     The second mixed difference takes planes and slow structure away; Immerkær 1996, "Fast noise variance estimation".
@@ -87,13 +86,13 @@ def white_noise(values: Array) -> float:
     return float(np.sqrt((both**2).mean())) / 6.0
 
 
-def waves(turn: ArrayLike, harmonics: Sequence[int]) -> Array:
+def waves(turn: ArrayLike, harmonics: Sequence[int]) -> Floats:
     """Cosine and sine of each harmonic wave, shape (…, 2 · harmonics), at phases of shape (…) in periods."""
     angle = 2.0 * pi * np.multiply.outer(turn, np.asarray(harmonics, float))
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1).reshape(*angle.shape[:-1], -1)
 
 
-def least_squares(columns: Array, values: Array) -> tuple[Array, Array, Array]:
+def least_squares(columns: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
     """Solution, its covariance, and residuals (observed minus computed) of an overdetermined linear system."""
     fit = solve(columns, values)
     if fit.rank < columns.shape[1]:
@@ -149,9 +148,7 @@ class BarContrast:
     standard deviations hold what they may add."""
 
 
-def measure_bars(
-    light: NDArray[np.floating], *, clipped: NDArray[np.bool_] | None = None, what: str = "bars"
-) -> BarContrast:
+def measure_bars(light: NDArray[np.floating], *, clipped: Mask | None = None, what: str = "bars") -> BarContrast:
     """Frequency, direction, phase, duty and modulation of a window with parallel bars.
 
     Parameters
@@ -214,13 +211,13 @@ def measure_bars(
     )
 
 
-def _middle_part(values: Array) -> Array:
+def _middle_part(values: Floats) -> Floats:
     """The middle of a large window: more pixels than these add nothing but time."""
     rows, columns = (slice(max(0, (n - _MOST) // 2), max(0, (n - _MOST) // 2) + _MOST) for n in values.shape)
     return values[rows, columns]
 
 
-def _fit(values: Array, phase: Array, wave: BarWave) -> tuple[Array, Array, Array, Array, tuple[int, ...]]:
+def _fit(values: Floats, phase: Floats, wave: BarWave) -> tuple[Floats, Floats, Floats, Floats, tuple[int, ...]]:
     """Values with a uniform mean level, solution, covariance and residuals of the wave, harmonics that are hidden.
 
     Illumination acts as a factor: the plane of the mean level is divided out.
@@ -239,7 +236,9 @@ def _fit(values: Array, phase: Array, wave: BarWave) -> tuple[Array, Array, Arra
     return flat, solution, covariance, residuals, hidden
 
 
-def _levels(flat: Array, turn: Array, solution: Array, harmonics: tuple[int, ...]) -> tuple[float, float, float, float]:
+def _levels(
+    flat: Floats, turn: Floats, solution: Floats, harmonics: tuple[int, ...]
+) -> tuple[float, float, float, float]:
     """Levels of dark and bright bars in their middle, the standard deviation of their difference, and their bend."""
     found = []
     start = atan2(float(solution[4]), float(solution[3]))
@@ -262,11 +261,11 @@ def _levels(flat: Array, turn: Array, solution: Array, harmonics: tuple[int, ...
     return low, high, hypot(low_sigma, high_sigma), (low_bend - high_bend) / 2.0
 
 
-def _few_level(x: Array, phase: float, solution: Array, harmonics: tuple[int, ...]) -> tuple[float, float, float]:
+def _few_level(x: Floats, phase: float, solution: Floats, harmonics: tuple[int, ...]) -> tuple[float, float, float]:
     """Level of bars that meet the pixels at few phases: what the waves add up to; its deviation from the pixels there
     as standard deviation; and the bend of the waves."""
 
-    def at(turn: float | Array) -> Array:
+    def at(turn: float | Floats) -> Floats:
         return np.asarray(solution[0] + waves(turn, harmonics) @ solution[3:])
 
     level = float(at(phase))
@@ -310,7 +309,7 @@ class BarWave:
         """Cycles per pixel across the bars."""
         return hypot(self.fx, self.fy)
 
-    def phases(self, shape: tuple[int, ...]) -> Array:
+    def phases(self, shape: tuple[int, ...]) -> Floats:
         """Periods from the middle of a window, shape (rows, columns)."""
         x = np.arange(shape[1]) - (shape[1] - 1) / 2.0
         y = np.arange(shape[0]) - (shape[0] - 1) / 2.0
@@ -339,15 +338,15 @@ class BarWave:
         return tuple(kept), tuple(hidden)
 
 
-def _both(wave: Array) -> list[Array]:
+def _both(wave: Floats) -> list[Floats]:
     return [wave, -wave]
 
 
-def _wrapped(wave: Array) -> Array:
+def _wrapped(wave: Floats) -> Floats:
     return np.asarray(wave - np.round(wave))
 
 
-def wave_columns(shape: tuple[int, ...], phase: Array, harmonics: tuple[int, ...]) -> Array:
+def wave_columns(shape: tuple[int, ...], phase: Floats, harmonics: tuple[int, ...]) -> Floats:
     """Columns of the linear model: level, its slopes in x and y, and cosine and sine of each harmonic wave.
 
     The phase is in periods, one for each pixel of a window of this shape; a row of the result is a pixel.
@@ -358,7 +357,7 @@ def wave_columns(shape: tuple[int, ...], phase: Array, harmonics: tuple[int, ...
     return np.hstack([plane, waves(phase.ravel(), harmonics)])
 
 
-def find_wave(values: Array, what: str) -> BarWave:
+def find_wave(values: Floats, what: str) -> BarWave:
     """The strongest plane wave of a window."""
     rows, columns = values.shape
     flat = values - values.mean()
@@ -379,7 +378,7 @@ def find_wave(values: Array, what: str) -> BarWave:
     return _refined(residuals.reshape(values.shape), BarWave(float(fx[0, column]), float(fy[row, 0])))
 
 
-def _refined(values: Array, wave: BarWave) -> BarWave:
+def _refined(values: Floats, wave: BarWave) -> BarWave:
     """Frequencies by least squares, from a start that is right within half a period over the window."""
     y, x = np.mgrid[0 : values.shape[0], 0 : values.shape[1]]
     x = (x - (values.shape[1] - 1) / 2.0).ravel()
@@ -534,17 +533,17 @@ class StarPixels:
     """Pixels of a window in polar coordinates about a centre, by increasing radius."""
 
     centre: tuple[float, float]
-    values: Array
+    values: Floats
     """Light, shape (n,)."""
-    x: Array
-    y: Array
-    radius: Array
+    x: Floats
+    y: Floats
+    radius: Floats
     """Distance from the centre."""
-    angle: Array
+    angle: Floats
     """Direction from the centre, from columns towards increasing rows, radians."""
 
     @classmethod
-    def of(cls, values: Array, centre: tuple[float, float]) -> StarPixels:
+    def of(cls, values: Floats, centre: tuple[float, float]) -> StarPixels:
         """Pixels of a window."""
         y, x = np.mgrid[0 : values.shape[0], 0 : values.shape[1]].astype(float)
         return cls._sorted(centre, values.ravel(), x.ravel(), y.ravel())
@@ -554,14 +553,14 @@ class StarPixels:
         return self._sorted(centre, self.values, self.x, self.y)
 
     @classmethod
-    def _sorted(cls, centre: tuple[float, float], values: Array, x: Array, y: Array) -> StarPixels:
+    def _sorted(cls, centre: tuple[float, float], values: Floats, x: Floats, y: Floats) -> StarPixels:
         radius = np.hypot(x - centre[0], y - centre[1])
         order = np.argsort(radius, kind="stable")
         x, y = x[order], y[order]
         angle = np.arctan2(y - centre[1], x - centre[0])
         return cls(centre=centre, values=values[order], x=x, y=y, radius=radius[order], angle=angle)
 
-    def between(self, inner: float, outer: float) -> tuple[Array, Array]:
+    def between(self, inner: float, outer: float) -> tuple[Floats, Floats]:
         """Light and direction of the pixels of a ring."""
         part = slice(*np.searchsorted(self.radius, [inner, outer]))
         return self.values[part], self.angle[part]
@@ -575,7 +574,7 @@ class StarRing:
     mean: float
     cosine: float
     sine: float
-    covariance: Array
+    covariance: Floats
     """Covariances of cosine and sine, (2, 2)."""
     third: tuple[float, float] | None
     """Cosine and sine of the third harmonic wave; None where it is not fitted."""
@@ -594,7 +593,7 @@ class StarRing:
         return float(np.sqrt(np.trace(self.covariance) / 2.0))
 
 
-def fit_ring(values: Array, angle: Array, radius: float, sectors: int, *, whole: bool) -> StarRing:
+def fit_ring(values: Floats, angle: Floats, radius: float, sectors: int, *, whole: bool) -> StarRing:
     """Least squares of a wave with so many periods around the centre, beside a level that changes slowly."""
     frequency = sectors / (2.0 * pi * radius)
     around = angle / (2.0 * pi)
@@ -618,7 +617,7 @@ def fit_ring(values: Array, angle: Array, radius: float, sectors: int, *, whole:
     )
 
 
-def rough_centre(values: Array) -> tuple[float, float]:
+def rough_centre(values: Floats) -> tuple[float, float]:
     """Centre of the pattern that a half turn maps onto itself, or onto its negative (odd numbers of sectors).
 
     The correlation of the window with itself, turned by half a turn; it peaks at twice the centre.
@@ -684,7 +683,7 @@ def find_centre(
     return pixels, sigma
 
 
-def _parts(pixels: StarPixels, radii: tuple[float, float], sectors: int) -> tuple[Array, NDArray[np.complex128]]:
+def _parts(pixels: StarPixels, radii: tuple[float, float], sectors: int) -> tuple[Floats, NDArray[np.complex128]]:
     """Complex amplitudes of eight parts of six rings; rows of the shift's equations: column, row, ring."""
     edges, rings = np.linspace(-pi, pi, 9), np.linspace(*radii, 7)
     rows, found = [], []
@@ -704,7 +703,7 @@ def _parts(pixels: StarPixels, radii: tuple[float, float], sectors: int) -> tupl
     return np.array(rows).reshape(-1, 8), np.array(found, complex)
 
 
-def _shift(rows: Array, found: NDArray[np.complex128]) -> tuple[tuple[float, float], Array]:
+def _shift(rows: Floats, found: NDArray[np.complex128]) -> tuple[tuple[float, float], Floats]:
     """Shift of the centre and its covariance from the phases of all parts, relative to each ring's mean phase."""
     turned = np.zeros(found.size)
     for k in range(2, 8):
@@ -777,11 +776,7 @@ class StarMtf:
 
 
 def measure_star(
-    light: NDArray[np.floating],
-    rules: StarRules | None = None,
-    *,
-    clipped: NDArray[np.bool_] | None = None,
-    what: str = "star",
+    light: NDArray[np.floating], rules: StarRules | None = None, *, clipped: Mask | None = None, what: str = "star"
 ) -> StarMtf:
     """Modulation transfer of a window with a Siemens star.
 
@@ -840,7 +835,7 @@ def measure_star(
     )
 
 
-def _outer(values: Array, centre: tuple[float, float], rules: StarRules, what: str) -> float:
+def _outer(values: Floats, centre: tuple[float, float], rules: StarRules, what: str) -> float:
     """Radius of the largest circle about the centre that the window holds."""
     rows, columns = values.shape
     if not (0 <= centre[0] <= columns - 1 and 0 <= centre[1] <= rows - 1):

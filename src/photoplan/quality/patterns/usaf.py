@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.adjustment.least_squares import solve
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.quality.patterns.bars import MOST_CLIPPED, least_squares, pattern_window
 
@@ -73,8 +74,6 @@ def usaf_frequency(group: int, element: int) -> float:
     return float(2.0 ** (group + (element - 1) / 6.0))
 
 
-Array = NDArray[np.float64]
-
 #: Bars that are looked at, the largest first.
 _MOST_BARS = 3000
 #: Threes of bars that are compared with the layout; a target shows far fewer.
@@ -87,9 +86,9 @@ _LEAST_MATCHES = 5
 class UsafPlace:
     """Where the target is in the picture."""
 
-    matrix: Array
+    matrix: Floats
     """(2, 2): from periods of the first element of the largest group to pixels."""
-    origin: Array
+    origin: Floats
     """(2,): column and row of the centre about which the pairs of groups are similar."""
     matched: int
     """Threes of bars that fit."""
@@ -101,31 +100,31 @@ class UsafPlace:
     shifts: Mapping[int, tuple[float, float]] = field(default_factory=dict)
     """By how much pairs of groups lie beside their places, pixels."""
 
-    def pixel(self, x: float, y: float, pair: int = 0) -> Array:
+    def pixel(self, x: float, y: float, pair: int = 0) -> Floats:
         """Column and row of a point of the layout that belongs to a pair of groups."""
         return np.asarray(self.origin + self.matrix @ np.array([x, y]) + np.array(self.shifts.get(pair, (0.0, 0.0))))
 
-    def shifted(self, pair: int, shift: Array) -> UsafPlace:
+    def shifted(self, pair: int, shift: Floats) -> UsafPlace:
         """The place with another shift of a pair."""
         return replace(self, shifts={**self.shifts, pair: (float(shift[0]), float(shift[1]))})
 
 
 @dataclass(frozen=True, eq=False)
 class _Bar:
-    centre: Array
-    along: Array
+    centre: Floats
+    along: Floats
     length: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Three:
-    centre: Array
-    across: Array
+    centre: Floats
+    across: Floats
     """Unit vector across the bars."""
     period: float
 
 
-def find_usaf(values: Array, what: str) -> UsafPlace:
+def find_usaf(values: Floats, what: str) -> UsafPlace:
     """The place of the target."""
     best: UsafPlace | None = None
     for bright in (True, False):
@@ -141,7 +140,7 @@ def find_usaf(values: Array, what: str) -> UsafPlace:
     return best
 
 
-def _bars(values: Array) -> list[_Bar]:
+def _bars(values: Floats) -> list[_Bar]:
     """Bright rectangles about five times as long as wide, at several scales of the local threshold."""
     bars: list[_Bar] = []
     side = max(values.shape)
@@ -216,7 +215,7 @@ def _place(threes: Sequence[_Three], bright: bool) -> UsafPlace | None:
     if len(threes) < _LEAST_MATCHES:
         return None
     items = list(usaf_layout(8))
-    best: tuple[int, Array, Array] | None = None
+    best: tuple[int, Floats, Floats] | None = None
     for seed in threes[:6]:
         for item in items[:24]:
             for matrix in _turns(seed, item):
@@ -241,7 +240,7 @@ def _place(threes: Sequence[_Three], bright: bool) -> UsafPlace | None:
     return UsafPlace(matrix=matrix, origin=origin, matched=len(matches), rms=rms, bright=bright)
 
 
-def _turns(seed: _Three, item: UsafElement) -> list[Array]:
+def _turns(seed: _Three, item: UsafElement) -> list[Floats]:
     """Similarities that lay an item on a three: both senses of each axis."""
     scale = seed.period / item.period
     across, along = scale * seed.across, scale * np.array([-seed.across[1], seed.across[0]])
@@ -250,7 +249,7 @@ def _turns(seed: _Three, item: UsafElement) -> list[Array]:
 
 
 def _matches(
-    threes: Sequence[_Three], items: Sequence[UsafElement], matrix: Array, origin: Array, tolerance: float
+    threes: Sequence[_Three], items: Sequence[UsafElement], matrix: Floats, origin: Floats, tolerance: float
 ) -> list[tuple[int, int]]:
     """Threes and the item that each of them is: near, of its period and direction."""
     places = np.array([[item.x, item.y] for item in items]) @ matrix.T + origin
@@ -300,21 +299,19 @@ class ThreeBars:
 class _Pixels:
     """Pixels around three bars."""
 
-    u: Array
+    u: Floats
     """Across the bars from the middle one, periods."""
-    v: Array
+    v: Floats
     """Along the bars from their middle, periods."""
-    light: Array
-    clipped: Array
-    centre: Array
+    light: Floats
+    clipped: Floats
+    centre: Floats
     frequency: float
-    across: Array
+    across: Floats
     """Unit vector."""
 
 
-def _pixels(
-    values: Array, clipped: NDArray[np.bool_] | None, place: UsafPlace, item: UsafElement, reach: float
-) -> _Pixels | None:
+def _pixels(values: Floats, clipped: Mask | None, place: UsafPlace, item: UsafElement, reach: float) -> _Pixels | None:
     """Pixels up to so many periods from the centre; None where the element is not inside of the picture."""
     x_axis, y_axis = (place.matrix * item.period).T
     across, along = (y_axis, x_axis) if item.horizontal else (x_axis, y_axis)
@@ -343,9 +340,7 @@ def _pixels(
     )
 
 
-def measure_three(
-    values: Array, clipped: NDArray[np.bool_] | None, place: UsafPlace, item: UsafElement
-) -> ThreeBars | None:
+def measure_three(values: Floats, clipped: Mask | None, place: UsafPlace, item: UsafElement) -> ThreeBars | None:
     """Difference between bars and gaps; None where the element is not inside of the picture, or has too few pixels.
 
     Bars are placed along their normal by their own wave, if it stands out; a linear change of light across them is
@@ -378,7 +373,7 @@ def measure_three(
     )
 
 
-def place_pair(values: Array, place: UsafPlace, items: Sequence[UsafElement]) -> UsafPlace:
+def place_pair(values: Floats, place: UsafPlace, items: Sequence[UsafElement]) -> UsafPlace:
     """Shift one pair of groups so that its bars lie where the picture has bars.
 
     Makers place the inner pairs to a fraction of a millimetre; each pair is shifted by the sum of the correlations of
@@ -406,7 +401,7 @@ def place_pair(values: Array, place: UsafPlace, items: Sequence[UsafElement]) ->
     return place.shifted(pair, shift)
 
 
-def _correlation(u: Array, light: Array) -> float:
+def _correlation(u: Floats, light: Floats) -> float:
     """Correlation of pixels with three bars and the dark on both sides of them."""
     part = np.abs(u) <= 1.75
     if part.sum() < 12:
@@ -418,7 +413,7 @@ def _correlation(u: Array, light: Array) -> float:
     return float(grey @ bars) / size if size > 0.0 else 0.0
 
 
-def _shift(u: Array, v: Array, light: Array) -> float:
+def _shift(u: Floats, v: Floats, light: Floats) -> float:
     """By how much the bars lie beside their place, periods; 0 where their wave does not stand out."""
     shift = 0.0
     for _ in range(3):
@@ -440,7 +435,7 @@ def _shift(u: Array, v: Array, light: Array) -> float:
     return shift
 
 
-def _wide(u: Array, light: Array) -> tuple[float, float, bool]:
+def _wide(u: Floats, light: Floats) -> tuple[float, float, bool]:
     """Difference of the means in the middle of bars and gaps."""
     level: list[tuple[float, float, float]] = []
     for k in (-1.0, -0.5, 0.0, 0.5, 1.0):
@@ -458,7 +453,7 @@ def _wide(u: Array, light: Array) -> tuple[float, float, bool]:
     return difference, sigma, bool(abs(bend) < 0.015 * abs(difference) + 2.0 * sigma and difference > 20.0 * sigma)
 
 
-def _fine(u: Array, light: Array, frequency: float) -> tuple[float, float, bool]:
+def _fine(u: Floats, light: Floats, frequency: float) -> tuple[float, float, bool]:
     """Difference of bars and gaps by waves with the bars' period, beside a level with slope and curvature.
 
     Harmonic waves are taken in as far as blur leaves them and the places of the pixels tell them apart.
@@ -582,11 +577,7 @@ class UsafResult:
 
 
 def measure_usaf(
-    light: NDArray[np.floating],
-    rules: UsafRules,
-    *,
-    clipped: NDArray[np.bool_] | None = None,
-    what: str = "USAF target",
+    light: NDArray[np.floating], rules: UsafRules, *, clipped: Mask | None = None, what: str = "USAF target"
 ) -> UsafResult:
     """Contrast transfer of every element in a picture, and the limiting resolution.
 
@@ -656,7 +647,7 @@ def _first_group(place: UsafPlace, rules: UsafRules, what: str) -> int:
     return rules.group
 
 
-def _full(found: Sequence[tuple[UsafElement, ThreeBars]], what: str) -> Array:
+def _full(found: Sequence[tuple[UsafElement, ThreeBars]], what: str) -> Floats:
     """Difference of light between wide bars and gaps as level and slopes over the picture."""
     flat = [three for _, three in found if three.flat]
     if not flat:
@@ -679,7 +670,7 @@ def _full(found: Sequence[tuple[UsafElement, ThreeBars]], what: str) -> Array:
     return np.array([float(levels.mean()), 0.0, 0.0])
 
 
-def _bars_usaf(item: UsafElement, three: ThreeBars, full: Array, first: int, rules: UsafRules) -> UsafBars:
+def _bars_usaf(item: UsafElement, three: ThreeBars, full: Floats, first: int, rules: UsafRules) -> UsafBars:
     level = float(full @ np.array([1.0, *three.centre]))
     contrast = three.difference / level
     sigma = three.sigma / level

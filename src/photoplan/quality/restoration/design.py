@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import GAUSSIAN_WIDTH, MtfCurve, SpreadFunction, disc_transfer
 from photoplan.quality.restoration.restorer import (
@@ -28,16 +29,14 @@ _GRID = 256
 LEAST_TRANSFER = 0.05
 
 
-def aperture_transfer(
-    shape: Literal["square", "round"], ratio: float, u: NDArray[np.float64], v: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def aperture_transfer(shape: Literal["square", "round"], ratio: float, u: Floats, v: Floats) -> Floats:
     """Transfer function of an aperture."""
     if shape == "square":
         return np.asarray(np.sinc(ratio * u) * np.sinc(ratio * v))
     return disc_transfer(ratio / 2.0, np.hypot(u, v))
 
 
-def aperture_filter(shape: Literal["square", "round"], ratio: float = 1.0, half: int = 4) -> NDArray[np.float64]:
+def aperture_filter(shape: Literal["square", "round"], ratio: float = 1.0, half: int = 4) -> Floats:
     """Filter that undoes an aperture: the Fourier series of the inverse transfer function up to 0.5 cycles per step.
 
     With ratio 1 and nine values a side these are He's matrices; the square one is printed divided by its sum, the
@@ -69,8 +68,6 @@ def _largest_ratio(shape: Literal["square", "round"]) -> float:
     return float(ratios[int(np.argmax(np.array(left) < LEAST_TRANSFER)) - 1])
 
 
-Array = NDArray[np.float64]
-
 #: Side of the blocks that are compressed, pixels.
 BLOCK = 8
 #: Steps that are tried, grey values.
@@ -85,7 +82,7 @@ _COMPRESSED = 0.2
 _HELD = 0.3
 
 
-def kept_by_compression(pixels: Array) -> Array:
+def kept_by_compression(pixels: Floats) -> Floats:
     """Share of what an image shows at each frequency that is the scene, as compression by blocks has left it.
 
     It is the slope of the scene on the rounded coefficients, for a Laplacian distribution of the coefficients (Lam and
@@ -106,14 +103,14 @@ def kept_by_compression(pixels: Array) -> Array:
     return np.asarray(kept.reshape(BLOCK, BLOCK) * held)
 
 
-def at_frequencies(kept: Array, u: Array, v: Array) -> Array:
+def at_frequencies(kept: Floats, u: Floats, v: Floats) -> Floats:
     """Return what `kept_by_compression` found at frequencies up to 0.5 cycles per pixel; arrays that broadcast."""
     at = np.arange(BLOCK) / (2.0 * BLOCK)
     along, down = (np.stack([np.interp(np.abs(f), at, unit) for unit in np.eye(BLOCK)]) for f in (u, v))
     return np.asarray(np.einsum("ij,i...,j...->...", kept, down, along))
 
 
-def _step(values: Array) -> float:
+def _step(values: Floats) -> float:
     """Step of which coefficients are multiples; 0 if there is none."""
     best, found = _ON_STEPS, 0.0
     size = np.sort(np.abs(values))
@@ -127,7 +124,7 @@ def _step(values: Array) -> float:
     return found
 
 
-def _slope(values: Array, step: float) -> float:
+def _slope(values: Floats, step: float) -> float:
     """Slope of true on rounded coefficients; 1 where no step is known."""
     size = np.abs(np.rint(values / step)) if step > 0.0 else np.zeros(1)
     if not size.any():
@@ -148,7 +145,7 @@ _EVEN = 0.1
 _TOO_SMALL = 0.894
 
 
-def block_noise(grey: NDArray[np.float64], valid: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+def block_noise(grey: Floats, valid: Mask | None = None) -> Floats:
     """Standard deviation of the noise in each whole block of an image, if the scene is even there.
 
     Differences of differences in both directions, [1 -2 1] times [1 -2 1], leave nothing of planes and of edges along
@@ -166,7 +163,7 @@ def block_noise(grey: NDArray[np.float64], valid: NDArray[np.bool_] | None = Non
     return np.asarray(noise[whole])
 
 
-def image_noise(blocks: NDArray[np.float64]) -> float:
+def image_noise(blocks: Floats) -> float:
     """Noise of an image from that of its blocks: what the most even ones show; NaN if there is none."""
     seen = np.sort(blocks[blocks > 0.0])
     if seen.size == 0:
@@ -224,7 +221,7 @@ class Condition:
         )
 
 
-def band_matrix(spread: SpreadFunction, rows: int = BAND_ROWS) -> NDArray[np.float64]:
+def band_matrix(spread: SpreadFunction, rows: int = BAND_ROWS) -> Floats:
     """Band matrix that makes image values of object values, shape (rows, rows) (Kölbl 2006, eq. 2)."""
     half = spread.half
     down, right = np.zeros(rows), np.zeros(rows)
@@ -252,7 +249,7 @@ def condition_of(spread: SpreadFunction) -> Condition:
     )
 
 
-def exact_inverse(spread: SpreadFunction, half: int = 5, rows: int = BAND_ROWS) -> NDArray[np.float64]:
+def exact_inverse(spread: SpreadFunction, half: int = 5, rows: int = BAND_ROWS) -> Floats:
     """The one-dimensional filter that undoes a spread function: the middle row of the inverse band matrix (eq. 3).
 
     Parameters
@@ -289,7 +286,7 @@ def curve_transfer(x: MtfCurve, y: MtfCurve) -> Transfer:
     Beyond the last frequency of a curve it is 0. Curves without standard deviations count as known.
     """
 
-    def transfer(u: Array, v: Array) -> tuple[Array, Array]:
+    def transfer(u: Floats, v: Floats) -> tuple[Floats, Floats]:
         square = u**2 + v**2
         frequency = np.sqrt(square)
         share = np.where(square > 0.0, u**2 / np.where(square > 0.0, square, 1.0), 0.5)
@@ -309,7 +306,7 @@ def curve_transfer(x: MtfCurve, y: MtfCurve) -> Transfer:
 def sharpest(transfer: Transfer, sigmas: float = 1.96) -> Transfer:
     """The sharpest that a transfer function may be, by so many standard deviations; it counts as known."""
 
-    def known(u: Array, v: Array) -> tuple[Array, Array]:
+    def known(u: Floats, v: Floats) -> tuple[Floats, Floats]:
         modulation, sigma = transfer(u, v)
         # A sharpened image has modulations above 1.
         return np.maximum(modulation, np.minimum(modulation + sigmas * sigma, 1.0)), np.zeros_like(sigma)
@@ -321,16 +318,16 @@ def sharpest(transfer: Transfer, sigmas: float = 1.96) -> Transfer:
 class Expectation:
     """Expected square errors of the filters of an image; all over one frequency square, what folds back included."""
 
-    seen: Array
+    seen: Floats
     """Power of the image, noise included."""
-    cross: Array
+    cross: Floats
     """Cross power of the image with the ideal one."""
-    ideal: Array
+    ideal: Floats
     """Power of the ideal image."""
 
     @classmethod
     def of(
-        cls, transfer: Transfer, scene: SceneStatistics, aperture: float = 1.0, kept: Array | None = None
+        cls, transfer: Transfer, scene: SceneStatistics, aperture: float = 1.0, kept: Floats | None = None
     ) -> Expectation:
         """Return what is expected of an image."""
         u, v = frequency_grid()
@@ -350,11 +347,11 @@ class Expectation:
         names = ("seen", "cross", "ideal")
         return cls(*(sum(s * getattr(one, name) for s, one in zip(shares, each, strict=True)) for name in names))
 
-    def gain(self, kernel: Array) -> float:
+    def gain(self, kernel: Floats) -> float:
         """Expected error after a filter by that of the image as it is."""
         return self.error(kernel) / max(self.error(np.ones((1, 1))), 1e-300)
 
-    def error(self, kernel: Array) -> float:
+    def error(self, kernel: Floats) -> float:
         """Expected root mean square difference to the ideal image after a filter, in the light of the scene."""
         base = frequency_grid()[0][0, 0]
         left, right = (
@@ -364,7 +361,7 @@ class Expectation:
         square = (np.abs(response) ** 2 * self.seen - 2.0 * response.real * self.cross + self.ideal).mean()
         return sqrt(max(float(square), 0.0))
 
-    def best(self, half: tuple[int, int]) -> Array:
+    def best(self, half: tuple[int, int]) -> Floats:
         """Kernel of least expected error, symmetric in x and in y, sum 1."""
         # A quadrant of the kernel is unknown; its waves are products of one per axis.
         down, right = (_waves(frequency_grid()[0][0, 0], reach) for reach in half)
@@ -378,14 +375,14 @@ class Expectation:
         return np.concatenate([rows[:, :0:-1], rows], axis=1)
 
 
-def _waves(frequency: Array, half: int) -> Array:
+def _waves(frequency: Floats, half: int) -> Floats:
     """Real waves of the values 0 to half to both sides of a symmetric kernel, shape (frequencies, half + 1)."""
     waves = np.cos(2.0 * pi * np.outer(frequency, np.arange(half + 1)))
     waves[:, 1:] *= 2.0
     return np.asarray(waves)
 
 
-def _with_sum_one(normal: Array, right: Array, at_zero: Array) -> Array:
+def _with_sum_one(normal: Floats, right: Floats, at_zero: Floats) -> Floats:
     """Least squares under the condition that the kernel's sum is 1, so that brightness stays."""
     count = right.size
     # Without noise some kernels cost nothing; a trace of noise keeps the equations solvable and changes no figure.
@@ -395,9 +392,7 @@ def _with_sum_one(normal: Array, right: Array, at_zero: Array) -> Array:
     return np.asarray(np.linalg.solve(bordered, np.append(right, 1.0))[:count])
 
 
-def radial_filter(
-    inverse_x: NDArray[np.float64], inverse_y: NDArray[np.float64] | None = None, distance_digits: int | None = None
-) -> NDArray[np.float64]:
+def radial_filter(inverse_x: Floats, inverse_y: Floats | None = None, distance_digits: int | None = None) -> Floats:
     """Two-dimensional filter whose row and column sums are given one-dimensional inverses, turned about its centre.
 
     The rotation assumption: the weight depends on the distance r from the centre, linearly between the whole distances
@@ -418,7 +413,7 @@ def radial_filter(
     return np.asarray(weights @ axes)
 
 
-def point_spread(x: SpreadFunction, y: SpreadFunction) -> NDArray[np.float64]:
+def point_spread(x: SpreadFunction, y: SpreadFunction) -> Floats:
     """Point spread function whose sums are the spread functions along a row and along a column.
 
     Between the axes by the rotation assumption of `radial_filter`; both spread functions are made symmetric, and the
@@ -429,9 +424,7 @@ def point_spread(x: SpreadFunction, y: SpreadFunction) -> NDArray[np.float64]:
     return radial_filter(np.concatenate([across[:0:-1], across]), np.concatenate([along[:0:-1], along]))
 
 
-def separable_filter(
-    inverse_x: NDArray[np.float64], inverse_y: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
+def separable_filter(inverse_x: Floats, inverse_y: Floats | None = None) -> Floats:
     """Two-dimensional filter as the product of the inverses: exact if the spread function itself is such a product.
 
     Shape (2 n + 1, 2 n + 1). Its noise gain is the product of both, much larger than that of `radial_filter`.
@@ -441,7 +434,7 @@ def separable_filter(
     return np.outer(along, across)
 
 
-def _check(across: NDArray[np.float64], along: NDArray[np.float64]) -> None:
+def _check(across: Floats, along: Floats) -> None:
     if across.shape != along.shape or across.ndim != 1 or across.size % 2 == 0 or across.size < 3:
         raise InputError(
             f"both inverses have the same odd number of values, at least 3; given: {across.shape} and {along.shape}"
@@ -456,7 +449,7 @@ def _check(across: NDArray[np.float64], along: NDArray[np.float64]) -> None:
         )
 
 
-def _axis_weights(half: int, digits: int | None) -> NDArray[np.float64]:
+def _axis_weights(half: int, digits: int | None) -> Floats:
     """Return how each weight follows from those on the axes, shape (2 n + 1, 2 n + 1, 1 + 2 n): centre, x axis, y
     axis."""
     offset = np.arange(-half, half + 1.0)
@@ -539,7 +532,7 @@ class DesignOptions:
 class Design:
     """A designed kernel and why it is as it is."""
 
-    kernel: NDArray[np.float64]
+    kernel: Floats
     """Shape (2 m + 1, 2 n + 1), sum 1; one row or one column where the other direction stays as it is."""
     method: Method
     reason: str
@@ -568,7 +561,7 @@ def design_filter(
     y: Sharpness,
     scenes: Sequence[SceneStatistics] = (),
     options: DesignOptions | None = None,
-    kept: NDArray[np.float64] | None = None,
+    kept: Floats | None = None,
 ) -> Design:
     """Restoration filter of an image whose sharpness is known along rows and along columns.
 
@@ -598,7 +591,7 @@ def design_filter(
     doubts = [f"{name}: {one.doubt}" for name, one in both.items() if one.doubt]
     broken = [f"{name}: {c}" for name, c in zip(both, conditions, strict=True) if not c.holds]
     _refuse(asked, doubts, broken, scenes)
-    exact: dict[Method, NDArray[np.float64]] = {}
+    exact: dict[Method, Floats] = {}
     if asked.method != "regularised" and not broken and not doubts:
         exact["exact"] = _exact(x.spread, y.spread, asked)
     notes = [f"not inverted, practically unknown {doubt}" for doubt in doubts]
@@ -610,10 +603,10 @@ def design_filter(
     choice = _Choice.of(curve_transfer(*curves), scenes, asked.aperture, kept)
     half = asked.half or _HALVES[0]
     regularised = choice.regularised((0 if y.doubt else half, 0 if x.doubt else half))
-    kernels: dict[Method, NDArray[np.float64]] = {"regularised": regularised, **exact}
+    kernels: dict[Method, Floats] = {"regularised": regularised, **exact}
     method, why = (asked.method, "as asked for") if asked.method != "auto" else choice.method(kernels)
     index = choice.worst(regularised) if method == "none" else 0
-    every: dict[str, NDArray[np.float64]] = {"none": _AS_IT_IS, **{str(name): each for name, each in kernels.items()}}
+    every: dict[str, Floats] = {"none": _AS_IT_IS, **{str(name): each for name, each in kernels.items()}}
     expected = {name: choice.models[index].error(each) for name, each in every.items()}
     if kept is not None and kept.min() < 1.0:
         notes.append(f"compression has left {100 * kept.mean():.0f} % of the fine detail")
@@ -664,27 +657,25 @@ class _Choice:
     """The judges, were the image as sharp as it may be."""
 
     @classmethod
-    def of(
-        cls, transfer: Transfer, scenes: Sequence[SceneStatistics], aperture: float, kept: NDArray[np.float64] | None
-    ) -> _Choice:
+    def of(cls, transfer: Transfer, scenes: Sequence[SceneStatistics], aperture: float, kept: Floats | None) -> _Choice:
         """Return the choice for an image of a modulation transfer."""
         cases = ((transfer, None), (transfer, kept), (sharpest(transfer), kept))
         return cls(scenes, *([Expectation.of(h, s, aperture, lost) for s in scenes] for h, lost in cases))
 
-    def worst(self, kernel: NDArray[np.float64]) -> int:
+    def worst(self, kernel: Floats) -> int:
         """The scene in which a filter gains least."""
         return int(np.argmax([model.gain(kernel) for model in self.models]))
 
-    def gain(self, kernel: NDArray[np.float64]) -> float:
+    def gain(self, kernel: Floats) -> float:
         """Return what a filter leaves of the error in its worst scene."""
         return self.models[self.worst(kernel)].gain(kernel)
 
-    def regularised(self, half: tuple[int, int]) -> NDArray[np.float64]:
+    def regularised(self, half: tuple[int, int]) -> Floats:
         """Return the filter that gains most in its worst scene, of the best filters of each scene and of their mean."""
         means = [Expectation.mean(self.plain)] if len(self.plain) > 1 else []
         return min((model.best(half) for model in [*self.plain, *means]), key=self.gain)
 
-    def method(self, kernels: Mapping[Method, NDArray[np.float64]]) -> tuple[Method, str]:
+    def method(self, kernels: Mapping[Method, Floats]) -> tuple[Method, str]:
         """Method of least expected error in the worst scene, and why."""
         method = min(kernels, key=lambda each: self.gain(kernels[each]))
         kernel = kernels[method]
@@ -713,7 +704,7 @@ def _ideal_curve(aperture: float) -> MtfCurve:
     return MtfCurve(frequency, np.abs(np.sinc(aperture * frequency)))
 
 
-def _exact(x: SpreadFunction, y: SpreadFunction, asked: DesignOptions) -> NDArray[np.float64]:
+def _exact(x: SpreadFunction, y: SpreadFunction, asked: DesignOptions) -> Floats:
     """Two-dimensional filter of the exact inverses, large enough, sum 1."""
     for half in _HALVES if asked.half is None else (asked.half,):
         # Both sides averaged: a filter turned about its centre has no other.

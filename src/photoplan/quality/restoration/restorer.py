@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from photoplan.arrays import Floats, Floats32, Mask
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.jit import is_ready
@@ -29,8 +30,7 @@ from photoplan.kernels.raster import (
 )
 from photoplan.quality.linearise import Linearisation
 
-Array = NDArray[np.float64]
-Transfer = Callable[[Array, Array], tuple[Array, Array]]
+Transfer = Callable[[Floats, Floats], tuple[Floats, Floats]]
 """Modulation and its standard deviation at frequencies u along rows and v along columns, cycles per pixel; arrays that
 broadcast."""
 
@@ -82,17 +82,17 @@ class SceneStatistics:
                 f"or more, contrast above 0 and an exponent from {_EXPONENTS[0]:g} to {_EXPONENTS[1]:g}"
             )
 
-    def power(self, u: Array, v: Array) -> Array:
+    def power(self, u: Floats, v: Floats) -> Floats:
         """Power of the scene at frequencies other than 0, cycles per pixel; arrays that broadcast."""
         fractal = self.contrast**2 / _unit_contrast(self.exponent) * np.hypot(u, v) ** -self.exponent
         return np.asarray(fractal + self.texture**2 / _unit_contrast(0.0))
 
-    def noise_power(self, u: Array, v: Array) -> Array:
+    def noise_power(self, u: Floats, v: Floats) -> Floats:
         """Power of the noise at frequencies up to 0.5 cycles per pixel; arrays that broadcast."""
         return np.asarray(self.noise**2 * np.exp(-((2.0 * pi * self.smoothed) ** 2) * (u**2 + v**2)))
 
 
-def frequency_grid(count: int = 64) -> tuple[Array, Array]:
+def frequency_grid(count: int = 64) -> tuple[Floats, Floats]:
     """Frequencies of all folds, u and v of shapes (folds, 1, count) and (folds, count, 1), none of them 0."""
     base = (np.arange(count) + 0.5) / count - 0.5
     down, right = (part.ravel() for part in np.mgrid[-FOLDS : FOLDS + 1, -FOLDS : FOLDS + 1])
@@ -108,7 +108,7 @@ def _unit_contrast(exponent: float) -> float:
     return float((power * 2.0 * (np.sin(pi * u) ** 2 + np.sin(pi * v) ** 2)).sum(axis=0).mean())
 
 
-def block_spectra(grey: Array, usable: NDArray[np.bool_] | None = None) -> Array:
+def block_spectra(grey: Floats, usable: Mask | None = None) -> Floats:
     """Power spectra of overlapping blocks under a Hann window, mean taken off."""
     side = min(BLOCK, *grey.shape)
     keep = np.isfinite(grey) if usable is None else np.isfinite(grey) & usable
@@ -124,7 +124,7 @@ def block_spectra(grey: Array, usable: NDArray[np.bool_] | None = None) -> Array
 
 
 def scenes_of(
-    spectrum: Array, transfer: Transfer, even: float, stated: float | None = None
+    spectrum: Floats, transfer: Transfer, even: float, stated: float | None = None
 ) -> tuple[SceneStatistics, ...]:
     """Return what an image may show by its mean spectrum: what is fine in it is texture, or it is noise.
 
@@ -141,7 +141,7 @@ def scenes_of(
 
 
 def fit_scene(
-    spectrum: Array, transfer: Transfer, noise: tuple[float, float], *, textured: bool = False
+    spectrum: Floats, transfer: Transfer, noise: tuple[float, float], *, textured: bool = False
 ) -> SceneStatistics:
     """Noise, contrast and exponent of the scene by which a mean spectrum is likeliest (Whittle 1953)."""
     side = spectrum.shape[0]
@@ -157,7 +157,7 @@ def fit_scene(
     scale = float(spectrum[used].mean())
     seen = spectrum[used] / scale
 
-    def loss(at: Array) -> tuple[float, Array]:
+    def loss(at: Floats) -> tuple[float, Floats]:
         scene = passed * np.exp(at[0] - at[1] * logarithm)
         signal, noisy, white = scene.sum(axis=0), np.exp(at[2] - at[3] * square), flat * np.exp(at[4])
         model = signal + noisy + white
@@ -192,7 +192,7 @@ MOST_WIDTH = 101
 class FilterKernel:
     """A two-dimensional kernel; the restored image is the image convolved with it."""
 
-    values: NDArray[np.float64]
+    values: Floats
     """Shape (2 m + 1, 2 n + 1): rows, columns; ``values[m + i, n + k]`` is the weight of the pixel i rows above and k
     columns left of the restored one."""
     at: tuple[float, float] | None = None
@@ -286,7 +286,7 @@ class Convolution:
     kernel: FilterKernel
     even: bool = field(init=False)
     """Whether the fast way for symmetric kernels is taken."""
-    _weights: NDArray[np.float32] = field(init=False, repr=False)
+    _weights: Floats32 = field(init=False, repr=False)
     """As the compiled code wants them, filled up with columns of zeros."""
     _tag: tuple[int, ...] = field(init=False, repr=False)
     _zeros: int = field(init=False, repr=False)
@@ -311,11 +311,7 @@ class Convolution:
             object.__setattr__(self, name, value)
 
     def __call__(
-        self,
-        source: NDArray[np.float32],
-        margin: tuple[int, int],
-        out: NDArray[Any],
-        valid: NDArray[np.bool_] | None = None,
+        self, source: Floats32, margin: tuple[int, int], out: NDArray[Any], valid: Mask | None = None
     ) -> tuple[int, int]:
         """Convolve the inner part of an array."""
         rows, columns = (side // 2 for side in self.kernel.values.shape)
@@ -343,9 +339,9 @@ class Scratch(threading.local):
     """Float32 arrays by name, of this thread alone; what they hold is what was left in them."""
 
     def __init__(self) -> None:
-        self._kept: dict[str, NDArray[np.float32]] = {}
+        self._kept: dict[str, Floats32] = {}
 
-    def array(self, name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    def array(self, name: str, shape: tuple[int, ...]) -> Floats32:
         """An array to be filled; it is the same memory as the last one of this name."""
         count = int(np.prod(shape))
         if count > MOST_KEPT:
@@ -384,13 +380,8 @@ class Margin:
         )
 
     def source(
-        self,
-        window: Window,
-        pixels: NDArray[Any],
-        at: Window,
-        valid: NDArray[np.bool_] | None,
-        scratch: Scratch | None = None,
-    ) -> NDArray[np.float32]:
+        self, window: Window, pixels: NDArray[Any], at: Window, valid: Mask | None, scratch: Scratch | None = None
+    ) -> Floats32:
         """Pixels of a window with its margin, all of them finite, as `Convolution` wants them."""
         wide = Window(
             window.col - self.columns,
@@ -420,7 +411,7 @@ class Margin:
             _beyond_edges(pixels, at, wide, to, body)
         return out
 
-    def _near(self, valid: NDArray[np.bool_], at: Window, wide: Window) -> NDArray[np.bool_]:
+    def _near(self, valid: Mask, at: Window, wide: Window) -> Mask:
         """Pixels of `wide` that have a valid one within reach."""
         sums = np.zeros((at.height + 1, at.width + 1), np.int64)
         sums[1:, 1:] = valid.cumsum(0, np.int64).cumsum(1)
@@ -436,9 +427,7 @@ def _part(common: Window, of: Window) -> tuple[slice, slice]:
     return (slice(common.row - of.row, common.stop[1] - of.row), slice(common.col - of.col, common.stop[0] - of.col))
 
 
-def _beyond_edges(
-    pixels: NDArray[Any], at: Window, wide: Window, to: tuple[slice, slice], body: NDArray[np.float32]
-) -> None:
+def _beyond_edges(pixels: NDArray[Any], at: Window, wide: Window, to: tuple[slice, slice], body: Floats32) -> None:
     """What `extend_oddly` does where the image has no gaps: its nearest pixel is found without search."""
     rows, cols = np.arange(wide.row, wide.stop[1]) - at.row, np.arange(wide.col, wide.stop[0]) - at.col
     above, below, left, right = (
@@ -479,7 +468,7 @@ class RestoredPixels:
 
     values: NDArray[Any]
     """(bands, height, width); 0 where invalid."""
-    valid: NDArray[np.bool_] | None
+    valid: Mask | None
     """(height, width); None: all. Invalid pixels are those of the image."""
     below: tuple[int, ...]
     """Valid pixels of each band that would be below the least value of the type."""
@@ -537,9 +526,7 @@ class Restorer:
             for each in ready
         )
 
-    def restore(
-        self, window: Window, pixels: NDArray[Any], at: Window, valid: NDArray[np.bool_] | None
-    ) -> RestoredPixels:
+    def restore(self, window: Window, pixels: NDArray[Any], at: Window, valid: Mask | None) -> RestoredPixels:
         """Restore a window."""
         rows = slice(window.row - at.row, window.stop[1] - at.row)
         cols = slice(window.col - at.col, window.stop[0] - at.col)
@@ -570,12 +557,7 @@ class Restorer:
         return RestoredPixels(values, mask, tuple(c[0] for c in counts), tuple(c[1] for c in counts))
 
     def _convolved(
-        self,
-        source: NDArray[np.float32],
-        window: Window,
-        mask: NDArray[np.bool_] | None,
-        band: int,
-        values: NDArray[Any],
+        self, source: Floats32, window: Window, mask: Mask | None, band: int, values: NDArray[Any]
     ) -> tuple[int, int]:
         """Grey values of a window of light, filtered; returns how many pixels were clipped."""
         ready, margin = self._ready[band], self.filter.margin
@@ -593,9 +575,7 @@ class Restorer:
         clipped = _store(grey, mask, values)
         return lost[0] + clipped[0], lost[1] + clipped[1]
 
-    def _grey(
-        self, light: NDArray[np.float32], mask: NDArray[np.bool_] | None, band: int
-    ) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    def _grey(self, light: Floats32, mask: Mask | None, band: int) -> tuple[Floats32, tuple[int, int]]:
         """Grey values of light, and how many valid pixels were darker and brighter than a table reaches."""
         if self.linearisation.is_linear:
             return light, (0, 0)
@@ -616,9 +596,7 @@ class Restorer:
             values[values == self.out.type(self.nodata)] = self.out.type(self.nodata + step)
 
 
-def light_of(
-    linearisation: Linearisation, grey: NDArray[Any], valid: NDArray[np.bool_] | None, band: int
-) -> NDArray[Any]:
+def light_of(linearisation: Linearisation, grey: NDArray[Any], valid: Mask | None, band: int) -> NDArray[Any]:
     """Light of grey values of a band (from 1), float32; as they are where they are light already.
 
     What invalid pixels hold is of no account.
@@ -633,7 +611,7 @@ def light_of(
     return linearisation.to_linear(grey, band).astype(np.float32)
 
 
-def _store(grey: NDArray[np.float32], mask: NDArray[np.bool_] | None, values: NDArray[Any]) -> tuple[int, int]:
+def _store(grey: Floats32, mask: Mask | None, values: NDArray[Any]) -> tuple[int, int]:
     """Round into the type of the result; returns how many pixels were clipped."""
     if values.dtype.kind == "f":
         values[:] = grey
@@ -643,9 +621,7 @@ def _store(grey: NDArray[np.float32], mask: NDArray[np.bool_] | None, values: ND
     return int(below), int(above)
 
 
-def field_weights(
-    places: Sequence[tuple[float, float]], window: Window
-) -> list[tuple[int, NDArray[np.float32] | None]]:
+def field_weights(places: Sequence[tuple[float, float]], window: Window) -> list[tuple[int, Floats32 | None]]:
     """Weights of the places for every pixel of a window; they add up to 1.
 
     Places that form a full grid (each of their columns with each of their rows, whatever the steps) are interpolated
@@ -670,6 +646,6 @@ def field_weights(
     return [(i, (near / total).astype(np.float32)) for i, near in enumerate(nearness)]
 
 
-def _hats(nodes: Sequence[float], at: NDArray[np.float64]) -> NDArray[np.float64]:
+def _hats(nodes: Sequence[float], at: Floats) -> Floats:
     """Linear interpolation between nodes as one row of weights for each of them, (nodes, positions)."""
     return np.stack([np.interp(at, nodes, unit) for unit in np.eye(len(nodes))])
