@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from pydantic import TypeAdapter
 
 from photoplan.cameras.fiducials import MarkPattern
-from photoplan.io.camera.model import Mark
+from photoplan.cameras.marks import Mark
 from photoplan.orientation.marks.template import render
 from photoplan.project.camera_marks import mark_pattern
 

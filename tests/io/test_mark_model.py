@@ -12,8 +12,9 @@ import rasterio
 from pydantic import TypeAdapter, ValidationError
 
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
+from photoplan.cameras.marks import Mark
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmEntry, Mark
+from photoplan.io.camera.model import FilmEntry
 from photoplan.io.formats import read_cameras
 from photoplan.io.project.file import camera_lines
 from photoplan.project.camera_marks import mark_pattern, mark_patterns

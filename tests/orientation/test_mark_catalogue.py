@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 from scipy import ndimage
 from tools.thinned import some, thinned
 
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
+from photoplan.cameras.marks import Mark, disc, turned
 from photoplan.errors import InputError
-from photoplan.orientation.marks import template as frame
-from photoplan.orientation.marks import template as free
 from photoplan.orientation.marks.locate import locate_mark
 from photoplan.orientation.marks.single import find_mark, fit_edges, pattern_edges
 from photoplan.orientation.marks.template import coverage, render
@@ -22,36 +23,34 @@ SNR = 20.0
 SCALE = 40.0
 BLUR = 0.9
 
+
+def mark(kind: str, **entries: Any) -> MarkPattern:
+    made: MarkPattern = TypeAdapter(Mark).validate_python({"type": kind, **entries}).pattern()
+    return made
+
+
+SQUARES = [[(0.0, 0.0), (s, 0.0), (s, s), (0.0, s)] for s in (0.8, -0.8)]
 FREE = {
-    "cross": free.cross(1.0, 0.12),
-    "open cross": free.cross(1.0, 0.12, free=0.25, rotation=45.0),
-    "dot": free.dot(0.4),
-    "dark dot": free.dot(0.4, bright=False),
-    "ring": free.ring(0.9, 0.12),
-    "ring_cross": free.ring_cross(1.2, 0.1, 0.45, rotation=45.0),
-    "dot_cross": free.dot_cross(0.3, 0.8, 0.1, free=0.3),
-    "checkerboard": free.polygon(
-        [
-            (np.array([(0.0, 0.0), (0.8, 0.0), (0.8, 0.8), (0.0, 0.8)]), 1.0),
-            (np.array([(0.0, 0.0), (-0.8, 0.0), (-0.8, -0.8), (0.0, -0.8)]), 1.0),
-        ],
-        background=0.0,
-    ),
+    "cross": mark("cross", arm=1.0, width=0.12),
+    "open cross": mark("cross", arm=1.0, width=0.12, free=0.25, rotation=45.0),
+    "dot": mark("dot", diameter=0.4),
+    "dark dot": mark("dot", diameter=0.4, bright=False),
+    "ring": mark("ring", diameter=0.9, width=0.12),
+    "ring_cross": mark("ring_cross", diameter=1.2, width=0.1, arm=0.45, rotation=45.0),
+    "dot_cross": mark("dot_cross", diameter=0.3, arm=0.8, width=0.1, free=0.3),
+    "checkerboard": mark("polygon", parts=[{"outline": each, "tone": 1.0} for each in SQUARES], background=0.0),
 }
-
-
-def style(**more: float | bool) -> frame.Style:
-    return frame.Style(**more)  # type: ignore[arg-type]
+BLOCK = {"ledge": 2.6, "depth": 1.5, "tip": 1.6, "height": 2.4}
 
 
 def silhouettes(**more: float | bool) -> dict[str, MarkPattern]:
     return {
-        "block": frame.block(2.6, 1.5, 1.6, 2.4, style=style(**more)),
-        "slit block": frame.block(2.6, 1.5, 1.6, 2.4, slit=0.1, style=style(**more)),
-        "curve": frame.curve(2.6, 1.8, 2.6, 3.4, style=style(**more)),
-        "notch": frame.notch(2.5, 1.9, 2.1, style=style(**more)),
-        "triangle": frame.triangle((225.0, 312.0), 0.3, 2.6, style=style(**more)),
-        "arc": frame.arc(1.0, 0.1, 3.0, 2.0, 3.0, 4.0, style=style(**more)),
+        "block": mark("block", **BLOCK, **more),
+        "slit block": mark("block", **BLOCK, slit=0.1, **more),
+        "curve": mark("curve", ledge=2.6, depth=1.8, rise=2.6, run=3.4, **more),
+        "notch": mark("notch", reach=2.5, tip=1.9, shoulder=2.1, **more),
+        "triangle": mark("triangle", flanks=(225.0, 312.0), near=0.3, far=2.6, **more),
+        "arc": mark("arc", arm=1.0, width=0.1, tip=3.0, depth=2.0, rise=3.0, run=4.0, **more),
     }
 
 
@@ -145,9 +144,9 @@ def test_a_silhouette_is_found_by_its_edges(kind: str, side: float, texture: flo
 @pytest.mark.parametrize("inside", [None, 0.3])
 def test_frame_and_image_meet_without_a_seam(inside: float | None) -> None:
     x, y = 0.37, -0.21
-    pattern = frame.block(2.6, 1.5, 1.6, 2.4, style=frame.Style(inside=inside))
+    pattern = mark("block", **BLOCK, inside=inside)
     drawn = render(pattern, matrix(7.0), blur_px=0.0, offset=(x, y))
-    whole = frame.block(2.6, 1.5, 1.6, 2.4).parts[0].outline
+    whole = mark("block", **BLOCK).parts[0].outline
     exact = 1 - coverage(whole @ matrix(7.0).T + np.array(drawn.reference), drawn.values.shape)
     seen = drawn.weights > 0.99
     edge = seen & (exact > 0.1) & (exact < 0.9)
@@ -170,11 +169,11 @@ def test_standard_deviations_of_edges_are_those_of_their_errors(count: int) -> N
 
 
 def test_edges_are_where_both_sides_are_described() -> None:
-    edges = pattern_edges(free.dot(2.0), 0.05)
+    edges = pattern_edges(mark("dot", diameter=2.0), 0.05)
     radius = np.hypot(*edges.points.T)
     np.testing.assert_allclose(radius, 1.0, atol=2e-3)
     np.testing.assert_allclose(edges.normals, -edges.points / radius[:, None], atol=0.05)  # from dark to bright
-    wedge = frame.triangle((200.0, 340.0), 0.5, 2.0)
+    wedge = mark("triangle", flanks=(200.0, 340.0), near=0.5, far=2.0)
     points = pattern_edges(wedge, 0.05).points
     angle = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
     assert np.minimum(np.abs(angle - 200), np.abs(angle - 340)).max() < 1e-6
@@ -228,34 +227,33 @@ def test_an_example_is_found_turned_and_mirrored() -> None:
 
 
 def test_the_area_of_a_disc_is_that_of_a_circle() -> None:
-    x, y = free.disc(2.0).T
+    x, y = disc(2.0).T
     assert abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2 == pytest.approx(np.pi, rel=1e-12)
 
 
 def test_turning_is_anticlockwise_and_mirroring_exchanges_left_and_right() -> None:
-    np.testing.assert_allclose(free.turned(np.array([(1.0, 0.0)]), 90.0), [(0.0, 1.0)], atol=1e-15)
-    tip = frame.block(2.0, 1.0, 1.0, 1.0)
-    flipped = free.mirrored(tip)
+    np.testing.assert_allclose(turned(np.array([(1.0, 0.0)]), 90.0), [(0.0, 1.0)], atol=1e-15)
+    tip, flipped = mark("block", **BLOCK), mark("block", **BLOCK, mirrored=True)
     assert flipped.window == pytest.approx((-tip.window[2], tip.window[1], -tip.window[0], tip.window[3]))
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("kind", "entries", "message"),
     [
-        (lambda: free.cross(1.0, -0.1), "width -0.1 mm; a positive length"),
-        (lambda: free.cross(1.0, 0.1, free=1.0), "free < arm"),
-        (lambda: free.ring(1.0, 0.5), "less than half of the diameter"),
-        (lambda: free.dot_cross(3.0, 1.0, 0.1), "must show outside"),
-        (lambda: free.dot(0.5, margin=-1.0), "margin"),
-        (lambda: free.polygon([(np.zeros((2, 2)), 1.0)], background=0.0), "at least 3 vertices"),
-        (lambda: free.polygon([(np.eye(3)[:, :2], 1.5)], background=0.0), "tone 1.5"),
-        (lambda: free.polygon([(np.eye(3)[:, :2], 1.0)], background=1.0), "one tone"),
-        (lambda: frame.block(1.0, 1.0, 0.0, 1.0), "tip 0.0 mm"),
-        (lambda: frame.notch(3.0, 0.5, 1.0), "flanks must be longer"),
-        (lambda: frame.triangle((90.0, 80.0), 0.0, 1.0), "angle under 180"),
-        (lambda: frame.Style(band=0.0), "band 0.0"),
+        ("cross", {"arm": 1.0, "width": -0.1}, "cross.width\n.*greater than 0"),
+        ("cross", {"arm": 1.0, "width": 0.1, "free": 1.0}, "free < arm"),
+        ("ring", {"diameter": 1.0, "width": 0.5}, "less than half of the diameter"),
+        ("dot_cross", {"diameter": 3.0, "arm": 1.0, "width": 0.1}, "must show outside"),
+        ("dot", {"diameter": 0.5, "margin": -1.0}, "dot.margin\n"),
+        ("polygon", {"parts": [{"outline": [(0.0, 0.0), (0.0, 0.0)], "tone": 1.0}]}, "at least 3 items"),
+        ("polygon", {"parts": [{"outline": SQUARES[0], "tone": 1.5}]}, "tone\n.*less than or equal to 1"),
+        ("polygon", {"parts": [{"outline": SQUARES[0], "tone": 1.0}], "background": 1.0}, "one tone"),
+        ("block", {"ledge": 1.0, "depth": 1.0, "tip": 0.0, "height": 1.0}, "block.tip\n.*greater than 0"),
+        ("notch", {"reach": 3.0, "tip": 0.5, "shoulder": 1.0}, "flanks must be longer"),
+        ("triangle", {"flanks": (90.0, 80.0), "near": 0.0, "far": 1.0}, "angle under 180"),
+        ("block", {**BLOCK, "band": 0.0}, "block.band\n.*greater than 0"),
     ],
 )
-def test_impossible_marks_are_refused(make, message) -> None:
-    with pytest.raises(InputError, match=message):
-        make()
+def test_impossible_marks_are_refused(kind: str, entries: dict[str, Any], message: str) -> None:
+    with pytest.raises((InputError, ValidationError), match=message):
+        mark(kind, **entries)

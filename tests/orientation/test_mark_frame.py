@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from scipy import ndimage
 from tools.mark_scans import ArrayScan
 
-from photoplan.io.camera import model
+from photoplan.cameras import marks
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
 from photoplan.orientation.marks.locate import MarkLayout
 from photoplan.orientation.marks.template import coverage
@@ -28,7 +28,7 @@ PLACES = {"T": (0.01, 40.0), "B": (-0.01, -40.01), "L": (-40.0, 0.02), "R": (40.
 def test_silhouettes_are_placed_by_their_edges_and_tell_how_the_scan_is_turned(
     kind: str, negative: bool, allowed: float
 ) -> None:
-    mark = TypeAdapter(model.Mark)
+    mark = TypeAdapter(marks.Mark)
     patterns = {name: mark_pattern(mark.validate_python(v), Path()) for name, v in MARKS[kind].items()}
     rng = np.random.default_rng(3)
     pixel, t, n = 0.05, np.radians(1.2), 1900

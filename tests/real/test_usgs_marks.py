@@ -19,8 +19,8 @@ from pydantic import TypeAdapter
 from tools.thinned import some
 
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
+from photoplan.cameras.marks import Mark
 from photoplan.geometry.grid import Window
-from photoplan.io.camera.model import Mark
 from photoplan.orientation.marks.single import AloneMark, find_mark
 from photoplan.project.camera_marks import ScanImage, mark_pattern
 

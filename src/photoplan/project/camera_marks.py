@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
+from photoplan.cameras.marks import EachMark, Example, Mark
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.camera import model as described
 from photoplan.io.camera.model import FiducialSystem
 from photoplan.io.files import resolve_input
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import read_pitch
-from photoplan.orientation.marks import template as frame
-from photoplan.orientation.marks import template as free
 
 _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
 """Of red, green and blue (ITU-R BT.601): what JPEG and video keep at full resolution, unlike the colours."""
@@ -95,7 +92,7 @@ def mark_patterns(system: FiducialSystem, folder: Path) -> dict[str, MarkPattern
             '`marks = { type = "cross", arm = 1.0, width = 0.1 }`'
         )
     names = list(system.places_mm)
-    if not isinstance(marks, described.EachMark):
+    if not isinstance(marks, EachMark):
         one = mark_pattern(marks, folder)
         return dict.fromkeys(names, one)
     each = marks.__pydantic_extra__
@@ -108,43 +105,12 @@ def mark_patterns(system: FiducialSystem, folder: Path) -> dict[str, MarkPattern
     return made
 
 
-def mark_pattern(mark: described.Mark, folder: Path) -> MarkPattern | MarkExample:
+def mark_pattern(mark: Mark, folder: Path) -> MarkPattern | MarkExample:
     """What one mark looks like."""
-    if isinstance(mark, described.Example):
-        return _example(mark, folder)
-    if isinstance(mark, described.Polygon):
-        return _polygon(mark)
-    given = mark.model_dump(exclude_none=True)
-    kind = given.pop("type")
-    if isinstance(mark, described.Silhouette):
-        style = frame.Style(**{key: given.pop(key) for key in described.Silhouette.model_fields if key in given})
-        makers = {
-            "block": frame.block,
-            "curve": frame.curve,
-            "notch": frame.notch,
-            "triangle": frame.triangle,
-            "arc": frame.arc,
-        }
-        made: MarkPattern = makers[kind](**given, style=style)  # type: ignore[operator]
-        return made
-    drawn = {
-        "cross": free.cross,
-        "dot": free.dot,
-        "ring": free.ring,
-        "ring_cross": free.ring_cross,
-        "dot_cross": free.dot_cross,
-    }
-    pattern: MarkPattern = drawn[kind](**given)  # type: ignore[operator]
-    return pattern
+    return _example(mark, folder) if isinstance(mark, Example) else mark.pattern()
 
 
-def _polygon(mark: described.Polygon) -> MarkPattern:
-    parts = [(np.array(part.outline, np.float64), math.nan if part.tone is None else part.tone) for part in mark.parts]
-    ground = math.nan if mark.background is None else mark.background
-    return free.polygon(parts, background=ground, window=mark.window, rotation=mark.rotation)
-
-
-def _example(mark: described.Example, folder: Path) -> MarkExample:
+def _example(mark: Example, folder: Path) -> MarkExample:
     path = resolve_input(folder, mark.file)
     scan = ScanImage(path)
     width, height = scan.size
