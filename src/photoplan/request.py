@@ -224,6 +224,10 @@ _WORKERS = "Number of parallel workers [all cores]."
 WORKERS: Any = opt(_WORKERS, None, ge=1, section="run")
 ONE_WORKER: Any = opt(_WORKERS, 1, ge=1, section="run")
 """For calls from Python that use one worker unless told otherwise; the command line uses all cores."""
+TARGET: Any = opt(
+    "Frame of the product: map, a name of [targets], wall:X,Y,Z,AZIMUTH[,TILT], vault:X,Y,Z,AZIMUTH,RADIUS[,TILT], "
+    "column:X,Y,Z,AZIMUTH,RADIUS, or image:NAME[,DISTANCE] [map].", "map", metavar="WHAT"
+)  # fmt: skip
 BOUNDS: Any = opt("Part to process [all].", None, metavar="XMIN YMIN XMAX YMAX")
 _BEYOND = "Accept coordinates far outside the area of use of their CRS."
 BEYOND_AREA: Any = opt(_BEYOND, False, section="input")

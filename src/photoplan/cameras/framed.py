@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,8 @@ _Doubles = NDArray[np.float64]
 #: Points along a side of the target from the nearest of which a ray is followed, times that it is, and pixels by which
 #: it may miss then.
 _POINTS, _TIMES, _OFF = 17, 5, 1e-6
+#: Lines of sight are cut into at most half so many pieces.
+_MOST_PIECES = 128
 #: Metres before a place of a ray from which it is followed, if it begins nowhere.
 _BEFORE = 100_000.0
 
@@ -44,8 +46,11 @@ class FramedCamera:
 
     @property
     def breaks(self) -> Breaks | Tremor | Parts | None:
-        """The camera's."""
-        return self.camera.breaks
+        """The camera's; parts of an image lie in the frame, too."""
+        breaks = self.camera.breaks
+        if not isinstance(breaks, Parts):
+            return breaks
+        return Parts(tuple(replace(p, projection=replace(self, camera=p.projection)) for p in breaks.parts))  # type: ignore[arg-type]
 
     @property
     def vantage(self) -> Vantage:
@@ -90,6 +95,32 @@ class FramedCamera:
     def derivatives(self, XYZ: ArrayLike) -> _Doubles:
         """∂(x, y)/∂(u, v, h), shape (..., 2, 3), pixels per metre; NaN behind the camera."""
         return self.camera.derivatives(self.frame(XYZ)) @ self.frame.jacobian(XYZ)
+
+    def sight_paths(self, uvh: _Doubles, tolerance: float) -> _Doubles:
+        """Lines of sight from places of the frame (n, 3) to the camera, in so many pieces that they follow the bends of
+        the frame to a tolerance, metres; shape (n, k, 3). u goes on beyond half a turn."""
+        here = self.frame(uvh)
+        if self.camera.vantage.central:
+            there = np.broadcast_to(self.camera.vantage.point, here.shape)
+        else:
+            _, way = self.camera.rays(project(self.camera, here), here[:, 2])  # type: ignore[arg-type]
+            there = here - self.vantage.point[2] * way
+        pieces = 4
+        while True:
+            # The frame bends most close to its surface, where a line begins.
+            part = np.linspace(0.0, 1.0, 2 * pieces + 1)[:, None] ** 2
+            path = self.frame.inverse(here[:, None] + part * (there - here)[:, None])
+            path[:, 0] = uvh
+            if math.isfinite(self.frame.turn):
+                path[..., 0] = np.unwrap(path[..., 0], axis=1, period=self.frame.turn)
+            off = path[:, 1::2] - (path[:, :-1:2] + path[:, 2::2]) / 2
+            # Along the line a difference does not matter.
+            along = path[:, 2::2] - path[:, :-1:2]
+            along /= np.linalg.norm(along, axis=-1, keepdims=True) + 1e-300
+            off -= (off * along).sum(axis=-1, keepdims=True) * along
+            if np.nanmax(np.linalg.norm(off, axis=-1), initial=0.0) <= 4 * tolerance or pieces >= _MOST_PIECES:
+                return path
+            pieces *= 2
 
     def _met_from_a_point(self, xy: _Doubles, uvh: _Doubles, height: float) -> tuple[_Doubles, _Doubles]:
         """Places at a height whose images are xy (n, 2), from places near them; by Newton's method, as level rays meet

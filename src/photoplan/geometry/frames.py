@@ -28,6 +28,11 @@ class Frame(Hashable, Protocol):
     """An invertible mapping of space. A value: hashable, and pickles."""
 
     @property
+    def turn(self) -> float:
+        """Length of a whole turn along u, metres; infinite if straight lines stay straight in the frame."""
+        ...
+
+    @property
     def heights(self) -> tuple[float, float]:
         """Between which h there is anything; infinite: everywhere."""
         ...
@@ -64,8 +69,16 @@ class WallFrame:
     """Ground point of u = v = h = 0."""
     axes: Axes
     """Rows: directions of u, v and h on the ground."""
-    heights: tuple[float, float] = (-math.inf, math.inf)
-    """Everywhere."""
+
+    @property
+    def turn(self) -> float:
+        """Infinite: lines stay straight."""
+        return math.inf
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """Everywhere."""
+        return -math.inf, math.inf
 
     def top(self, point: _Doubles) -> float:
         """Return that of the camera."""
@@ -113,6 +126,11 @@ class ImageFrame:
     """Rows: directions of the image's axes on the ground, the third one against its view."""
     distance: float
     """D, metres along the axis."""
+
+    @property
+    def turn(self) -> float:
+        """Infinite: lines stay straight."""
+        return math.inf
 
     @property
     def heights(self) -> tuple[float, float]:
@@ -204,6 +222,11 @@ class CylinderFrame:
         """From outside: an axis that stands upright; the surface faces an azimuth where u = 0."""
         sa, ca = sine_cosine(azimuth)
         return cls(origin, (0.0, 0.0, 1.0), (sa, ca, 0.0), radius, False)
+
+    @property
+    def turn(self) -> float:
+        """Circumference."""
+        return 2 * math.pi * self.radius
 
     @property
     def heights(self) -> tuple[float, float]:

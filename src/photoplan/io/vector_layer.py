@@ -782,7 +782,7 @@ class PlanTables:
     """Columns of the layer `footprints`: image, product, columns, rows, resolution."""
     outlines: list[Floats]
     """Footprint of each image, shape (k, 2), in the product's CRS."""
-    crs: str
+    crs: str | None
     """CRS of all layers."""
     squares: tuple[Floats, dict[str, NDArray[Any]]] | None = None
     """Outer edges (n, 4) and columns of the layer `quadtree`; None: there is none."""
@@ -825,7 +825,7 @@ def _write_polygons(
     layer: str,
     geometry: NDArray[Any],
     columns: dict[str, NDArray[Any]],
-    crs: str,
+    crs: str | None,
     kind: str,
     append: bool = False,
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import Projection, project, steady
+from photoplan.cameras.framed import FramedCamera
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.anchors import interpolate_positions, source_costs
@@ -41,8 +43,8 @@ _MOST_PIXELS = 1e6
 _SHORT = 0.1
 #: The same of posts that a place lies between, which are known better: to rounding.
 _BESIDE = 0.01
-#: Lines that are followed at once.
-_BATCH = 200_000
+#: Lines that are followed at once, straight and in pieces.
+_BATCH, _PATHS = 200_000, 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +112,9 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
     if not low <= high:
         return none
     if not isinstance(target, MapTarget):
-        raise UsageError(f"visibility over {type(target).__name__}; it is known for maps")
+        raise UsageError(f"visibility over {type(target).__name__}; it is known for maps, walls, vaults and columns")
+    if isinstance(projection, FramedCamera) and math.isfinite(projection.frame.turn):
+        return _hidden_along_paths(projection, ground, surface)
     pad = 0.01 + 1e-6 * max(abs(low), abs(high))
     levels = low - pad, high + pad
     lines = _lines_over(projection, target, window, levels)
@@ -135,6 +139,25 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
     there = np.argwhere(hidden)
     xy = project(projection, target.to_ground(_places(window, ground.relief, there)))
     hidden[tuple(there.T)] = ((xy >= -0.5) & (xy <= np.array(projection.size) - 0.5)).all(axis=-1)
+    return hidden
+
+
+def _hidden_along_paths(camera: FramedCamera, ground: TileGround, surface: Surface) -> NDArray[np.bool_]:
+    """Pixels of a tile on a frame that bends lines that lie in the image, but that something hides: each line of sight
+    is followed in pieces."""
+    window, target = ground.window, ground.target
+    assert isinstance(target, MapTarget)
+    hidden = np.zeros((window.height, window.width), bool)
+    there = np.argwhere(np.isfinite(ground.relief))
+    places = target.to_ground(_places(window, ground.relief, there))
+    xy = project(camera, places)
+    inside = ((xy >= -0.5) & (xy <= np.array(camera.size) - 0.5)).all(axis=-1)
+    short = _SHORT * target.grid.resolution
+    whole: Any = surface.surface if isinstance(surface, RaisedSurface) else surface
+    for part in np.array_split(np.flatnonzero(inside), max(1, -(-int(inside.sum()) // _PATHS))):
+        hits = whole.first_hit(camera.sight_paths(places[part], short)[:, ::-1])
+        before = np.linalg.norm(hits.XYZ - places[part], axis=1) > short
+        hidden[tuple(there[part].T)] = np.isfinite(hits.along) & before
     return hidden
 
 

@@ -25,7 +25,6 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import lock_of, make_folder, make_parents
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
-from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.io.quality_files import BalanceBand, write_balance_file
 from photoplan.io.raster import RasterReader
@@ -34,13 +33,13 @@ from photoplan.io.store import input_entry, locked, run_key, run_times, scratch,
 from photoplan.io.tables import write_table
 from photoplan.plain import pick
 from photoplan.plan.anchors import AnchorRule
-from photoplan.plan.footprint import Tile, Tiles, covered_tiles
+from photoplan.plan.footprint import Bounds, Tile, Tiles, covered_tiles
 from photoplan.plan.product import ProductPlan
 from photoplan.products.orthophoto.mosaic import refuse_mixed
 from photoplan.products.orthophoto.plan import Looked, look_at, two_figures
 from photoplan.products.orthophoto.shown import shown
 from photoplan.products.plausibility import one_colour_told
-from photoplan.products.run import BASE_MEMORY, question, refuse_inputs
+from photoplan.products.run import BASE_MEMORY, load_on_target, question, refuse_inputs
 from photoplan.project.cameras import is_there
 from photoplan.project.scene import Attempts, Scene, SceneAddress, input_files, map_order, open_scene, refuse_unusable
 from photoplan.radiometry.balance import Balanced, Pairs, balanced, even_images, pairs_of
@@ -166,7 +165,8 @@ def open_reference(path: Path, grid: MapGrid, bands: int, dtype: np.dtype[Any]) 
     placement = placement_of(reader.info)
     if placement.transform is None or placement.crs is None:
         raise InputError(f"{path}: no georeference or no CRS; a reference is a raster on the map")
-    assert grid.crs is not None, "overlaps are sampled on the map"
+    if grid.crs is None:
+        raise UsageError(f"{path}: a reference lies on the map; on a target set `reference_image`")
     a, b = placement.coefficients[:2]
     return Reference(path, grid.crs, grid.bounds, float(np.hypot(a, b)))
 
@@ -224,20 +224,22 @@ class Survey:
         return _KEPT * self.looked[0].scene.reader.bands * rows
 
 
-def survey(project: Project, names: Sequence[str], resolution: float | None, events: Events) -> Survey:
+def survey(
+    project: Project, names: Sequence[str], resolution: float | None, bounds: Bounds | None, events: Events
+) -> Survey:
     """Look at images, and choose the map; no pixel is read."""
     events.begin("planning", len(names), "images")
     looked, blind = look_at(project, names, False, events)
     if len(looked) < 2:
-        seen = "one image sees" if looked else "no image sees"
-        raise GeometryError(f"{seen} terrain, two at least are compared:\n  " + "\n  ".join(blind or ["the others"]))
+        told = "one image sees" if looked else "no image sees"
+        raise GeometryError(f"{told} terrain, two at least are compared:\n  " + "\n  ".join(blind or ["the others"]))
     refuse_mixed(looked)
     if resolution is None:
         coarser = [one.look.gsd * max(1.0, min(one.scene.reader.size) / ACROSS) for one in looked]
         resolution = two_figures(float(np.median(coarser)))
-    bounds = np.array([one.look.footprint.bounds for one in looked], float)
-    extent = (*bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:].max(axis=0).tolist())
-    grid = MapGrid.covering(extent, resolution, project.crs)
+    seen = np.array([one.look.footprint.bounds for one in looked], float)
+    extent = bounds or (*seen[:, :2].min(axis=0).tolist(), *seen[:, 2:].max(axis=0).tolist())
+    grid = MapGrid.covering(extent, resolution, project.plane_crs)
     taken = []
     for one in looked:
         surface = painted_surface(one.scene.surface)
@@ -431,7 +433,7 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     GeometryError
         No two images have enough ground in common.
     """
-    times, project = run_times(), _plain(load_project(request.project))
+    times, project = run_times(), _plain(load_on_target(request))
     names = project.select(request.images or None)
     fixed = _check(request, project, names)
     attempts = Attempts(project, request.images or None)
@@ -450,7 +452,7 @@ def _balance(
     project: Project,
 ) -> BalanceReport:
     """Balance a project without images that cannot be used."""
-    found = survey(project, names, request.resolution, events)
+    found = survey(project, names, request.resolution, request.bounds, events)
     notes = [f"left out: {line}" for line in found.blind]
     workers = tiles_in_flight(request.workers, request.memory, BASE_MEMORY + found.kept_bytes, found.tile_bytes)
     if request.dry_run:

@@ -13,7 +13,10 @@ from photoplan.engine.executors import Question, Workers, executor_factory, open
 from photoplan.engine.run import Runner, tiles_in_flight
 from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Project
 from photoplan.io.store import run_times, versions
+from photoplan.project.target import with_target
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 320 * 2**20
@@ -21,6 +24,12 @@ BASE_MEMORY = 320 * 2**20
 _EACH = 3 * MOST_SOURCE_BYTES
 #: Of each pixel of a tile that is computed strictly: it has a box of its own. Below this tolerance that may happen.
 _STRICT_PIXEL, _NEARLY_STRICT = 512, 1e-3
+
+
+def load_on_target(request: Any) -> Project:
+    """Load the project of a request whose products may lie on a target, and place them there."""
+    project = load_project(request.project)
+    return with_target(project, request.target, request.bounds, request.relief, request.relief_sigma)
 
 
 def tile_bytes(tolerance: float, side: int) -> int:

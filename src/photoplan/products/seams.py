@@ -21,7 +21,6 @@ from photoplan.findings import Result, noted
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.disk import make_folder
 from photoplan.io.product import check_output
-from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.io.store import (
     ResultLog,
@@ -37,7 +36,7 @@ from photoplan.io.vector_layer import check_vectors, label_polygons, read_region
 from photoplan.products.balance import Survey, survey
 from photoplan.products.orthophoto.shown import shown
 from photoplan.products.plausibility import one_colour_told
-from photoplan.products.run import BASE_MEMORY, question
+from photoplan.products.run import BASE_MEMORY, load_on_target, question
 from photoplan.project.scene import Attempts, SceneAddress, input_files, refuse_unusable
 from photoplan.radiometry.seams import AROUND, find_seams, standing_out, without_overlap
 from photoplan.radiometry.shown import ArrayStore, SeamFeatures, SeamLayer, Shown, features_of
@@ -112,7 +111,7 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
     GeometryError
         No two images see the same terrain.
     """
-    times, project = run_times(), load_project(request.project)
+    times, project = run_times(), load_on_target(request)
     files = [*input_files(project), *([request.keep] if request.keep else [])]
     check_output(request.product, files, overwrite=request.overwrite)
     check_vectors(request.product)
@@ -127,7 +126,7 @@ def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
 def _make(request: SeamsRequest, times: Callable[[], dict[str, Any]], events: Events, project: Project) -> SeamsReport:
     """Find the seams of a project without images that cannot be used."""
     names = project.select(request.images or None)
-    found = survey(project, names, request.resolution, events)
+    found = survey(project, names, request.resolution, request.bounds, events)
     files = [*input_files(project.alone(found.names)), *([request.keep] if request.keep else [])]
     notes = tuple(f"left out: {line}" for line in found.blind)
     images = _images(found)

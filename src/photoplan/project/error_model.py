@@ -19,8 +19,8 @@ from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Deviation, ImageEntry, Project
 from photoplan.plan.accuracy import DepthErrors, IndependentError, SourceErrors
 from photoplan.project.cameras import camera_of
-from photoplan.project.ground import Ground, open_terrain
-from photoplan.project.scene import SceneAddress, ScenesAddress, surface_of
+from photoplan.project.ground import Ground, ground_of, open_relief, open_terrain
+from photoplan.project.scene import SceneAddress, ScenesAddress, on_target, surface_of
 from photoplan.surfaces.hybrid import HeightErrors, RasterHeightErrors, StatedHeightErrors
 from photoplan.surfaces.objects import ObjectSurface
 from photoplan.targets.base import Target
@@ -34,11 +34,12 @@ _MOST_DEVIATION = 1e6
 def source_errors(
     project: Project, image: ImageEntry, ground: Ground, projection: Projection, in_image: float
 ) -> SourceErrors:
-    """Errors of an image as the project states them."""
+    """Errors of an image as the project states them; `ground` is the terrain, also if products lie on a target."""
 
     def at(change: NDArray[np.float64]) -> Projection:
         moved, cameras = image.moved(change, project.cameras)
-        return camera_of(project.model_copy(update={"cameras": cameras}), moved, ground, projection.size)
+        there = project.model_copy(update={"cameras": cameras})
+        return on_target(project, camera_of(there, moved, ground, projection.size))
 
     known = _deviations(project, image)
     causes = (IndependentError(name, at(_STEP * d), at(-_STEP * d), _STEP) for name, d in known)
@@ -71,7 +72,7 @@ class ScenesErrors(Mapping[int, SourceErrors]):
             known = [(name, d.tolist()) for name, d in _deviations(project, image)]
             of_camera = None if camera is None else project.cameras[camera].sigma
             objects = [part.sigma for part in project.objects]
-            sigma = project.ground.sigma
+            sigma = project.ground.sigma if project.target is None else project.target.sigma
             ground = fingerprint(project.resolve(sigma)).digest if isinstance(sigma, str) else sigma
             out.append([known, of_camera, ground, *objects])
         return [out, list(self.in_image)]
@@ -109,7 +110,8 @@ def _project_of(address: SceneAddress) -> Project:
 @lru_cache(maxsize=64)
 def _errors_of(address: SceneAddress, in_image: float) -> SourceErrors:
     scene, project = address.open(), _project_of(address)
-    return source_errors(project, project.any_image(project.images[0].name), scene.ground, scene.camera, in_image)
+    image = project.any_image(project.images[0].name)
+    return source_errors(project, image, ground_of(project), scene.camera, in_image)
 
 
 @lru_cache(maxsize=8)
@@ -162,6 +164,11 @@ def object_errors(project: Project, surface: ObjectSurface, ground: DepthErrors)
 def height_errors(project: Project) -> HeightErrors:
     """Standard deviations of a project's terrain; see `known_height_errors`."""
     found = known_height_errors(project)
+    if found is None and project.target is not None:
+        raise InputError(
+            "nothing is known of the accuracy of the target's surface: set `relief_sigma` to metres or to a raster of "
+            "standard deviations (`photoplan surface` writes NAME_sigma.tif), or sigma in [targets.NAME]"
+        )
     if found is None:
         raise InputError(
             "nothing is known of the accuracy of the terrain's heights: state sigma = METRES in [terrain], or a raster "
@@ -175,6 +182,11 @@ def height_errors(project: Project) -> HeightErrors:
 def known_height_errors(project: Project) -> HeightErrors | None:
     """Standard deviations of a project's terrain, in its CRS: what [terrain] states, a number or a raster of them, or
     else what the terrain model holds; None: nothing is known."""
+    if project.target is not None:
+        sigma = project.target.sigma
+        if isinstance(sigma, str):
+            return RasterHeightErrors(open_relief(project.resolve(sigma))[0].surface)
+        return None if sigma is None else StatedHeightErrors(sigma)
     terrain = project.ground
     if isinstance(terrain.sigma, str):
         beside, _ = open_terrain(project.resolve(terrain.sigma), default_crs=terrain.crs).in_crs(project.crs)

@@ -1,7 +1,8 @@
-"""The ground of a project: terrain and heights."""
+"""The ground of a project: terrain, objects and heights, on the map or on a target."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -23,17 +24,18 @@ from photoplan.geometry.crs import (
     split_compound,
     turn_of,
 )
+from photoplan.geometry.frames import Frame
 from photoplan.geometry.heights import HeightStep, declared_pair, height_step, require_metric_heights
 from photoplan.geometry.units import metric_heights
 from photoplan.io.disk import target_of
 from photoplan.io.files import resolve_input
-from photoplan.io.project.model import Objects, Project, StatedTerrain
+from photoplan.io.project.model import Objects, PlacedTarget, Project, StatedTerrain
 from photoplan.io.raster import TerrainReader
 from photoplan.io.terrain.model import ModelReader, is_terrain_model
 from photoplan.io.terrain.options import KnownRanges
 from photoplan.surfaces.base import LevelSurface, Terrain
 from photoplan.surfaces.hybrid import HeightErrors, HybridSurface, ModelHeightErrors
-from photoplan.surfaces.objects import ObjectSurface, without_objects
+from photoplan.surfaces.objects import Faces, ObjectSurface, without_objects
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.shifted import ShiftedSurface
 
@@ -170,9 +172,7 @@ def _refuse_other(path: Path, stated: str | None, declared: str | None) -> None:
 
 
 def _of_raster(path: Path, reader: TerrainReader, option: str) -> OpenTerrain:
-    info = reader.info
-    assert info.to_map is not None
-    target = target_of(info.path, info.driver)
+    target = target_of(reader.info.path, reader.info.driver)
     if target is not None:
         raise InputError(
             f"{path}: heights over {target}, which is no map and no terrain; let `photoplan surface` write them as "
@@ -180,22 +180,37 @@ def _of_raster(path: Path, reader: TerrainReader, option: str) -> OpenTerrain:
         )
     if reader.system is None:
         raise InputError(f"{path}: no CRS; state it {option}, it is not guessed")
-    x0, xx, xy, y0, yx, yy = (reader.system.scale * value for value in info.to_map)
+    return _placed_raster(path, reader, reader.system.scale, reader.system.crs)
+
+
+def _placed_raster(path: Path, reader: TerrainReader, scale: float, crs: str) -> OpenTerrain:
+    """A raster of heights in a plane, whose units are so many metres; the plane of a target has no CRS, an empty
+    one."""
+    info = reader.info
+    assert info.to_map is not None
+    x0, xx, xy, y0, yx, yy = (scale * value for value in info.to_map)
     if xy or yx or xx <= 0 or yy >= 0:
         raise InputError(f"{path}: the grid is rotated or not north-up; bring it north-up with gdalwarp first")
     columns, rows = info.size
     bounds = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
-    surface = RasterSurface(
-        reader, (x0, y0), (xx, -yy), part=reader.block, store=KnownRanges.of(reader), turn=turn_of(reader.system.crs)
-    )
+    turn = turn_of(crs) if crs else None
+    surface = RasterSurface(reader, (x0, y0), (xx, -yy), part=reader.block, store=KnownRanges.of(reader), turn=turn)
     return OpenTerrain(
         path=info.path,
         surface=surface,
         bounds=bounds,
-        crs=reader.system.crs,
-        height_system=reader.system.heights,
+        crs=crs,
+        height_system=None if reader.system is None else reader.system.heights,
         resolution=min(xx, -yy),
     )
+
+
+def open_relief(path: Path) -> tuple[OpenTerrain, str | None]:
+    """Open a raster of offsets from a target's frame; also return the frame that it states, None if it states none."""
+    reader = TerrainReader(path)
+    if reader.system is not None:
+        raise InputError(f"{path}: states a CRS, so that it lies on the map; a relief of a target has none")
+    return _placed_raster(path, reader, 1.0, ""), target_of(reader.info.path, reader.info.driver)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,6 +285,64 @@ def ground_of(project: Project) -> Ground:
             objects=project.objects,
         )
     )
+
+
+#: Faces of objects on a frame that bends lines are cut until they are straight to this part of a turn, or there are so
+#: many pieces.
+_BENT, _MOST_PIECES = 2e-5, 200_000
+
+
+def target_ground(project: Project) -> Ground:
+    """The surface of a project's target in the coordinates of its frame, with the project's objects as occluders."""
+    assert project.target is not None
+    relief = project.target.relief
+    stamp = stamp_of(project.resolve(relief)) if isinstance(relief, str) else (0, 0)
+    # The cache of grounds is keyed by the project's own files, so that this one follows them.
+    return _target_ground(ground_of(project), project.target, str(project.folder), stamp)
+
+
+@lru_cache(maxsize=8)
+def _target_ground(ground: Ground, target: PlacedTarget, folder: str, _stamp: tuple[int, int]) -> Ground:
+    surface: Terrain
+    file = None
+    if isinstance(target.relief, str):
+        opened, _ = open_relief(resolve_input(Path(folder), target.relief))
+        surface, file = opened.surface, opened.path
+    else:
+        surface = LevelSurface(target.relief)
+    if isinstance(ground.surface, ObjectSurface):
+        faces = _faces_on(ground.surface.faces, target.space)
+        surface = surface if faces is None else replace(ground.surface, ground=surface, faces=faces, part=None)
+    return replace(ground, surface=surface, bounds=target.bounds, file=file)
+
+
+def _faces_on(faces: Faces, frame: Frame) -> Faces | None:
+    """Faces of objects in the coordinates of a frame, cut until they follow its bends; they only hide what lies behind
+    them. None if the frame has none of them."""
+    corners, owner, turn = faces.corners, faces.owner, frame.turn
+    uvh = frame.inverse(corners)
+    while math.isfinite(turn) and len(corners) < _MOST_PIECES:
+        uvh[..., 0] -= turn * np.round((uvh[..., 0] - uvh[:, :1, 0]) / turn)
+        middles = (corners + np.roll(corners, -1, axis=1)) / 2
+        off = frame.inverse(middles) - (uvh + np.roll(uvh, -1, axis=1)) / 2
+        off[..., 0] -= turn * np.round(off[..., 0] / turn)
+        long = np.linalg.norm(off, axis=-1).max(axis=1) > _BENT * turn
+        if not long.any():
+            break
+        (a, b, c), (ab, bc, ca) = (np.moveaxis(points[long], 1, 0) for points in (corners, middles))
+        four = np.stack([(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)])
+        corners = np.concatenate([corners[~long], four.swapaxes(1, 2).reshape(-1, 3, 3)])
+        owner, uvh = np.concatenate([owner[~long], np.tile(owner[long], 4)]), frame.inverse(corners)
+    if math.isfinite(turn):
+        # What lies across the seam of the frame is on both of its sides.
+        uvh[..., 0] -= turn * np.round((uvh[..., 0] - uvh[:, :1, 0]) / turn)
+        uvh, owner = np.concatenate([uvh + np.array([k * turn, 0.0, 0.0]) for k in (-1, 0, 1)]), np.tile(owner, 3)
+        seam = (uvh[..., 0].min(axis=1) <= turn / 2) & (uvh[..., 0].max(axis=1) >= -turn / 2)
+        uvh, owner = uvh[seam], owner[seam]
+    known = np.isfinite(uvh).all(axis=(1, 2))
+    if not known.any():
+        return None
+    return Faces(uvh[known], np.zeros(int(known.sum()), bool), owner[known], faces.names)
 
 
 @lru_cache(maxsize=8)

@@ -1,9 +1,8 @@
-"""Scenes: camera, ground and pixels of each image of a project; frames of targets."""
+"""Scenes: camera, ground and pixels of each image of a project, on the map or on a target."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -12,20 +11,18 @@ from typing import Any, Self, TypeVar, overload
 
 import numpy as np
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import Camera, tremor_of
+from photoplan.cameras.framed import FramedCamera
 from photoplan.engine.execute import Source
-from photoplan.errors import GeometryError, ImagesLeftOut, InputError, UsageError
-from photoplan.geometry.bounds import HIGHEST_FLIGHT, odd_place
-from photoplan.geometry.frames import CylinderFrame, Frame, ImageFrame, WallFrame
+from photoplan.errors import GeometryError, ImagesLeftOut, InputError
 from photoplan.geometry.grid import Window
-from photoplan.geometry.heights import HeightStep
 from photoplan.io.files import fingerprint
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Image, ImageEntry, Project
 from photoplan.io.raster import RasterReader
-from photoplan.plan.footprint import Bounds, Footprint, footprint, image_border
+from photoplan.plan.footprint import Footprint, footprint
 from photoplan.project.cameras import camera_of
-from photoplan.project.ground import Ground, ground_of, stamp_of
+from photoplan.project.ground import Ground, ground_of, stamp_of, target_ground
 from photoplan.project.steps import (
     BalanceStep,
     RestoreStep,
@@ -71,6 +68,9 @@ class SceneAddress:
                      "covariance", "correction", "mount"):  # fmt: skip
             image.pop(name, None)
         ground = (project["terrain"], *project.get("objects", ()))
+        target = project.get("target", {})
+        for name in ("frame", "sigma", *(["relief"] if isinstance(target.get("relief"), str) else [])):
+            target.pop(name, None)
         idle = [(part, name) for part in ground for name in ("file", "sigma")]
         for entries, name in (*idle, (camera, "sigma")):
             entries.pop(name, None)
@@ -133,6 +133,7 @@ def input_files(project: Project) -> list[Path]:
     files += [file for each in restored if each is not None for file in each.files]
     files += [] if project.terrain is None else project.terrain.files
     files += [objects.file for objects in project.objects]
+    files += [] if project.target is None else project.target.files
     observed = project.observations
     files += [*observed.image_points, *observed.control, *([observed.positions] if observed.positions else [])]
     geometry = [file for image in project.images for file in image.geometry_files(project.resolve)]
@@ -231,11 +232,13 @@ def scene_address(project: Project, name: str) -> SceneAddress:
     if project.ground.file is not None:
         files.append(project.resolve(project.ground.file))
     files += [project.resolve(objects.file) for objects in project.objects]
+    if project.target is not None and isinstance(project.target.relief, str):
+        files.append(project.resolve(project.target.relief))
     restoration = project.restoration(image)
     if restoration is not None:
         files += [project.resolve(file) for file in restoration.files]
     digests = tuple((str(path), _digest(str(path), stamp_of(path))) for path in files)
-    text = alone.model_dump_json(exclude={"ortho", "observations", "adjustment"}, exclude_none=True)
+    text = alone.model_dump_json(exclude={"ortho", "observations", "adjustment", "targets"}, exclude_none=True)
     return SceneAddress(text, str(project.folder), digests)
 
 
@@ -254,8 +257,22 @@ def _open(address: SceneAddress) -> Scene:
     image = project.images[0]
     ground = ground_of(project)
     reader = _reader(project, image)
-    camera = camera_of(project, image, ground, reader.size)
+    camera = on_target(project, camera_of(project, image, ground, reader.size))
+    if project.target is not None:
+        ground = target_ground(project)
     return Scene(camera=camera, surface=ground.surface, reader=reader, ground=ground, address=address)
+
+
+def on_target(project: Project, camera: Camera) -> Camera:
+    """Return a camera in the coordinates that products of the project lie in."""
+    target = project.target
+    if target is None:
+        return camera
+    if tremor_of(camera) is not None:
+        raise GeometryError(
+            f"target {target.frame}: images of a turbulent flight lie on the map alone; leave them out by `images`"
+        )
+    return FramedCamera(camera, target.space, target.bounds)
 
 
 def _reader(project: Project, image: ImageEntry) -> SteppedReader:
@@ -347,128 +364,3 @@ class _Table(Sequence[Source]):
             return _Table(ScenesAddress(self.address.scenes[row]))
         (source,) = self.address.scenes[row].open().sources
         return source
-
-
-#: Metres over which an image's projection is taken apart; from a straight line it differs by less than this part.
-_APART, _STRAIGHT = 1024.0, 1e-6
-#: Nearest of what an image shows, metres.
-_NEAR = 0.001
-_FORMS = (
-    "`map`, `wall:X,Y,Z,AZIMUTH[,TILT]`, `vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`, `column:X,Y,Z,AZIMUTH,RADIUS` or "
-    "`image:NAME[,DISTANCE]`"
-)
-#: Radii of vaults and columns, metres.
-_RADII = (0.01, 10_000.0)
-#: How many numbers each target has; what they are.
-_NUMBERS = {
-    "wall": (
-        (4, 5),
-        "`wall:X,Y,Z,AZIMUTH[,TILT]`: a point of the wall in the project's CRS, the azimuth of its outward normal from "
-        "north by east (-360 to 360), and by how much that is raised (-90 to 90), degrees",
-    ),
-    "vault": (
-        (5, 6),
-        "`vault:X,Y,Z,AZIMUTH,RADIUS[,TILT]`: a point of its axis in the project's CRS, the azimuth of the axis from "
-        f"north by east (-360 to 360), the radius ({_RADII[0]:g} to {_RADII[1]:g} m), and by how much the axis rises "
-        "(-90 to 90), degrees",
-    ),
-    "column": (
-        (5, 5),
-        "`column:X,Y,Z,AZIMUTH,RADIUS`: a point of its axis in the project's CRS, the azimuth that its middle faces, "
-        f"from north by east (-360 to 360), and the radius ({_RADII[0]:g} to {_RADII[1]:g} m)",
-    ),
-}
-
-
-def _straight(scene: Scene, name: str) -> Camera:
-    """The camera of a scene, whose rays are straight on the ground and meet in a point, so that a target can
-    follow it.
-    """
-    camera = scene.camera
-    try:
-        camera.rays(np.zeros((1, 2)))
-    except UsageError:
-        way = "it is a line or satellite image; choose another one"
-        if camera.vantage.central:
-            way = 'state earth_curvature = "none" and no refraction in [orientation]; so near neither counts'
-        raise GeometryError(
-            f"image {name!r}: its rays are not straight on the ground, so that no surface lies along it: {way}"
-        ) from None
-    return camera
-
-
-def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | None]:
-    """The frame of a target as a user states it, and the bounds that it has by itself; None: it is the map, has none.
-
-    A user states heights in the system of the orientation; the frame is in that of the cameras.
-    """
-    kind, _, rest = text.partition(":")
-    if text == "map":
-        return None, None
-    if kind in _NUMBERS:
-        numbers = _numbers(rest)
-        counts, form = _NUMBERS[kind]
-        more = numbers[4:] if kind == "wall" else numbers[5:]
-        good = len(numbers) in counts and abs(numbers[3]) <= 360 and abs(sum(more)) <= 90
-        if not good or (kind != "wall" and not _RADII[0] <= numbers[4] <= _RADII[1]):
-            raise UsageError(f"target {text}: give {form}")
-        x, y, z, *others = numbers
-        odd = odd_place((x, y, z), camera=False) or project.area_fault((x, y))
-        if odd is not None:
-            raise UsageError(f"target {text}: {odd}")
-        z = float(ground_of(project).into_working(project.crs)((x, y, z)))
-        if kind == "wall":
-            return WallFrame.facing((x, y, z), *others), None
-        make = CylinderFrame.vault if kind == "vault" else CylinderFrame.column
-        return make((x, y, z), *others), None
-    if kind != "image" or not rest:
-        raise UsageError(f"target {text}; give {_FORMS}")
-    name, _, last = rest.rpartition(",")
-    if not name or any(image.name == rest for image in project.images):
-        return _along(project, rest, None, text)
-    return _along(project, name, next(iter(_numbers(last)), math.nan), text)
-
-
-def at_heights(frame: Frame, step: HeightStep) -> Frame:
-    """A frame with its origin in another height system: the step between them is the same all over a target."""
-    if step.definition is None or not isinstance(frame, WallFrame | CylinderFrame | ImageFrame):
-        return frame
-    x, y, _ = frame.origin
-    return replace(frame, origin=(x, y, float(step(frame.origin))))
-
-
-def _numbers(text: str) -> list[float]:
-    """Finite numbers between commas; none if any of them is none."""
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        return []
-    return numbers if all(math.isfinite(n) for n in numbers) else []
-
-
-def _along(project: Project, name: str, distance: float | None, text: str) -> tuple[Frame, Bounds]:
-    """The frame of an image, and the bounds of its picture."""
-    scene = open_scene(project, project.any_image(name).name)
-    camera = _straight(scene, name)
-    center = camera.vantage.point
-    # Of a camera in a plane picture (x·w, y·w, w) are linear in XYZ, and w is the depth.
-    L, twice = (camera.project_homogeneous(center + length * np.eye(3)).T / length for length in (_APART, _APART / 2))
-    if not (np.isfinite(L).all() and np.abs(L - twice).max() <= _STRAIGHT * np.abs(L).max()):
-        raise GeometryError(f"target {text}: a fisheye image of more than 126° lies in no plane; choose another one")
-    normal = -L[2] / np.linalg.norm(L[2])
-    right = L[0] - (L[0] @ normal) * normal
-    right /= np.linalg.norm(right)
-    axes = np.array([right, np.cross(normal, right), normal])
-    if distance is None:
-        low, high = scene.footprint.height_range
-        distance = float((center[2] - (low + high) / 2) / normal[2]) if normal[2] > 0 else math.nan
-        if not _NEAR <= distance <= HIGHEST_FLIGHT:
-            raise UsageError(f"target {text}: the axis of the image meets no terrain; say `image:{name},DISTANCE`")
-    if not _NEAR <= distance <= HIGHEST_FLIGHT:
-        raise UsageError(
-            f"target {text}: give a distance from {_NEAR:g} to {HIGHEST_FLIGHT:g} m: `image:NAME,DISTANCE`"
-        )
-    frame = ImageFrame(tuple(center.tolist()), tuple(map(tuple, axes.tolist())), distance)  # type: ignore[arg-type]
-    p = camera.rays(image_border(camera.size))[1] @ axes.T
-    uv = p[:, :2] / np.where(p[:, 2:] < 0, -p[:, 2:], np.nan) * distance
-    return frame, (*np.nanmin(uv, axis=0).tolist(), *np.nanmax(uv, axis=0).tolist())

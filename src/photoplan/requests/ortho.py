@@ -19,6 +19,7 @@ from photoplan.request import (
     OVERWRITE,
     PICTURE,
     PROJECT,
+    TARGET,
     WORKERS,
     Request,
     arg,
@@ -193,7 +194,21 @@ class OrthoSettings(SingleOptions, PixelOptions):
         return self.nodata if self.nodata in ("auto", "mask") else float(self.nodata)  # type: ignore[return-value]
 
 
-class ProductRequest(PixelOptions):
+class OnTarget(Request):
+    """Options of commands whose products may lie on a wall, a vault, a column or along an image instead of the map."""
+
+    target: str = TARGET
+    relief: str | None = opt(
+        "Offset of the target's surface along its normal: metres, or a raster by `surface` [0].", None,
+        metavar="M|FILE", section="input"
+    )  # fmt: skip
+    relief_sigma: str | None = opt(
+        "Standard deviation of these offsets: metres, or a raster by `surface`.", None, metavar="M|FILE",
+        section="input"
+    )  # fmt: skip
+
+
+class ProductRequest(OnTarget, PixelOptions):
     """Options of all commands that plan products and execute them."""
 
     project: Path = PROJECT
@@ -300,11 +315,12 @@ class DemoRequest(Request):
     overwrite: bool = OVERWRITE
 
 
-class SeamsRequest(Request):
+class SeamsRequest(OnTarget):
     """Options of the search for seams."""
 
     project: Path = PROJECT
     images: tuple[str, ...] = IMAGES
+    bounds: tuple[float, float, float, float] | None = BOUNDS
     resolution: float | None = opt(
         "Size of the pixels along whose edges seams run, metres [256 across an image].", None, gt=0, metavar="R"
     )
@@ -324,11 +340,12 @@ class SeamsRequest(Request):
         return self.output or self.project.resolve().parent / "products" / "seams.gpkg"
 
 
-class BalanceRequest(Request):
+class BalanceRequest(OnTarget):
     """Options of even colours between the images of a project."""
 
     project: Path = PROJECT
     images: tuple[str, ...] = IMAGES
+    bounds: tuple[float, float, float, float] | None = BOUNDS
     reference_image: str | None = opt(
         "Name of the image that stays unchanged [mean and contrast of all images stay].", None, metavar="NAME"
     )

@@ -5,17 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 
 from photoplan.errors import UsageError
-from photoplan.request import BOUNDS, DRY_RUN, EXECUTOR, IMAGES, MEMORY, ONE_WORKER, OVERWRITE, PROJECT, Request, opt
+from photoplan.request import (
+    BOUNDS,
+    DRY_RUN,
+    EXECUTOR,
+    IMAGES,
+    MEMORY,
+    ONE_WORKER,
+    OVERWRITE,
+    PROJECT,
+    TARGET,
+    Request,
+    opt,
+)
 
 
 class SurfaceSettings(Request):
     """Options that decide a surface."""
 
     resolution: float = opt("Distance of the heights, metres.", metavar="R")
-    target: str = opt(
-        "Surface that heights are over: map, wall:X,Y,Z,AZIMUTH[,TILT], vault:X,Y,Z,AZIMUTH,RADIUS[,TILT], "
-        "column:X,Y,Z,AZIMUTH,RADIUS, or image:NAME[,DISTANCE] [map].", "map", metavar="WHAT"
-    )  # fmt: skip
+    target: str = TARGET
     bounds: tuple[float, float, float, float] | None = BOUNDS
     start: str = opt("Initial heights: terrain (the project's), a height, or a file [terrain; 0].", "terrain",
                      metavar="WHAT", section="input")  # fmt: skip

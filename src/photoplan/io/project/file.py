@@ -26,6 +26,7 @@ from photoplan.io.project.model import (
     OrthoDefaults,
     Project,
     StatedTerrain,
+    TargetEntry,
 )
 from photoplan.io.raster_info import read_info
 from photoplan.io.store import write_atomically
@@ -70,6 +71,7 @@ def project_text(project: Project) -> str:
         *_observations(project.observations),
         *_adjustment(project.adjustment),
         *_ortho(project.ortho),
+        *(line for name, target in project.targets.items() for line in _target(name, target)),
         *(line for verb, options in project.defaults.items() for line in _defaults(verb, options)),
     ]
     for name, camera in project.cameras.items():
@@ -119,6 +121,16 @@ def _objects(objects: Objects) -> list[str]:
         "offset": "added to X, Y, Z of the file",
     }
     return ["[[objects]]", *_given(objects, comments), ""]
+
+
+def _target(name: str, target: TargetEntry) -> list[str]:
+    comments = {
+        "frame": "wall:X,Y,Z,AZIMUTH[,TILT], vault:…, column:… or image:NAME[,DISTANCE]",
+        "relief": "offset of the surface from the frame, metres, or a raster of offsets",
+        "sigma": "standard deviation of the offsets, or a raster of it",
+        "bounds": "lowest u, v and highest u, v, metres",
+    }
+    return [f"[targets.{toml_key(name)}]", *_given(target, comments), ""]
 
 
 def _orientation(orientation: Orientation) -> list[str]:
@@ -248,6 +260,8 @@ def load_project(path: str | Path) -> Project:
     if (path / "project.toml").is_file():
         path = path / "project.toml"
     data, text = read_toml(path)
+    if "target" in data:
+        raise InputError(f"{path}: unknown entry 'target'; a target is stated as [targets.NAME], and set by `target`")
     folder = path.resolve().parent
     return parse_project(_with_sizes(data, folder), folder, str(path), text)
 

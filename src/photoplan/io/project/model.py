@@ -19,6 +19,7 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import Lens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import area_fault, bounds_fault, odd_angles, odd_place
+from photoplan.geometry.frames import CylinderFrame, ImageFrame, WallFrame
 from photoplan.geometry.pose import ANGLE_UNITS
 from photoplan.io.camera.line import line_files
 from photoplan.io.camera.model import (
@@ -546,6 +547,52 @@ class Objects(Entry):
         return plain_file(text)
 
 
+Bounds = tuple[Number, Number, Number, Number]
+
+
+class TargetEntry(Entry):
+    """A wall, vault, column or image that products lie on instead of the map."""
+
+    frame: Annotated[str, Field(min_length=1, max_length=4000)]
+    """`wall:…`, `vault:…`, `column:…` or `image:…`, as `--target` takes it."""
+    relief: Number | InputName = 0.0
+    """Offset of the surface from the frame along its normal, metres, or a raster of offsets by `photoplan surface`."""
+    sigma: NotNegative | InputName | None = None
+    """Standard deviation of the offsets, metres, or a raster of them; None: unknown."""
+    bounds: Bounds | None = None
+    """Lowest u, v and highest u, v, metres; None for those of the relief or of the image."""
+
+    @field_validator("relief", "sigma")
+    @classmethod
+    def _file(cls, text: str | float | None) -> str | float | None:
+        return plain_file(text) if isinstance(text, str) else text
+
+    @property
+    def files(self) -> list[str]:
+        """Names of all files that it states."""
+        return [file for file in (self.relief, self.sigma) if isinstance(file, str)]
+
+
+def _frame_kind(frame: Any) -> str:
+    """Return the kind of a target's frame, whether it is a value or comes from a file."""
+    names = frame if isinstance(frame, dict) else vars(frame)
+    return "image" if "distance" in names else "cylinder" if "radius" in names else "wall"
+
+
+class PlacedTarget(TargetEntry):
+    """A target with its frame as numbers, in the height system of the cameras: what a worker needs of it."""
+
+    space: Annotated[
+        Annotated[WallFrame, Tag("wall")]
+        | Annotated[ImageFrame, Tag("image")]
+        | Annotated[CylinderFrame, Tag("cylinder")],
+        Discriminator(_frame_kind),
+    ]
+    """The frame."""
+    bounds: Bounds
+    """Lowest u, v and highest u, v of what products show, metres."""
+
+
 class Orientation(Entry):
     """Meaning of the numbers of all [[images]]."""
 
@@ -684,6 +731,10 @@ class Project(Entry):
     cameras: dict[Name, Camera] = Field(default_factory=dict)
     images: tuple[AnyImage, ...]
     ortho: OrthoDefaults = OrthoDefaults()
+    targets: dict[Name, TargetEntry] = Field(default_factory=dict)
+    """Walls, vaults, columns and images that products can lie on, by their names."""
+    target: SkipJsonSchema[PlacedTarget | None] = None
+    """The target on which the products at hand lie; None for the map. A project file does not state it."""
     defaults: dict[Name, dict[Name, Any]] = Field(default_factory=dict)
     """Options of commands, by the command's name, that hold unless others are given."""
     folder: SkipJsonSchema[Path] = Field(default=Path(), exclude=True)
@@ -754,6 +805,11 @@ class Project(Entry):
         if self.terrain is None:
             raise InputError("the project states no [terrain]; give file or height there")
         return self.terrain
+
+    @property
+    def plane_crs(self) -> str | None:
+        """The CRS of the plane that products lie in; None on a target, whose plane has none."""
+        return self.crs if self.target is None else None
 
     def area_fault(self, XY: ArrayLike, names: Sequence[str] = ()) -> str | None:
         """Return why places (n, 2 or more columns) cannot be in the project's CRS; None if they can, or are meant to

@@ -19,6 +19,7 @@ from photoplan.errors import InputError, PhotoplanError, TilesFailed
 from photoplan.events import Events
 from photoplan.io.disk import make_folder
 from photoplan.io.files import safe_stem
+from photoplan.io.disk import TARGET
 from photoplan.io.product import (
     ProductFacts,
     ProductFile,
@@ -326,6 +327,7 @@ def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:
         "PHOTOPLAN_IMAGE": ", ".join(product.images),
         "PHOTOPLAN_KERNEL": plan.settings.kernel,
         "PHOTOPLAN_KEY": product.key,
+        **({} if plan.project.target is None else {TARGET: plan.project.target.frame}),
     }
 
 
@@ -343,6 +345,7 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scenes: Scenes, result: Prod
             "width": product.grid.width,
             "height": product.grid.height,
         },
+        **({} if plan.project.target is None else {"target": plan.project.target}),
         "heights": {
             "terrain": scene.ground.height_systems[0],
             "orientation": scene.ground.height_systems[1],

@@ -20,7 +20,7 @@ from photoplan.plain import pick
 from photoplan.products.orthophoto.execution import execute_all, refuse_failed
 from photoplan.products.orthophoto.finished import ProductResult, overview_path
 from photoplan.products.orthophoto.plan import OrthoPlan, plan_orthophotos
-from photoplan.products.run import Run
+from photoplan.products.run import Run, load_on_target
 from photoplan.project.scene import Attempts, refuse_unusable
 from photoplan.requests.ortho import (
     DemoRequest,
@@ -109,7 +109,7 @@ def make_products(request: ProductRequest, events: Events = SILENT) -> ProductsR
     GeometryError
         No image sees the terrain, or an orientation cannot be right.
     """
-    project, images, plan = load_project(request.project), request.images or None, _planner(request)
+    project, images, plan = load_on_target(request), request.images or None, _planner(request)
     attempts, again = Attempts(project, images), False
     for attempt in attempts:
         with attempt as usable:

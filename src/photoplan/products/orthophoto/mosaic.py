@@ -298,7 +298,7 @@ def plan_objects(
     looked = with_blur(looked, grid_of(project, chosen, [one.look.footprint for one in looked]), chosen, events)
     surface = looked[0].scene.surface
     assert isinstance(surface, ObjectSurface)
-    found = _placed(_named(surface, entry, objects), chosen, project.crs, blind)
+    found = _placed(_named(surface, entry, objects), chosen, project.plane_crs, blind)
     near = _near(found, looked)
     products = []
     events.begin("planning objects", len(found), "objects")
@@ -372,7 +372,9 @@ def _named(surface: ObjectSurface, entry: int, patterns: Sequence[str]) -> dict[
     return {name: replace(surface, part=SingleObject(tuple(places[name]))) for name in chosen}
 
 
-def _placed(found: Mapping[str, ObjectSurface], chosen: OrthoSettings, crs: str, blind: list[str]) -> list[_Single]:
+def _placed(
+    found: Mapping[str, ObjectSurface], chosen: OrthoSettings, crs: str | None, blind: list[str]
+) -> list[_Single]:
     """Objects with the grids of their products; of those that cover nothing of the map `blind` gets a line each."""
     assert chosen.resolution is not None
     placed = []

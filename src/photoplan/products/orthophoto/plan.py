@@ -169,16 +169,16 @@ def look_at(project: Project, names: Sequence[str], force: bool, events: Events)
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
         scenes[names[place]] = scene = open_scene(project, names[place])
-        if scene.footprint.bounds is not None:
+        if scene.footprint.bounds is not None and project.target is None:
             seen[names[place]] = judged(project, project.any_image(names[place]), scene.ground)
         events.done()
-    if not force:
+    if not force and project.target is None:
         _refuse_faults(project, seen, scenes)
         _refuse_feet(list(scenes.values()))
     looked = []
     for name, scene in ((name, scenes[name]) for name in names):
         if scene.footprint.bounds is None:
-            blind.append(_sees_no_terrain(scene, name))
+            blind.append(_sees_no_terrain(scene, name) if project.target is None else _sees_no_target(scene, name))
         else:
             looked.append(Looked(name, scene, Look(scene.footprint, mean_gsd(scene.camera, scene.footprint))))
     return looked, blind
@@ -276,6 +276,15 @@ def _sees_no_terrain(scene: Scene, name: str) -> str:
     else:
         looks = f"does not look down to the level {level:.0f}"
     return f"{center} {looks}; the terrain is {extent_text(bounds)}"
+
+
+def _sees_no_target(scene: Scene, name: str) -> str:
+    """Return where an image stands in the coordinates of a target that it does not see."""
+    u, v, h = scene.camera.vantage.point
+    behind = "; it stands behind the target" if not h > 0 else ""
+    return (
+        f"{name}: shows nothing of the target inside {extent_text(scene.ground.bounds)}, from {u:g} {v:g} {h:g}{behind}"
+    )
 
 
 def extent_text(bounds: tuple[float, float, float, float] | None) -> str:
@@ -455,13 +464,13 @@ def grid_of(project: Project, settings: OrthoSettings, seen: Sequence[Footprint]
     assert settings.resolution is not None
     extents = np.array([one.bounds for one in seen if one.bounds is not None])
     low, high = extents[:, :2].min(axis=0).tolist(), extents[:, 2:].max(axis=0).tolist()
-    return MapGrid.covering(settings.bounds or (*low, *high), settings.resolution, project.crs)
+    return MapGrid.covering(settings.bounds or (*low, *high), settings.resolution, project.plane_crs)
 
 
 def judge_bounds(project: Project, settings: OrthoSettings, seen: Sequence[Footprint]) -> None:
     """Refuse bounds that are in another order or CRS, by what the images see."""
     extents = np.array([one.bounds for one in seen if one.bounds is not None])
-    if settings.bounds is None or not len(extents):
+    if settings.bounds is None or not len(extents) or project.target is not None:
         return
     low, high = extents[:, :2].min(axis=0).tolist(), extents[:, 2:].max(axis=0).tolist()
     if (fault := bounds_fault(settings.bounds, project.crs, (*low, *high))) is not None:

@@ -224,7 +224,7 @@ def write_plan(
         tile_bounds=bounds,
         footprints=footprints,
         outlines=outlines,
-        crs=plan.project.crs,
+        crs=plan.project.plane_crs,
         squares=layer,
     )
     try:

@@ -105,9 +105,9 @@ def sheet_index(plan: OrthoPlan, folder: Path) -> list[Path]:
 
 
 def write_index(plan: OrthoPlan, path: Path, results: Sequence[ProductResult]) -> None:
-    """A STAC item beside each sheet that is there, and a VRT of them all."""
+    """A STAC item beside each sheet that is there, if it lies on the map, and a VRT of them all."""
     products = {product.plan.name: product for product in plan.products}
-    for result in results:
+    for result in results if plan.project.target is None else ():
         item = _item(products[result.path.stem], result, plan.project)
         write_atomically(result.path.with_suffix(".stac.json"), item.encode())
     if results:

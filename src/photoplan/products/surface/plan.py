@@ -40,8 +40,8 @@ from photoplan.project.scene import (
     open_scene,
     refuse_unusable,
     surface_of,
-    target_frame,
 )
+from photoplan.project.target import target_frame
 from photoplan.requests.surface import SurfaceSettings
 from photoplan.surfaces.objects import without_objects
 

@@ -24,7 +24,8 @@ from photoplan.io.store import input_entry, scratch, together, write_run_record
 from photoplan.plain import pick
 from photoplan.products.run import Run, refuse_inputs
 from photoplan.products.surface.plan import HARDLY, TILE, SurfaceJob, SurfacePlan, median, plan_surface
-from photoplan.project.scene import Attempts, at_heights, input_files
+from photoplan.project.scene import Attempts, input_files
+from photoplan.project.target import at_heights
 from photoplan.requests.surface import SurfaceRequest, SurfaceSettings
 
 #: An image whose sigma0 is so many times the median of the others is told of; or all, if sigma0 is this part of the
