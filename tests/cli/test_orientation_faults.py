@@ -339,7 +339,7 @@ class TestGrossErrors:
         said = photoplan("adjust", block / "project.toml")
         no_nan(said, block)
         point, image = wrong.name  # type: ignore[attr-defined]
-        gross = [line for line in said.err.split("\n") if line.startswith("gross error")]
+        gross = [line for line in said.err.split("\n") if line.startswith("note: gross error")]
         assert any(f"'{point}'" in g and f"'{image[:2]}'" in g for g in gross), gross
         assert any("control point 'G5', Z" in g for g in gross), gross
         assert len(gross) <= 4

@@ -345,7 +345,6 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scenes: Scenes, result: Prod
             "width": product.grid.width,
             "height": product.grid.height,
         },
-        **({} if plan.project.target is None else {"target": plan.project.target}),
         "heights": {
             "terrain": scene.ground.height_systems[0],
             "orientation": scene.ground.height_systems[1],
