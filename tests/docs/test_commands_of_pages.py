@@ -22,6 +22,7 @@ from rasterio.transform import from_origin
 from tools.camera_model import Sensor, write_frame
 from tools.camera_series import edge_frame
 from tools.command import inside
+from tools.target_scene import wall, write
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -438,6 +439,13 @@ def seen_image(folder: Path, shared: Path) -> None:
     assert said.code == 0, said.err
 
 
+def facade(folder: Path) -> None:
+    """A wall behind a pillar, as a target of the project."""
+    (folder / "facade").mkdir()
+    place = wall()
+    write(place, folder / "facade", f'[targets.south]\nframe = "{place.stated}"\nbounds = {list(place.bounds)}\n')
+
+
 #: What a section needs before it runs, by the page's name, or by page and title.
 STAGES: dict[str, Callable[..., None]] = {
     "README: Try it": lambda folder: None,
@@ -467,6 +475,7 @@ STAGES: dict[str, Callable[..., None]] = {
     "terrain-use": models,
     "terrain-volumes": before_and_after,
     "true-orthophoto": town,
+    "facades": facade,
     "views": block_and_mountains,
     "views: With the camera of an image": seen_image,
 }

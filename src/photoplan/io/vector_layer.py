@@ -297,7 +297,10 @@ class VectorLayer:
 def write_vector(path: Path, **layer: Any) -> None:
     """Write a layer as `pyogrio.raw.write`, without the time of writing."""
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": FIXED_DATE})
-    pyogrio.raw.write(os.fspath(path), **layer)
+    with warnings.catch_warnings():
+        # The plane of a wall has no CRS.
+        warnings.filterwarnings("ignore", message="'crs' was not provided")
+        pyogrio.raw.write(os.fspath(path), **layer)
 
 
 def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str | None) -> None:

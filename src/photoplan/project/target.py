@@ -72,7 +72,9 @@ def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | No
     A user states heights in the system of the orientation; the frame is in that of the cameras.
     """
     if text in project.targets:
-        text = project.targets[text].frame
+        stated = project.targets[text]
+        frame, own = target_frame(project, stated.frame)
+        return frame, stated.bounds or own
     kind, _, rest = text.partition(":")
     if text == "map":
         return None, None

@@ -41,7 +41,7 @@ from photoplan.project.scene import (
     refuse_unusable,
     surface_of,
 )
-from photoplan.project.target import target_frame
+from photoplan.project.target import stated_target, target_frame
 from photoplan.requests.surface import SurfaceSettings
 from photoplan.surfaces.objects import without_objects
 
@@ -763,6 +763,7 @@ def plan_surface(
         looked, blind = over_map(project, names, force, events)
     else:
         settings = _on_frame(settings, settings.bounds or own)
+        settings = settings.replace(target=stated_target(project, settings.target).frame)
         assert settings.bounds is not None
         looked, blind = over_frame(project, names, frame, settings.bounds, float(settings.start), events)
     for one in looked if settings.bands else ():
