@@ -17,9 +17,8 @@ from photoplan.engine.executors import Workers
 from photoplan.engine.run import Kept, Tally, Work
 from photoplan.errors import InputError, PhotoplanError, TilesFailed
 from photoplan.events import Events
-from photoplan.io.disk import make_folder
+from photoplan.io.disk import TARGET, make_folder
 from photoplan.io.files import safe_stem
-from photoplan.io.disk import TARGET
 from photoplan.io.product import (
     ProductFacts,
     ProductFile,
