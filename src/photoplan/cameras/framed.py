@@ -19,8 +19,8 @@ _Doubles = NDArray[np.float64]
 #: Points along a side of the target from the nearest of which a ray is followed, times that it is, and pixels by which
 #: it may miss then.
 _POINTS, _TIMES, _OFF = 17, 5, 1e-6
-#: Lines of sight are cut into at most half so many pieces.
-_MOST_PIECES = 128
+#: Lines of sight are cut into at most so many pieces, as these of them need.
+_MOST_PIECES, _SAMPLE = 128, 256
 #: Metres before a place of a ray from which it is followed, if it begins nowhere.
 _BEFORE = 100_000.0
 
@@ -105,22 +105,26 @@ class FramedCamera:
         else:
             _, way = self.camera.rays(project(self.camera, here), here[:, 2])  # type: ignore[arg-type]
             there = here - self.vantage.point[2] * way
-        pieces = 4
-        while True:
-            # The frame bends most close to its surface, where a line begins.
-            part = np.linspace(0.0, 1.0, 2 * pieces + 1)[:, None] ** 2
-            path = self.frame.inverse(here[:, None] + part * (there - here)[:, None])
-            path[:, 0] = uvh
-            if math.isfinite(self.frame.turn):
-                path[..., 0] = np.unwrap(path[..., 0], axis=1, period=self.frame.turn)
-            off = path[:, 1::2] - (path[:, :-1:2] + path[:, 2::2]) / 2
-            # Along the line a difference does not matter.
-            along = path[:, 2::2] - path[:, :-1:2]
-            along /= np.linalg.norm(along, axis=-1, keepdims=True) + 1e-300
-            off -= (off * along).sum(axis=-1, keepdims=True) * along
-            if np.nanmax(np.linalg.norm(off, axis=-1), initial=0.0) <= 4 * tolerance or pieces >= _MOST_PIECES:
-                return path
+        way, some, pieces = there - here, slice(None, None, max(1, len(here) // _SAMPLE)), 4
+        unit = (way[some] / np.linalg.norm(way[some], axis=-1, keepdims=True))[:, None]
+        while pieces < _MOST_PIECES:
+            line, path = self._pieces(uvh[some], here[some], way[some], 2 * pieces)
+            # On the ground: close to the axis a turn is short. Along the line a difference does not matter.
+            off = self.frame((path[:, :-1:2] + path[:, 2::2]) / 2) - line[:, 1::2]
+            off -= (off * unit).sum(axis=-1, keepdims=True) * unit
+            if np.nanmax(np.linalg.norm(off, axis=-1), initial=0.0) <= tolerance:
+                break
             pieces *= 2
+        return self._pieces(uvh, here, way, pieces)[1]
+
+    def _pieces(self, uvh: _Doubles, here: _Doubles, way: _Doubles, pieces: int) -> tuple[_Doubles, _Doubles]:
+        """Lines (n, k, 3) on the ground and in the frame, the pieces shortest where they begin: there it bends most."""
+        line = here[:, None] + np.linspace(0.0, 1.0, pieces + 1)[:, None] ** 2 * way[:, None]
+        path = self.frame.inverse(line)
+        path[:, 0] = uvh
+        if math.isfinite(self.frame.turn):
+            path[..., 0] = np.unwrap(path[..., 0], axis=1, period=self.frame.turn)
+        return line, path
 
     def _met_from_a_point(self, xy: _Doubles, uvh: _Doubles, height: float) -> tuple[_Doubles, _Doubles]:
         """Places at a height whose images are xy (n, 2), from places near them; by Newton's method, as level rays meet

@@ -43,6 +43,8 @@ _MOST_PIXELS = 1e6
 _SHORT = 0.1
 #: The same of posts that a place lies between, which are known better: to rounding.
 _BESIDE = 0.01
+#: Pieces of a bent line of sight are straight to this part of a pixel.
+_STRAIGHT = 0.25
 #: Lines that are followed at once, straight and in pieces.
 _BATCH, _PATHS = 200_000, 20_000
 
@@ -155,7 +157,7 @@ def _hidden_along_paths(camera: FramedCamera, ground: TileGround, surface: Surfa
     short = _SHORT * target.grid.resolution
     whole: Any = surface.surface if isinstance(surface, RaisedSurface) else surface
     for part in np.array_split(np.flatnonzero(inside), max(1, -(-int(inside.sum()) // _PATHS))):
-        hits = whole.first_hit(camera.sight_paths(places[part], short)[:, ::-1])
+        hits = whole.first_hit(camera.sight_paths(places[part], _STRAIGHT * target.grid.resolution)[:, ::-1])
         before = np.linalg.norm(hits.XYZ - places[part], axis=1) > short
         hidden[tuple(there[part].T)] = np.isfinite(hits.along) & before
     return hidden
