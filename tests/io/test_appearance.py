@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.io.files import decoded_text, looks_like, raster_driver
+from photoplan.io.files import decoded_text, format_hint, raster_driver
 from photoplan.io.formats import read_cameras
 
 KINDS = {
@@ -32,15 +32,15 @@ def test_files_are_named_for_what_they_look_like(tmp_path: Path, name: str) -> N
     raw, kind = KINDS[name]
     path = tmp_path / name
     path.write_bytes(raw)
-    assert looks_like(path).startswith(f"; it looks like {kind}")
+    assert format_hint(path).startswith(f"; it looks like {kind}")
 
 
 @pytest.mark.parametrize("raw", [b"1 2 3\n4 5 6\n", b"name,x,y,z\n", b"", b"\x00\x01\x02", b"<" * 4096])
 def test_nothing_is_said_of_others(tmp_path: Path, raw: bytes) -> None:
     path = tmp_path / "a.csv"
     path.write_bytes(raw)
-    assert looks_like(path) == ""
-    assert looks_like(tmp_path / "missing.csv") == ""
+    assert format_hint(path) == ""
+    assert format_hint(tmp_path / "missing.csv") == ""
 
 
 def test_refusals_say_it(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import topocentric_poses
 from photoplan.geometry.local import enu_poses
 from photoplan.io.formats import read_orientation, read_orientation_block
-from photoplan.io.image_metadata import read_folder, read_image_metadata, rotation_from_gimbal
+from photoplan.io.image_metadata import read_image_folder, read_image_metadata, rotation_from_gimbal
 from photoplan.io.points import read_observed_positions
 
 
@@ -231,7 +231,7 @@ def test_an_image_of_another_datum_is_left_out_of_a_folder(tmp_path: Path) -> No
     """One image in Tokyo's datum had refused the whole folder."""
     for name, datum in (("a", "WGS-84"), ("b", "TOKYO"), ("c", "WGS 84")):
         jpeg(tmp_path / f"{name}.jpg", exif(MAIN, OWN, gps(46, -91, 100) | {18: (ASCII, datum)}))
-    placed = read_folder(tmp_path)
+    placed = read_image_folder(tmp_path)
     assert [m.file.name for m in placed.placed] == ["a.jpg", "c.jpg"]
     assert "1 of 3 images refer to another datum than WGS 84 and are left out: b.jpg: datum TOKYO" in placed.notes[0]
 

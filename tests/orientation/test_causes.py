@@ -10,7 +10,7 @@ from tools.plain_block import FOCAL, Make, Truth, plain_block
 
 from photoplan.adjustment.statistics import variance_components
 from photoplan.errors import GeometryError
-from photoplan.orientation.bundle.adjust import adjust_block, weighed_causes
+from photoplan.orientation.bundle.adjust import adjust_block, misfit_hypotheses
 from photoplan.orientation.bundle.model import Block
 
 
@@ -50,7 +50,7 @@ def spoilt(kind: str, seed: int) -> Block:
 def test_the_cause_is_named(kind: str, words: str, seed: int) -> None:
     block = spoilt(kind, seed)
     result = adjust_block(block)
-    found = weighed_causes(block, result)
+    found = misfit_hypotheses(block, result)
     print([(c.name, round(c.explains, 3), round(c.change, 3)) for c in found], result.ground_rejected.sum())
     assert found and found[0].name.startswith(words)
     assert found[0].explains > 0.7
@@ -60,13 +60,13 @@ def test_the_cause_is_named(kind: str, words: str, seed: int) -> None:
 
 def test_where_all_is_as_stated_or_a_point_is_wrong_nothing_is_blamed() -> None:
     truth = plain_block(Make(3, 3, 5, gnss=0.05))
-    assert weighed_causes(truth.block, adjust_block(truth.block)) == ()
+    assert misfit_hypotheses(truth.block, adjust_block(truth.block)) == ()
     XYZ = truth.block.ground.XYZ.copy()
     XYZ[2] += (0.0, 3.0, -4.0)
     block = truth.with_ground(XYZ)
     result = adjust_block(block)
     assert result.ground_rejected.any()
-    assert weighed_causes(block, result) == ()
+    assert misfit_hypotheses(block, result) == ()
 
 
 def alike(truth: Truth, seed: int, size: float, reach: float) -> Block:
@@ -96,7 +96,7 @@ def low_block(seed: int, points: int, images: int) -> Truth:
 def told(block: Block) -> list[tuple[str, float]]:
     result = adjust_block(block)
     ratios = [round(group.factor, 1) for group in result.groups if "positions" in group.name]
-    found = [(cause.name, cause.explains) for cause in weighed_causes(block, result)]
+    found = [(cause.name, cause.explains) for cause in misfit_hypotheses(block, result)]
     print(f"{len(block.observations) / len(block.images):.0f} points an image, positions {ratios}, {found}")
     return found
 

@@ -18,7 +18,7 @@ from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.bundle.adjust import _selected, _started, adjust_block
-from photoplan.orientation.bundle.equations import linearise, loose_points
+from photoplan.orientation.bundle.equations import linearise, points_at_infinity
 from photoplan.orientation.bundle.model import Active, AdjustSettings, Block, BlockCamera, BlockImage, build_model
 from photoplan.orientation.bundle.robust import _left, weights_of
 
@@ -107,7 +107,7 @@ def test_a_point_that_comes_into_a_projection_centre_is_set_aside(step: int) -> 
         fell[point] = into + 1e-4 * (XYZ[point] - into) / np.linalg.norm(XYZ[point] - into)
         state = _started(model, fell)
         rows, _ = linearise(model, state, np.sqrt(weights_of(model, active)))
-        assert model.point_names[point] in loose_points(model, state, rows)
+        assert model.point_names[point] in points_at_infinity(model, state, rows)
 
 
 def test_what_has_nothing_left_to_go_is_a_result() -> None:

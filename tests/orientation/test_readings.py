@@ -22,10 +22,10 @@ from photoplan.orientation.conventions import (
     CAMERA_AXES,
     DIRECTIONS,
     TURNS,
-    Reading,
+    Convention,
     StatedPoses,
     fitting,
-    judge_readings,
+    judge_conventions,
     sights_of,
     turn_matrix,
 )
@@ -70,7 +70,7 @@ def stated(names, centers, R, reading):
 
 
 SOME = [
-    Reading(unit, order, direction, axes, turned, mirrored, swapped)
+    Convention(unit, order, direction, axes, turned, mirrored, swapped)
     for k, (unit, order, direction, axes, turned, mirrored, swapped) in enumerate(
         product(ANGLE_UNITS, ROTATION_ORDERS, DIRECTIONS, CAMERA_AXES, TURNS, (False, True), (False, True))
     )
@@ -82,7 +82,7 @@ SOME = [
 def test_the_true_reading_is_the_only_one_that_fits(reading):
     names, centers, R, cameras, observed, ground = made_block(reading.mirrored)
     sights = sights_of(names, cameras, observed, ground)
-    results = judge_readings(stated(names, centers, R, reading), sights)
+    results = judge_conventions(stated(names, centers, R, reading), sights)
     assert len(results) == 3 * 6 * 2 * 2 * 4 * 2 * 2
     fits = fitting(results)
     assert fits[0].reading == reading
@@ -94,9 +94,9 @@ def test_the_true_reading_is_the_only_one_that_fits(reading):
 def test_the_lens_is_taken_into_account():
     names, centers, R, cameras, observed, ground = made_block()
     without = {name: (interior, NoLens()) for name, (interior, _) in cameras.items()}
-    poses = stated(names, centers, R, Reading())
-    assert judge_readings(poses, sights_of(names, cameras, observed, ground))[0].median < 0.5
-    assert judge_readings(poses, sights_of(names, without, observed, ground))[0].median > 5
+    poses = stated(names, centers, R, Convention())
+    assert judge_conventions(poses, sights_of(names, cameras, observed, ground))[0].median < 0.5
+    assert judge_conventions(poses, sights_of(names, without, observed, ground))[0].median > 5
 
 
 def test_fault_17_a_third_of_gross_errors_does_not_decide():
@@ -106,18 +106,18 @@ def test_fault_17_a_third_of_gross_errors_does_not_decide():
     bad = rng.random(len(xy)) < 0.33
     xy[bad] = rng.uniform(0, SIZE, (int(bad.sum()), 2))
     spoiled = ImagePoints(observed.images, observed.points, observed.image, observed.point, xy, observed.sigma)
-    results = judge_readings(
-        stated(names, centers, R, Reading("gon", "kpo")), sights_of(names, cameras, spoiled, ground)
+    results = judge_conventions(
+        stated(names, centers, R, Convention("gon", "kpo")), sights_of(names, cameras, spoiled, ground)
     )
-    assert [f.reading for f in fitting(results)] == [Reading("gon", "kpo")]
+    assert [f.reading for f in fitting(results)] == [Convention("gon", "kpo")]
 
 
 def test_matrices_have_a_direction_and_axes_only():
     names, centers, R, cameras, observed, ground = made_block()
     sights = sights_of(names, cameras, observed, ground)
-    results = judge_readings(StatedPoses(names, centers, matrices=np.swapaxes(R, 1, 2)), sights)
+    results = judge_conventions(StatedPoses(names, centers, matrices=np.swapaxes(R, 1, 2)), sights)
     assert len(results) == 2 * 2 * 4 * 2 * 2
-    assert [f.reading for f in fitting(results)] == [Reading(direction="ground-to-camera")]
+    assert [f.reading for f in fitting(results)] == [Convention(direction="ground-to-camera")]
 
 
 def test_strictly_vertical_images_do_not_tell_orders_and_that_is_said():
@@ -130,10 +130,10 @@ def test_strictly_vertical_images_do_not_tell_orders_and_that_is_said():
         xy = project(FrameCamera(interior, LENS, Pose(centers[k], R[k])), ground.XYZ)
         rows += [(f"p{p}", name, *xy[p]) for p in range(0, 400, 50)]
     sights = sights_of(names, cameras, ImagePoints.from_rows(rows), ground)
-    fits = fitting(judge_readings(stated(names, centers, R, Reading()), sights))
+    fits = fitting(judge_conventions(stated(names, centers, R, Convention()), sights))
     assert {f.reading.rotation for f in fits} == set(ROTATION_ORDERS)
     # Of equals the simplest is first.
-    assert fits[0].reading == Reading()
+    assert fits[0].reading == Convention()
 
 
 def test_too_few_points_and_cameras_that_see_nothing():
@@ -147,7 +147,7 @@ def test_too_few_points_and_cameras_that_see_nothing():
         sights_of(names, cameras, observed, no_height)
     sights = sights_of(names, cameras, observed, ground)
     with pytest.raises(GeometryError, match="under no reading"):
-        judge_readings(StatedPoses(names, np.full_like(centers, np.nan), angles=np.zeros((len(names), 3))), sights)
+        judge_conventions(StatedPoses(names, np.full_like(centers, np.nan), angles=np.zeros((len(names), 3))), sights)
 
 
 @pytest.fixture(scope="module")
@@ -170,12 +170,12 @@ def borea(shared: Path):
 def test_ign_borea_true_reading_is_first_by_a_wide_margin(borea):
     names, centers, table, sights = borea
     angles = np.array([i.angles for i in table.images])
-    results = judge_readings(StatedPoses(names, centers, angles=angles), sights)
+    results = judge_conventions(StatedPoses(names, centers, angles=angles), sights)
     assert len(sights.image) == 14_407
-    assert results[0].reading == Reading()
+    assert results[0].reading == Convention()
     assert results[0].median < 0.3
     # Tilts are below half a degree: φ before ω or after it differs by hundredths of a pixel. Everything else is wrong.
-    assert {f.reading for f in fitting(results)} <= {Reading(), Reading(rotation="pok")}
+    assert {f.reading for f in fitting(results)} <= {Convention(), Convention(rotation="pok")}
     others = [r for r in results if r.reading.rotation not in ("opk", "pok") or r.reading.angle_unit != "deg"]
     assert min(r.median for r in others) > 2 * results[0].median
     assert min(r.median for r in results if r.reading.angle_unit != "deg") > 60 * results[0].median
@@ -185,11 +185,11 @@ def test_ign_borea_true_reading_is_first_by_a_wide_margin(borea):
 
 def test_ign_borea_scrambled_table_is_recognised(borea):
     names, centers, table, sights = borea
-    true = Reading("gon", "kpo", "ground-to-camera")
-    results = judge_readings(stated(names, centers, table.rotations, true), sights)
+    true = Convention("gon", "kpo", "ground-to-camera")
+    results = judge_conventions(stated(names, centers, table.rotations, true), sights)
     assert results[0].reading == true
     assert results[0].median < 0.3
-    assert {f.reading for f in fitting(results)} <= {true, Reading("gon", "kop", "ground-to-camera")}
+    assert {f.reading for f in fitting(results)} <= {true, Convention("gon", "kop", "ground-to-camera")}
 
 
 def test_ign_borea_columns_in_another_order_are_no_other_rotation(shared, borea):

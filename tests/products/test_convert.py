@@ -12,7 +12,7 @@ from photoplan.geometry.pose import angles_from_rotation, rotation_from_angles
 from photoplan.io.camera.model import FilmEntry
 from photoplan.io.formats import FORMATS, orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation.block import TableFormat
-from photoplan.orientation.conventions import Reading
+from photoplan.orientation.conventions import Convention
 from photoplan.plain import json_text, plain
 from photoplan.products.convert import ConvertRequest, convert_orientation, list_readings
 
@@ -253,7 +253,7 @@ def test_readings_of_film_scans_use_their_marks(tmp_path):
     (tmp_path / "control.csv").write_text("name,x,y,z\n" + control)
     found = list_readings(ConvertRequest(source, "csv"), tmp_path / "points.csv", tmp_path / "control.csv")
     assert (found.points, found.images) == (80, 2)
-    assert found.fitting[0].reading == Reading()
+    assert found.fitting[0].reading == Convention()
     assert found.fitting[0].median < 0.01
     assert any(f"1 film images have no measured fiducial marks ({NAMES[2]!r}" in n for n in found.notes)
     # Marks and sizes go into own TOML; an Inpho project says that it has none.

@@ -22,8 +22,8 @@ from photoplan.orientation.conventions import (
     Heights,
     ImagePlausibility,
     JudgedView,
+    better_convention,
     look,
-    other_reading,
     readings,
 )
 from photoplan.project.cameras import view_of
@@ -83,7 +83,7 @@ class Plausibility:
 def assess(block: Sequence[JudgedView], heights: Heights) -> Plausibility:
     """Every image looked at; where something cannot be right, other readings of the whole block."""
     images = tuple(look(view, heights) for view in block)
-    return Plausibility(images, other_reading(block, images, heights))
+    return Plausibility(images, better_convention(block, images, heights))
 
 
 def fails(result: Plausibility) -> str:

@@ -7,7 +7,7 @@ import pytest
 from tools.thinned import thinned
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.drift import fit_approach
+from photoplan.quality.camera.drift import fit_settling
 from photoplan.quality.camera.video import compare_transitions, gain_control
 
 TIMES = np.arange(80) * 0.2
@@ -82,7 +82,7 @@ def test_step_is_found_or_given() -> None:
 def test_time_constants_out_of_reach_are_said(tau: float, words: str) -> None:
     t = np.arange(60) * 0.2
     y = 60 + 50 * (1 - np.exp(-t / tau)) + np.random.default_rng(7).normal(0, 0.3, 60)
-    found = fit_approach(t, y)
+    found = fit_settling(t, y)
     assert words in found.verdict and found.change is None and found.time_constant is None
 
 

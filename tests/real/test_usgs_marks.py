@@ -21,7 +21,7 @@ from tools.thinned import some
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.cameras.marks import Mark
 from photoplan.geometry.grid import Window
-from photoplan.orientation.marks.single import AloneMark, find_mark
+from photoplan.orientation.marks.single import SingleMark, find_mark
 from photoplan.project.camera_marks import ScanImage, mark_pattern
 
 HERE = Path(__file__).resolve().parent / "usgs_marks"
@@ -46,7 +46,7 @@ class Crop:
         scan = ScanImage(shared / "data" / "film_usgs_hipp" / "fiducials" / self.file)
         return scan.grey(Window(0, 0, *scan.size))
 
-    def off(self, found: AloneMark) -> float:
+    def off(self, found: SingleMark) -> float:
         return math.hypot(found.x - self.x, found.y - self.y)
 
 

@@ -71,7 +71,7 @@ _TEXT = (
 _COLMAP = ("cameras.bin", "images.bin", "points3D.bin")
 
 
-def looks_like(path: Path) -> str:
+def format_hint(path: Path) -> str:
     """``"; it looks like …"`` for the end of a refusal, or nothing where the file shows no kind that is known.
 
     Only the first bytes are looked at; a file that cannot be read shows nothing.
@@ -321,7 +321,7 @@ def raster_driver(path: Path) -> str:
             f"it is not followed. Make a plain copy of it with `gdal_translate` and give that ({known})"
         )
     raise InputError(
-        f"{path}: not a raster that is read here; allowed are {known}, others after `gdal_translate`{looks_like(path)}"
+        f"{path}: not a raster that is read here; allowed are {known}, others after `gdal_translate`{format_hint(path)}"
     )
 
 
@@ -668,7 +668,7 @@ def decoded_text(path: Path, raw: bytes, first_line: int = 1) -> str:
         at, wrong = error.start, f"not UTF-8 (byte {raw[error.start]:#04x}); save the file as UTF-8"
         before = raw[:at].count(b"\n")
     if at >= 0:
-        raise InputError(f"{path}:{first_line + before}: {wrong}{looks_like(path)}")
+        raise InputError(f"{path}:{first_line + before}: {wrong}{format_hint(path)}")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

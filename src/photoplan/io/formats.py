@@ -23,7 +23,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.io.camera.model import Camera, CameraEntry
 from photoplan.io.camera.opencv import is_opencv, read_opencv, read_orthority
 from photoplan.io.disk import disk_error, make_parents
-from photoplan.io.files import explain, finite, looks_like, read_head, read_toml
+from photoplan.io.files import explain, finite, format_hint, read_head, read_toml
 from photoplan.io.orientation import opensfm, projects, structure_from_motion
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, OrientationTable, TableFormat
 from photoplan.io.product import check_output
@@ -87,7 +87,7 @@ def _text(path: Path) -> dict[str, CameraEntry]:
         return structure_from_motion.read_colmap_cameras(path)
     raise InputError(
         f"{path}: no camera format; of text files, COLMAP's cameras.txt and Pix4D's calibrated_camera_parameters.txt "
-        f"describe cameras{looks_like(path)}"
+        f"describe cameras{format_hint(path)}"
     )
 
 
@@ -149,7 +149,7 @@ def read_cameras(path: str | Path) -> CameraFile:
     suffix = path.suffix.lower()
     if suffix not in CAMERA_FORMATS:
         known = ", ".join(CAMERA_FORMATS)
-        raise InputError(f"{path}: no camera format has the suffix {suffix!r}; allowed are {known}{looks_like(path)}")
+        raise InputError(f"{path}: no camera format has the suffix {suffix!r}; allowed are {known}{format_hint(path)}")
     cameras = CAMERA_FORMATS[suffix](path)
     if not cameras:
         raise InputError(f"{path}: describes no camera")

@@ -432,7 +432,7 @@ def image_files(path: Path) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class Folder:
+class ImageFolder:
     """Images of a folder, or one image, by what they state."""
 
     placed: tuple[ImageMetadata, ...]
@@ -443,7 +443,7 @@ class Folder:
     """Images that were left out, or parts of their metadata that are damaged."""
 
 
-def read_folder(path: Path) -> Folder:
+def read_image_folder(path: Path) -> ImageFolder:
     """Metadata of the images of a folder, or of one image."""
     files, found, unread = image_files(path), [], []
     for file in files:
@@ -475,7 +475,7 @@ def read_folder(path: Path) -> Folder:
         raise InputError(
             "; ".join([f"{path}: no image states a GPS position (latitude, longitude and altitude)", *notes])
         )
-    return Folder(stated, len(files), tuple(notes))
+    return ImageFolder(stated, len(files), tuple(notes))
 
 
 def _is_wgs84(datum: str) -> bool:
@@ -504,7 +504,7 @@ def map_positions(images: Sequence[ImageMetadata], crs: str) -> Floats:
 
 def read_drone_images(path: Path, form: TableFormat) -> OrientationBlock:
     """Approximate orientations of a folder of drone images, or of one; `form` is not used."""
-    folder = read_folder(path)
+    folder = read_image_folder(path)
     stated = folder.placed
     oriented = [m for m in stated if m.yaw_pitch_roll is not None and m.position is not None]
     if not oriented:

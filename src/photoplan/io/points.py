@@ -29,7 +29,7 @@ from photoplan.geometry.units import MetricSystem, metric_system
 from photoplan.io.disk import disk_error, open_raster
 from photoplan.io.files import ImageNames, check_plain_file, crs_beside, read_text, same_images
 from photoplan.io.formats import read_orientation
-from photoplan.io.image_metadata import map_positions, read_folder
+from photoplan.io.image_metadata import map_positions, read_image_folder
 from photoplan.io.orientation.block import TableFormat
 from photoplan.io.store import give_name, scratch, standing
 from photoplan.io.tables import NUMBER, Columns, Dialect, TextTable, number, read_table, write_table
@@ -598,7 +598,7 @@ def _same(path: Path, own: str, crs: str) -> None:
 
 def _from_images(path: Path, crs: str) -> PositionTable:
     """Positions that drones write into their images, with the receiver's standard deviations and times."""
-    folder = read_folder(path)
+    folder = read_image_folder(path)
     images = folder.placed
     n = len(images)
     sigma = np.array([m.sigma or (np.nan,) * 3 for m in images], float).reshape(n, 3)

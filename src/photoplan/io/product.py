@@ -39,8 +39,8 @@ from photoplan.io.files import check_plain_file, raster_driver
 from photoplan.io.raster_info import ImageForm, TiffArray, dress, read_tiff_layout, read_tiff_layouts
 from photoplan.io.store import (
     KeptTiles,
+    StagedOutput,
     TileLog,
-    Unfinished,
     is_unfinished,
     log_of,
     record_path,
@@ -310,7 +310,7 @@ class ProductFile:
         value = nodata_for(self.dtype, self.nodata, self.compress)
         self._coder = BlockCoder(self.tile, self.bands, self.dtype, value, lossy=self.compress == "jpeg")
         self._windows = tuple(self.placement.window.tiles(self.tile))
-        self._file = Unfinished(
+        self._file = StagedOutput(
             path=self.path,
             log_path=self.log_path,
             what="tiles",

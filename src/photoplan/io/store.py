@@ -580,7 +580,7 @@ def tidy(paths: Iterable[Path]) -> None:
 
 
 @dataclass(eq=False)
-class Unfinished:
+class StagedOutput:
     """A file that is made of a log, under a lock."""
 
     path: Path

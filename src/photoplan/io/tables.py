@@ -15,7 +15,7 @@ from photoplan.arrays import Floats
 from photoplan.codec import storable
 from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import disk_error, make_parents
-from photoplan.io.files import decoded_text, looks_like
+from photoplan.io.files import decoded_text, format_hint
 from photoplan.io.store import write_atomically
 
 #: In the order in which they are tried.
@@ -371,7 +371,7 @@ def _delimiter(path: Path, data: Sequence[Line], columns: Columns, dialect: Dial
     line, text = data[0]
     raise InputError(
         f"{path}:{line}: {text.strip()[:80]!r} has fewer than {least} columns by comma, semicolon, tab or space; "
-        f"needed are {', '.join(columns.needed)}{looks_like(path)}"
+        f"needed are {', '.join(columns.needed)}{format_hint(path)}"
     )
 
 

@@ -42,7 +42,7 @@ CUT = 5.0
 
 
 @dataclass(frozen=True)
-class Reading:
+class Convention:
     """One way to read the numbers of a table."""
 
     angle_unit: str = "deg"
@@ -66,14 +66,14 @@ class Reading:
         return sum(getattr(self, name) != getattr(USUAL, name) for name in self.__dataclass_fields__)
 
 
-USUAL = Reading()
+USUAL = Convention()
 
 
 @dataclass(frozen=True)
-class FittedReading:
+class FittedConvention:
     """A reading and what it makes of the measured points."""
 
-    reading: Reading
+    reading: Convention
     median: float
     """Median distance between measured and predicted image points, pixels; infinite if most are behind the camera."""
     worse: float
@@ -143,7 +143,7 @@ def sights_of(
     return Sights(image[good].astype(np.int64), XYZ[good], tangents[good], focal[good])
 
 
-def judge_readings(poses: StatedPoses, sights: Sights) -> tuple[FittedReading, ...]:
+def judge_conventions(poses: StatedPoses, sights: Sights) -> tuple[FittedConvention, ...]:
     """All readings with their errors: those that fit, the best first and of equals the simpler; then the others."""
     step = np.linspace(0, len(sights.image) - 1, min(SAMPLE, len(sights.image))).astype(int)
     few = Sights(sights.image[step], sights.XYZ[step], sights.tangents[step], sights.focal[step])
@@ -159,14 +159,14 @@ def judge_readings(poses: StatedPoses, sights: Sights) -> tuple[FittedReading, .
     off = {r: _distances(_components(poses, sights, r), sights, r) for _, r in ranked[:BEST]}
     order = sorted(off, key=lambda r: (round(_cost(off[r], off[ranked[0][1]]), 9), r.changes))
     best = off[order[0]]
-    first = [FittedReading(r, float(np.median(off[r])), _worse(off[r], best, sights.image)) for r in order]
+    first = [FittedConvention(r, float(np.median(off[r])), _worse(off[r], best, sights.image)) for r in order]
     fits = fitting(first)
     rest = [r for r in first if r not in fits]
-    rest += [FittedReading(r, median, np.inf) for median, r in ranked[BEST:]]
+    rest += [FittedConvention(r, median, np.inf) for median, r in ranked[BEST:]]
     return (*fits, *sorted(rest, key=lambda r: r.median))
 
 
-def fitting(results: Sequence[FittedReading]) -> tuple[FittedReading, ...]:
+def fitting(results: Sequence[FittedConvention]) -> tuple[FittedConvention, ...]:
     """The readings that the points do not tell apart from the best, which is the first."""
     return tuple(r for r in results if r.worse < CLEAR and r.median <= FACTOR * results[0].median + 1e-6)
 
@@ -196,7 +196,7 @@ def turn_matrix(camera_axes: str, turned: int) -> Floats:
     return turn @ flip
 
 
-def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Reading, Floats]]:
+def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Convention, Floats]]:
     """Every reading with the components of the rays along the axes of the camera that the file means."""
     conventions = [("deg", "opk")] if poses.matrices is not None else list(product(ANGLE_UNITS, ROTATION_ORDERS))
     others = list(product(CAMERA_AXES, TURNS, (False, True)))
@@ -206,7 +206,7 @@ def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Reading, Flo
             q = _along(R, poses.centers, sights, direction, swapped)
             for axes, turned, mirrored in others:
                 yield (
-                    Reading(
+                    Convention(
                         angle_unit=unit,
                         rotation=order,
                         direction=direction,
@@ -219,7 +219,7 @@ def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Reading, Flo
                 )
 
 
-def _components(poses: StatedPoses, sights: Sights, reading: Reading) -> Floats:
+def _components(poses: StatedPoses, sights: Sights, reading: Convention) -> Floats:
     R = poses.rotations(reading.angle_unit, reading.rotation)
     return _along(R, poses.centers, sights, reading.direction, reading.swapped)
 
@@ -230,7 +230,7 @@ def _along(R: Floats, centers: Floats, sights: Sights, direction: str, swapped: 
     return np.asarray(np.einsum(paths, R[sights.image], d), np.float64)
 
 
-def _distances(q: Floats, sights: Sights, reading: Reading) -> Floats:
+def _distances(q: Floats, sights: Sights, reading: Convention) -> Floats:
     """Distances of measured and predicted points (m,), pixels; infinite behind the camera."""
     p = q @ turn_matrix(reading.camera_axes, reading.turned).T
     depth = -p[:, 2]
@@ -253,7 +253,7 @@ _UNITS = {
 
 
 @dataclass(frozen=True)
-class OtherReading:
+class AlternativeConvention:
     """One way to read three angles and a projection centre."""
 
     unit: str | None = None
@@ -336,23 +336,26 @@ class OtherReading:
         return (center[[1, 0, 2]] if self.swapped else center), R
 
 
-DECLARED = OtherReading()
+DECLARED = AlternativeConvention()
 
 
-def readings(order: str, unit: str = "deg") -> list[OtherReading]:
+def readings(order: str, unit: str = "deg") -> list[AlternativeConvention]:
     """All readings with one change, then those with two; `order` and `unit` are those of the project."""
     others = [o for o in ROTATION_ORDERS if o != order]
-    units = [partial(OtherReading, unit=true, declared=stated) for true, stated in _UNITS[unit]]
+    units = [partial(AlternativeConvention, unit=true, declared=stated) for true, stated in _UNITS[unit]]
     one = [made() for made in units]
-    one += [OtherReading(transposed=True), OtherReading(camera_flipped=True)]
-    one += [OtherReading(ground_flipped=True), OtherReading(swapped=True)]
-    one += [OtherReading(order=o) for o in others]
+    one += [AlternativeConvention(transposed=True), AlternativeConvention(camera_flipped=True)]
+    one += [AlternativeConvention(ground_flipped=True), AlternativeConvention(swapped=True)]
+    one += [AlternativeConvention(order=o) for o in others]
     two = [made(order=o) for made in units for o in others]
     two += [made(transposed=True) for made in units]
     two += [made(camera_flipped=True) for made in units] + [made(ground_flipped=True) for made in units]
-    two += [OtherReading(order=o, transposed=True) for o in others]
-    two += [OtherReading(order=o, camera_flipped=True) for o in others]
-    two += [OtherReading(transposed=True, camera_flipped=True), OtherReading(transposed=True, ground_flipped=True)]
+    two += [AlternativeConvention(order=o, transposed=True) for o in others]
+    two += [AlternativeConvention(order=o, camera_flipped=True) for o in others]
+    two += [
+        AlternativeConvention(transposed=True, camera_flipped=True),
+        AlternativeConvention(transposed=True, ground_flipped=True),
+    ]
     return one + two
 
 
@@ -526,7 +529,7 @@ def _level_near(center: Floats, d: Floats, heights: Heights) -> float:
     return float(np.median(found[good])) if good.any() else np.nan
 
 
-def other_reading(views: Sequence[JudgedView], images: Sequence[ImagePlausibility], heights: Heights) -> str | None:
+def better_convention(views: Sequence[JudgedView], images: Sequence[ImagePlausibility], heights: Heights) -> str | None:
     """Sentence on the reading that fits where the declared one does not."""
     views, images = list(views), tuple(images)
     chosen = _sample(views, images)
@@ -535,7 +538,7 @@ def other_reading(views: Sequence[JudgedView], images: Sequence[ImagePlausibilit
     if not evidence.doubtful:
         return None
     beside = sum(not image.middle_on_terrain for image in declared)
-    ranked: list[tuple[tuple[float, ...], OtherReading, list[ImagePlausibility]]] = []
+    ranked: list[tuple[tuple[float, ...], AlternativeConvention, list[ImagePlausibility]]] = []
     for reading in readings(sample[0].order, sample[0].unit):
         # What one change explains needs no second, except where only the second makes the images upright.
         if ranked and reading.changes > ranked[0][1].changes and (ranked[0][0][0] < 0 or len(sample) < ENOUGH):
@@ -560,7 +563,7 @@ def other_reading(views: Sequence[JudgedView], images: Sequence[ImagePlausibilit
 
 
 def _seen(
-    views: list[JudgedView], reading: OtherReading, heights: Heights, most: int
+    views: list[JudgedView], reading: AlternativeConvention, heights: Heights, most: int
 ) -> list[ImagePlausibility] | None:
     """Return what images show by a reading; None as soon as `_Evidence.better_than` is out of reach.
 
@@ -595,7 +598,7 @@ class _Evidence:
     """Share of level photographs, whose axes need not follow flight lines."""
 
     @classmethod
-    def of(cls, views: list[JudgedView], images: list[ImagePlausibility], reading: OtherReading) -> _Evidence:
+    def of(cls, views: list[JudgedView], images: list[ImagePlausibility], reading: AlternativeConvention) -> _Evidence:
         tilts = [i.tilt for i in images]
         alike, offset = _alignment(views, reading)
         return cls(
@@ -624,7 +627,7 @@ class _Evidence:
     def doubtful(self) -> bool:
         return bool(self.faults) or self.middles < 0.8 or self.tilted or self.astray
 
-    def better_than(self, declared: _Evidence, reading: OtherReading) -> bool:
+    def better_than(self, declared: _Evidence, reading: AlternativeConvention) -> bool:
         """Return whether this reading removes what is wrong with the declared one; what only looks different is not
         better."""
         if self.faults or self.middles < declared.middles:
@@ -644,7 +647,7 @@ class _Evidence:
         return usual and self.alike > 0.9 and abs(self.offset) < 8
 
 
-def _possible(reading: OtherReading, largest: float) -> bool:
+def _possible(reading: AlternativeConvention, largest: float) -> bool:
     """Return whether the largest declared angle, in parts of a full circle, can be what the reading takes it for."""
     if reading.unit == "rad":
         return largest * ANGLE_UNITS[reading.declared] < ANGLE_UNITS["rad"]
@@ -662,7 +665,7 @@ def _sample(views: list[JudgedView], images: tuple[ImagePlausibility, ...]) -> l
     return list(dict.fromkeys(faulty[: SAMPLE_PLAUSIBILITY // 2] + spread))[:SAMPLE_PLAUSIBILITY]
 
 
-def _alignment(views: list[JudgedView], reading: OtherReading) -> tuple[float, float]:
+def _alignment(views: list[JudgedView], reading: AlternativeConvention) -> tuple[float, float]:
     """Return how image axes lie to the flight lines: their agreement in all images (0 to 1), and the mean difference
     (degrees).
 
@@ -740,7 +743,7 @@ class Evidence:
     """Height of the terrain below the station, metres; NaN: not known."""
 
 
-def impossible(found: Evidence) -> str | None:
+def rejection_reason(found: Evidence) -> str | None:
     """Why an orientation cannot be right, as a clause; None if it can."""
     below = _height_of_ground(found) - found.center[2]
     away = float(np.linalg.norm(found.ground - found.center, axis=1).mean()) if len(found.ground) else np.nan
@@ -787,7 +790,7 @@ def fitting_convention(
             continue
         few = tried.rejected.sum() <= 0.2 * len(points) and tried.redundancy > 0
         close = tried.sigma0 < _FITS or tried.rms < _FIFTH * rms
-        if few and close and impossible(of_resection(other, tried)) is None:
+        if few and close and rejection_reason(of_resection(other, tried)) is None:
             used = int((~tried.rejected).sum())
             fits.append(f"with {what}, {used} of {len(points)} points fit to {tried.rms:.2f} px")
     return "; ".join(fits) or (

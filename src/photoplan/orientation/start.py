@@ -319,7 +319,7 @@ class StartModel:
     """(p, 3); NaN: not known."""
 
 
-def free_model(net: Net, images: Iterable[int]) -> StartModel | None:
+def free_model(net: ImageGraph, images: Iterable[int]) -> StartModel | None:
     """A model of its own of as many of `images` as hang together; None where no pair does."""
     wanted = sorted(images)
     pair = _best_pair(net, wanted)
@@ -331,7 +331,7 @@ def free_model(net: Net, images: Iterable[int]) -> StartModel | None:
     return model
 
 
-def _best_pair(net: Net, images: list[int]) -> tuple[int, int, RelativeOrientation] | None:
+def _best_pair(net: ImageGraph, images: list[int]) -> tuple[int, int, RelativeOrientation] | None:
     """The pair with the most common points that meet under a good angle."""
     shown = {k: set(net.point[net.of_image[k]].tolist()) for k in images}
     pairs = [
@@ -353,14 +353,14 @@ def _best_pair(net: Net, images: list[int]) -> tuple[int, int, RelativeOrientati
     return None if best is None else best[1:]
 
 
-def _related(net: Net, a: int, b: int) -> RelativeOrientation:
+def _related(net: ImageGraph, a: int, b: int) -> RelativeOrientation:
     one, two = net.of_image[a], net.of_image[b]
     _, i, j = np.intersect1d(net.point[one], net.point[two], return_indices=True)
     one, two = one[i], two[j]
     return relate(net.tangents[one], net.tangents[two], float(np.median(net.sigma[one])))
 
 
-def grown(net: Net, model: StartModel, images: Iterable[int], loose: float, fixed: bool = True) -> list[int]:
+def grown(net: ImageGraph, model: StartModel, images: Iterable[int], loose: float, fixed: bool = True) -> list[int]:
     """Add images until none has enough known points; the numbers of those that were added."""
     waiting = [k for k in images if k not in model.poses]
     added: list[int] = []
@@ -391,7 +391,7 @@ def grown(net: Net, model: StartModel, images: Iterable[int], loose: float, fixe
                 model.poses[k] = _polished(net, model, k, loose)
 
 
-def looseness(net: Net, model: StartModel) -> float:
+def network_strain(net: ImageGraph, model: StartModel) -> float:
     """By how much the poses that the model has miss the measurements' standard deviation; at least 1."""
     numbers = sorted(model.poses)
     place = np.full(net.images, -1)
@@ -412,7 +412,7 @@ def looseness(net: Net, model: StartModel) -> float:
     return float(np.clip(2.0 * np.median(miss) / _SLACK, 1.0, 200.0)) if len(miss) else 1.0
 
 
-def _intersected(net: Net, model: StartModel, loose: float, fixed: bool) -> None:
+def _intersected(net: ImageGraph, model: StartModel, loose: float, fixed: bool) -> None:
     """Points of all oriented images, anew."""
     numbers = sorted(model.poses)
     place = np.full(net.images, -1)
@@ -432,13 +432,13 @@ def _intersected(net: Net, model: StartModel, loose: float, fixed: bool) -> None
     model.XYZ[free] = found.XYZ[free]
 
 
-def _known(net: Net, model: StartModel, k: int) -> tuple[Floats, Floats, float]:
+def _known(net: ImageGraph, model: StartModel, k: int) -> tuple[Floats, Floats, float]:
     mine = net.of_image[k]
     mine = mine[np.isfinite(model.XYZ[net.point[mine], 0])]
     return net.tangents[mine], model.XYZ[net.point[mine]], float(np.median(net.sigma[mine]))
 
 
-def _resected(net: Net, model: StartModel, k: int, loose: float) -> Pose | None:
+def _resected(net: ImageGraph, model: StartModel, k: int, loose: float) -> Pose | None:
     """Pose of an image; None where too few of its known points agree."""
     t, X, sigma = _known(net, model, k)
     try:
@@ -449,7 +449,7 @@ def _resected(net: Net, model: StartModel, k: int, loose: float) -> Pose | None:
     return found.pose if good else None
 
 
-def _polished(net: Net, model: StartModel, k: int, loose: float) -> Pose:
+def _polished(net: ImageGraph, model: StartModel, k: int, loose: float) -> Pose:
     t, X, sigma = _known(net, model, k)
     pose = model.poses[k]
     r = np.linalg.norm(reprojected(pose.R_ground_camera[None], pose.center[None], X)[0] - t, axis=1)
@@ -467,7 +467,7 @@ class _NetImage(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Net:
+class ImageGraph:
     """Measurements in tangent coordinates."""
 
     images: int
@@ -488,13 +488,13 @@ class Net:
     """Measurements of each image."""
 
 
-def net_of(
+def image_graph(
     cameras: Mapping[str, BlockCamera],
     images: Sequence[_NetImage],
     observations: ImagePoints,
     ground: GroundPoints,
     sigma: float,
-) -> Net:
+) -> ImageGraph:
     """Measurements of the block's images; those for which a lens has no ray are dropped."""
     number = {image.name: k for k, image in enumerate(images)}
     of_block = np.array([number.get(name, -1) for name in observations.images], np.int64)
@@ -520,7 +520,7 @@ def net_of(
     order = np.argsort(image, kind="stable")
     ends = np.searchsorted(image[order], np.arange(len(images) + 1))
     of_image = tuple(order[a:b] for a, b in pairwise(ends))
-    return Net(
+    return ImageGraph(
         images=len(images),
         points=observations.points,
         image=image,
@@ -673,14 +673,14 @@ def start_block(
     sigma : float
         Standard deviation of measurements that state none, pixels.
     """
-    net = net_of(cameras, images, observations, ground, sigma)
+    net = image_graph(cameras, images, observations, ground, sigma)
     block = StartModel({}, net.control.copy())
     how: dict[int, str] = {}
     for k, image in enumerate(images):
         if image.pose is not None:
             block.poses[k] = image.pose
             how[k] = "given"
-    loose = looseness(net, block)
+    loose = network_strain(net, block)
     _resect_by_control(net, block, how)
     _grow(net, block, how, loose)
     reasons: dict[int, str] = {}
@@ -704,7 +704,7 @@ def start_block(
     return _result(net, images, block, how, reasons)
 
 
-def _resect_by_control(net: Net, block: StartModel, how: dict[int, str]) -> None:
+def _resect_by_control(net: ImageGraph, block: StartModel, how: dict[int, str]) -> None:
     known = np.isfinite(net.control[:, 0])
     for k in range(net.images):
         mine = net.of_image[k]
@@ -720,13 +720,17 @@ def _resect_by_control(net: Net, block: StartModel, how: dict[int, str]) -> None
             how[k] = "control points"
 
 
-def _grow(net: Net, block: StartModel, how: dict[int, str], loose: float) -> None:
+def _grow(net: ImageGraph, block: StartModel, how: dict[int, str], loose: float) -> None:
     new = grown(net, block, range(net.images), loose)
     how |= dict.fromkeys(new, "tie points")
 
 
 def _placed(
-    net: Net, model: StartModel, block: StartModel, images: Sequence[StartImage], positions: ObservedPositions | None
+    net: ImageGraph,
+    model: StartModel,
+    block: StartModel,
+    images: Sequence[StartImage],
+    positions: ObservedPositions | None,
 ) -> Similarity:
     """Transformation of a free model into the ground system."""
     of_model = np.isfinite(model.XYZ[:, 0])
@@ -752,7 +756,7 @@ def _placed(
 
 
 def _result(
-    net: Net, images: Sequence[StartImage], block: StartModel, how: dict[int, str], reasons: dict[int, str]
+    net: ImageGraph, images: Sequence[StartImage], block: StartModel, how: dict[int, str], reasons: dict[int, str]
 ) -> Started:
     left = []
     for k, image in enumerate(images):

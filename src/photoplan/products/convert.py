@@ -44,11 +44,11 @@ from photoplan.io.product import check_output
 from photoplan.io.project.model import Image, interior_of, lens_of
 from photoplan.io.store import recording
 from photoplan.orientation.conventions import (
-    FittedReading,
-    Reading,
+    Convention,
+    FittedConvention,
     StatedPoses,
     fitting,
-    judge_readings,
+    judge_conventions,
     sights_of,
     turn_matrix,
 )
@@ -289,16 +289,16 @@ class ReadingsReport(Result):
     images: int
     matrices: bool
     """True if the file states matrices, so that units and orders have no meaning."""
-    fitting: tuple[FittedReading, ...]
-    others: tuple[FittedReading, ...]
+    fitting: tuple[FittedConvention, ...]
+    others: tuple[FittedConvention, ...]
     """The next ones, for comparison."""
     notes: tuple[str, ...]
 
-    def options(self, reading: Reading) -> str:
+    def options(self, reading: Convention) -> str:
         """Return the options by which `photoplan convert` reads the file so."""
         words = [] if self.matrices else [f"`angle_unit` {reading.angle_unit}", f"`rotation` {reading.rotation}"]
         words.append(f"`rotation_direction` {reading.direction}")
-        if reading.camera_axes != Reading.camera_axes:
+        if reading.camera_axes != Convention.camera_axes:
             words.append(f"`camera_axes` {reading.camera_axes}")
         if reading.turned:
             words.append(f"`image_turned` {reading.turned}")
@@ -327,7 +327,7 @@ class ReadingsReport(Result):
         """Return how many points were compared, and notes."""
         return [f"  medians of {self.points} points in {self.images} images", *noted(self.notes)]
 
-    def _fields(self, found: FittedReading) -> dict[str, Any]:
+    def _fields(self, found: FittedConvention) -> dict[str, Any]:
         reading = found.reading
         stated = {} if self.matrices else pick(reading, "angle_unit", "rotation")
         axes = pick(
@@ -359,7 +359,7 @@ def list_readings(request: ConvertRequest, image_points: Path, control: Path) ->
         poses = StatedPoses(names, table.centers, angles=np.array([i.angles for i in table.images], float)[:, at])
     else:
         poses = StatedPoses(names, table.centers, matrices=table.rotations)
-    results = judge_readings(poses, sights)
+    results = judge_conventions(poses, sights)
     fits = fitting(results)
     if fits[0].median > POOR:
         notes.append(

@@ -17,7 +17,7 @@ from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.camera.line import describe_line, is_line, read_line_correction
 from photoplan.io.camera.satellite import is_frame, is_rpc, read_frame, read_rpc, rpc_beside, rpc_in
-from photoplan.io.files import looks_like, raster_driver, read_json, read_toml
+from photoplan.io.files import format_hint, raster_driver, read_json, read_toml
 from photoplan.io.formats import choose_format, read_cameras, read_orientation_block
 from photoplan.io.objects import read_objects
 from photoplan.io.orientation.block import TableFormat
@@ -150,7 +150,7 @@ def describe(path: Path) -> dict[str, Any]:
         if found is None and kind == ".json":
             raise InputError(
                 f"{path}: JSON of no kind that is known: neither a run record of photoplan nor orientations, cameras, "
-                f"objects or vectors{looks_like(path)}"
+                f"objects or vectors{format_hint(path)}"
             ) from None
         if found is None and kind == ".xml":
             return {"file": str(path), **read_rpc(path).describe()}

@@ -40,7 +40,7 @@ from photoplan.io.raster_info import parse_pitch, read_pitch
 from photoplan.io.store import recording
 from photoplan.orientation.bundle.adjust import angle_derivatives
 from photoplan.orientation.bundle.model import AdjustedCamera
-from photoplan.orientation.conventions import fitting_convention, impossible, of_resection
+from photoplan.orientation.conventions import fitting_convention, of_resection, rejection_reason
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
 from photoplan.orientation.marks.locate import FiducialResult, MarkLayout, MarksNotFound, SoughtMark
 from photoplan.orientation.resection import MeasuredPoints, Resected, ResectSettings, resect
@@ -802,7 +802,7 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
         working = replace(given, XYZ=XYZ)
     found = resected(project, image, working, interior, lens, settings)
     terrain = float(nadir_heights(project, found.pose.center[None, :2], np.nan)[0])
-    wrong = impossible(of_resection(working, found, terrain))
+    wrong = rejection_reason(of_resection(working, found, terrain))
     if wrong is not None:
         fits = fitting_convention(
             working,

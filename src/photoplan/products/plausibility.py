@@ -18,7 +18,7 @@ from photoplan.geometry.grid import Window
 from photoplan.io.image_metadata import IMAGE_SUFFIXES, read_image_metadata
 from photoplan.io.orientation.block import OrientationTable
 from photoplan.io.project.model import Image, ImageEntry, Project
-from photoplan.orientation.conventions import ImagePlausibility, JudgedView, look, other_reading
+from photoplan.orientation.conventions import ImagePlausibility, JudgedView, better_convention, look
 from photoplan.plan.footprint import footprint, mean_gsd
 from photoplan.project.cameras import camera_without_pixels, is_there, pose_of, view_of
 from photoplan.project.ground import Ground
@@ -114,7 +114,7 @@ def _without_pose(project: Project, name: str, ground: Ground) -> ImagePlausibil
 def reading_of_block(
     project: Project, seen: Mapping[str, tuple[JudgedView | None, ImagePlausibility]], ground: Ground
 ) -> str | None:
-    """The reading of the orientation that would fit better than the declared one, see `other_reading`.
+    """The reading of the orientation that would fit better than the declared one, see `better_convention`.
 
     Few images say little of tilts and flight lines: the other images of the block beside them are looked at, too.
     """
@@ -131,7 +131,7 @@ def reading_of_block(
             )
             looked[image.name] = view, look(view, ground.bare.heights, _object_triangles(ground))
     views, looks = [view for view, _ in looked.values()], [found for _, found in looked.values()]
-    return other_reading(views, looks, ground.bare.heights)
+    return better_convention(views, looks, ground.bare.heights)
 
 
 def geodetic_positions(files: Iterable[Path | None]) -> _Floats:

@@ -22,7 +22,7 @@ _HEAP = 4
 _FEW = 0.002
 
 
-def piled_ends(values: NDArray[Any]) -> tuple[float, float]:
+def clipped_levels(values: NDArray[Any]) -> tuple[float, float]:
     """Smallest and largest value where many pixels have exactly that value, and the other end shows noise.
 
     A sensor that is full, an amplifier or a developing program that cuts off, leaves such piles. A picture without

@@ -61,7 +61,7 @@ from photoplan.geometry.pose import (
 )
 from photoplan.io.camera.model import Entry, Name, Number, Pixels, Positive, Triple
 from photoplan.io.camera.satellite import FORM, FRAME_MODEL, LENSES, Isd, lens_of, not_known
-from photoplan.io.files import looks_like, read_entries, read_head, read_json, read_text, read_xml
+from photoplan.io.files import format_hint, read_entries, read_head, read_json, read_text, read_xml
 
 #: Nothing that holds a trajectory and what belongs to an image is larger.
 MAX_BYTES = 200_000_000
@@ -667,7 +667,7 @@ def read_line(path: Path, detectors: str | None = None) -> StatedLine:
         return _read_strip(path, detectors)
     if kind not in LINE_FORMATS:
         known = ", ".join([*LINE_FORMATS, ".toml"])
-        raise InputError(f"{path}: not a file of a line camera ({known}){looks_like(path)}")
+        raise InputError(f"{path}: not a file of a line camera ({known}){format_hint(path)}")
     if detectors is not None:
         raise InputError(f"{path}: holds a single line of detectors; take `detectors = {detectors!r}` out")
     return LINE_FORMATS[kind](path)

@@ -47,7 +47,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.local import BodyGround
 from photoplan.geometry.pose import FLIP, Pose, between, conjugate, cubic, odd_step, quaternions, rotations, times
 from photoplan.io.disk import gdal_settings, not_georeferenced
-from photoplan.io.files import looks_like, read_head, read_json, read_text, read_xml
+from photoplan.io.files import format_hint, read_head, read_json, read_text, read_xml
 from photoplan.io.raster_info import read_info
 
 #: Nothing that holds 90 numbers and what belongs to an image is larger.
@@ -246,7 +246,7 @@ def read_rpc(path: Path) -> StatedRpc:
     if found is None:
         raise InputError(
             f"{path}: the image holds no rational polynomials (RPC); give the file that does ({', '.join(_SUFFIXES)})"
-            f"{looks_like(path)}"
+            f"{format_hint(path)}"
         )
     return found
 

@@ -47,7 +47,7 @@ from photoplan.geometry.local import enu_of_geodetic, geodetic_of_enu, topocentr
 from photoplan.geometry.pose import FLIP
 from photoplan.io.camera.model import CameraEntry, InPixels, UnusableCamera, frame_in_pixels
 from photoplan.io.camera.opencv import opencv_form, opencv_losses
-from photoplan.io.files import elements, finite, looks_like, members, read_json
+from photoplan.io.files import elements, finite, format_hint, members, read_json
 from photoplan.io.orientation.block import (
     Loss,
     OrientationBlock,
@@ -91,7 +91,7 @@ def cameras_of(
         isinstance(r, dict) and isinstance(r.get("cameras"), dict) for r in reconstructions
     ):
         raise InputError(
-            f"{path}: neither a reconstruction.json of OpenSfM nor a cameras.json of OpenDroneMap{looks_like(path)}"
+            f"{path}: neither a reconstruction.json of OpenSfM nor a cameras.json of OpenDroneMap{format_hint(path)}"
         )
     cameras: dict[str, CameraEntry] = {}
     for reconstruction in reconstructions:
@@ -424,7 +424,7 @@ def _reconstructions(path: Path) -> list[dict[str, Any]]:
         isinstance(each, dict) and isinstance(each.get("shots"), dict) for each in contents
     ):
         raise InputError(
-            f"{path}: not a reconstruction.json of OpenSfM (a list of reconstructions with `shots`){looks_like(path)}"
+            f"{path}: not a reconstruction.json of OpenSfM (a list of reconstructions with `shots`){format_hint(path)}"
         )
     return contents
 

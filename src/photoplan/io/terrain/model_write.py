@@ -35,7 +35,7 @@ from photoplan.geometry.grid import Window
 from photoplan.geometry.heights import height_label
 from photoplan.io.disk import FIXED_DATE, GDAL_ERRORS, FileLock, disk_error, gdal_settings, lock_of
 from photoplan.io.product import check_output
-from photoplan.io.store import Unfinished, give_name, scratch, standing, when_named
+from photoplan.io.store import StagedOutput, give_name, scratch, standing, when_named
 from photoplan.io.tables import csv_line
 from photoplan.io.terrain.model import (
     FORMAT,
@@ -304,7 +304,7 @@ class ModelWriter:
         if self.path.suffix.lower() != ".gpkg":
             raise UsageError(f"{self.path}: a terrain model is a GeoPackage; give it a name that ends with .gpkg")
         check_layout(self.layout, str(self.path))
-        self._file = Unfinished(
+        self._file = StagedOutput(
             path=self.path,
             log_path=self.path.with_name(f".{self.path.name}.units"),
             what="units",

@@ -35,10 +35,10 @@ from photoplan.orientation.bundle.model import (
 from photoplan.orientation.bundle.result import (
     Solution,
     Weighted,
+    correlation_evidence,
     correlation_of,
     effects_of_rows,
     evened_sigmas,
-    likeness_of,
     refitted_sigmas,
     result_of,
     solution_of,
@@ -48,12 +48,12 @@ from photoplan.orientation.bundle.robust import (
     Loop,
     Progress,
     Selection,
+    data_snooping,
     first_taken_out,
     judged_control,
     kinds_of_measurements,
     scales_of,
     select,
-    snooped,
     start_points,
     weights_of,
 )
@@ -308,7 +308,7 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
         if not settings.robust or turn == _ROUNDS - 1:
             break
         judged = solution.judged()
-        next_active = snooped(model, state, judged, active, settings.critical)
+        next_active = data_snooping(model, state, judged, active, settings.critical)
         next_active, alternative = judged_control(model, state, next_active, judged.scales, settings.critical)
         as_weighted = block.observations is model.block.observations
         if next_active.equals(active) and (as_weighted or turn >= _REFITTED):
@@ -464,7 +464,7 @@ def doubtful(result: Adjusted) -> bool:
     return bool(rejected or any(ratio > _RATIO for ratio in ratios))
 
 
-def weighed_causes(block: Block, result: Adjusted) -> tuple[Cause, ...]:
+def misfit_hypotheses(block: Block, result: Adjusted) -> tuple[Cause, ...]:
     """Causes that explain a good part of what does not fit, the likeliest first; empty where all is as stated.
 
     Each is an adjustment of the block with other unknowns, all control and positions included. It is named where
@@ -511,7 +511,7 @@ def _of_errors(block: Block, base: Adjusted, result: Adjusted) -> tuple[Cause, .
     Control that does not agree with the rest is wrong by itself, and has no part in this.
     """
     XYZ = np.where(result.ground_rejected, np.nan, block.ground.XYZ)
-    likeness = likeness_of(replace(block, ground=replace(block.ground, XYZ=XYZ)), base)
+    likeness = correlation_evidence(replace(block, ground=replace(block.ground, XYZ=XYZ)), base)
     if likeness is None:
         return ()
     found = []

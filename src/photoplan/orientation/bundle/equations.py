@@ -694,7 +694,7 @@ INSIDE = 1e-3
 _STRETCH = 100.0
 
 
-def loose_points(model: Model, state: State, rows: Rows) -> frozenset[str]:
+def points_at_infinity(model: Model, state: State, rows: Rows) -> frozenset[str]:
     """Points whose distance their rays do not tell, by name; control that holds a point counts as well.
 
     Rays are parallel within their accuracy; or they have brought the point into a projection centre.
@@ -710,7 +710,7 @@ def loose_points(model: Model, state: State, rows: Rows) -> frozenset[str]:
     return frozenset(model.point_names[k] for k in np.flatnonzero(far))
 
 
-def along_rays(model: Model, state: State, step: Floats) -> Floats:
+def inverse_depth_step(model: Model, state: State, step: Floats) -> Floats:
     """Steps of points (m, 3) as steps of direction and inverse distance, in which image points are nearly linear.
 
     Small steps stay what they are. A point that has to go far away gets there in a few steps instead of by doubling its

@@ -153,7 +153,7 @@ _RANK = 1e-10
 
 
 @dataclass(frozen=True)
-class Likeness:
+class CorrelationEvidence:
     """What makes the misfits of a block likely, image errors of free size at any rate."""
 
     reach: float
@@ -172,7 +172,7 @@ class Likeness:
     """Whether errors are alike, whatever the accuracies of the others are."""
 
 
-def likeness_of(block: Block, base: Adjusted) -> Likeness | None:
+def correlation_evidence(block: Block, base: Adjusted) -> CorrelationEvidence | None:
     """Weigh image errors that are alike, with covariance exp(−(d/L)²) over distances d, against other accuracies."""
     model, K, w = _contrasts(_part(block, base), base)
     if len(w) < _FEW:
@@ -208,7 +208,7 @@ def likeness_of(block: Block, base: Adjusted) -> Likeness | None:
     if not (alike or worse):
         return None
     own = float(np.average(likeness.variances[:-1], weights=[np.trace(part) for part in image]))
-    return Likeness(
+    return CorrelationEvidence(
         reach=length,
         share=float(likeness.variances[-1]) / (own + float(likeness.variances[-1])),
         by_likeness=min(1.0, (plain.deviance - likeness.deviance) / whole),

@@ -17,9 +17,9 @@ from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.equations import (
     PARALLEL,
     Rows,
-    along_rays,
+    inverse_depth_step,
     linearise,
-    loose_points,
+    points_at_infinity,
     reduce_normals,
     residuals_of,
     residuals_of_all,
@@ -530,7 +530,7 @@ def weights_of(model: Model, active: Active, factors: Floats | None = None) -> F
     return weight
 
 
-def softened(model: Model, state: State) -> Floats:
+def downweighted_control(model: Model, state: State) -> Floats:
     """Weights that make control no better than what image points say of the ground, while gross errors are sought.
 
     A wrong control point of high weight would otherwise draw its image points along, and these would look wrong.
@@ -616,7 +616,7 @@ def _sizes_robust(model: Model, e: Floats) -> Floats:
 
 def first_taken_out(model: Model, state: State, active: Active, critical: float) -> Active:
     """Take out what does not fit the robust estimate at `state`."""
-    e = whitened(model, residuals_of(model, state)) * np.sqrt(softened(model, state))
+    e = whitened(model, residuals_of(model, state)) * np.sqrt(downweighted_control(model, state))
     size, of = np.abs(e), kinds_of(model)[1]
     size[: len(of)] /= scales_of(model, e)[of]
     size[~np.isfinite(size)] = np.inf
@@ -660,7 +660,7 @@ def _without(model: Model, active: Active, bad: Mask) -> Active:
     return Active(image, active.ground, position)
 
 
-def snooped(model: Model, state: State, judged: Judged, active: Active, critical: float) -> Active:
+def data_snooping(model: Model, state: State, judged: Judged, active: Active, critical: float) -> Active:
     """Data snooping: the worst measurement of each point is taken out, and what fits again comes back.
 
     Only the largest normalised residual of a point is judged at a time, since a gross error spreads over the
@@ -739,12 +739,14 @@ class Loop:
         e = whitened(model, residuals_of(model, state))
         behind = np.flatnonzero(~np.isfinite(e[model.parts.image][::2]) & (base[model.parts.image][::2] > 0))
         rows, _ = linearise(model, state, np.sqrt(np.where(np.isfinite(e), base, 0.0)))
-        return state, frozenset(model.point_names[k] for k in model.point[behind]) | loose_points(model, state, rows)
+        return state, frozenset(model.point_names[k] for k in model.point[behind]) | points_at_infinity(
+            model, state, rows
+        )
 
     def run(self, model: Model, state: State, base: Floats, robust: bool = False, watch: _Watch | None = None) -> State:
         """The state where the sum of squares with weights `base` (rows,) is least."""
         if robust:
-            base = base * softened(model, state)
+            base = base * downweighted_control(model, state)
         descent, cost, gains = _Descent(model, state), np.inf, [np.inf] * _FLAT_STEPS
         for turn in range(self._most):
             e = whitened(model, residuals_of(model, state))
@@ -795,7 +797,7 @@ class _Watch:
         if not (self._due and calm):
             return False
         self._due = False
-        self.loose = loose_points(model, state, rows)
+        self.loose = points_at_infinity(model, state, rows)
         return bool(self.loose)
 
 
@@ -852,7 +854,7 @@ class _Descent:
         while True:
             reduced = reduce_normals(rows, len(model.point_names), self._damping)
             moves, points = reduced.solved(model, state)
-            moved = state.moved(model.columns, moves, along_rays(model, state, points))
+            moved = state.moved(model.columns, moves, inverse_depth_step(model, state, points))
             after = _cost(whitened(model, residuals_of(model, moved)), weight)
             if _is_no_more(after, before, redundancy):
                 break

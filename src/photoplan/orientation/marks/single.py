@@ -332,7 +332,7 @@ _SURE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class AloneMark:
+class SingleMark:
     """Where a mark is, and whether to believe it."""
 
     x: float
@@ -367,7 +367,7 @@ def find_mark(
     blur_px: float = 0.7,
     rotations: tuple[float, ...] = (-1.5, 0.0, 1.5),
     least_correlation: float = LEAST_ALONE,
-) -> AloneMark:
+) -> SingleMark:
     """A mark in a window.
 
     The window is searched with coarse pixels and a few rotations, the best place with fine ones. Where image content
@@ -421,9 +421,9 @@ def find_mark(
     return judged
 
 
-def _nothing(why: str) -> AloneMark:
+def _nothing(why: str) -> SingleMark:
     nan = math.nan
-    return AloneMark(
+    return SingleMark(
         x=nan, y=nan, sigma_x=nan, sigma_y=nan, correlation=nan, second=nan, method="pixel", refused=why, edges=None
     )
 
@@ -465,7 +465,7 @@ def _judged(
     edges: MarkEdge | None,
     second: float,
     least_correlation: float,
-) -> AloneMark:
+) -> SingleMark:
     """Which place stands, and whether it is to be used."""
     by_edges = isinstance(pattern, MarkPattern) and math.isnan(pattern.background)
     x, y, sx, sy, method = *at, fine.sigma_x, fine.sigma_y, fine.method
@@ -486,7 +486,7 @@ def _judged(
         refused = f"edges and correlation differ by {math.hypot(x - at[0], y - at[1]):.1f} px"
     elif not max(sx, sy) <= _SURE:
         refused = f"standard deviation of {max(sx, sy):.1f} px; {_SURE} px are allowed"
-    return AloneMark(
+    return SingleMark(
         x=float(x),
         y=float(y),
         sigma_x=float(sx),

@@ -22,9 +22,9 @@ from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Image, Project, interior_of, lens_of
 from photoplan.io.store import recording, stated_json, write_atomically
 from photoplan.io.vector_layer import write_point_layers, write_residuals
-from photoplan.orientation.bundle.adjust import Cause, adjust_block, weighed_causes
+from photoplan.orientation.bundle.adjust import Cause, adjust_block, misfit_hypotheses
 from photoplan.orientation.bundle.model import Adjusted, AdjustSettings
-from photoplan.orientation.conventions import Evidence, fitting_convention, impossible, misfit
+from photoplan.orientation.conventions import Evidence, fitting_convention, misfit, rejection_reason
 from photoplan.orientation.resection import ResectSettings
 from photoplan.plain import pick
 from photoplan.products.adjust.findings import AdjustReport, block_json, point_layers, summarise
@@ -67,7 +67,7 @@ def refuse_impossible(result: MapResult) -> None:
     wrong = []
     for k, name in enumerate(adjusted.images):
         mine = at[(points.image == points.images.index(name)) & (at >= 0)] if name in points.images else at[:0]
-        fault = impossible(
+        fault = rejection_reason(
             Evidence(
                 center=centers[k],
                 R_ground_camera=result.poses[k].R_ground_camera,
@@ -203,7 +203,7 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     result = map_result(prepared, adjusted)
     refuse_impossible(result)
     title = f"Bundle adjustment of {request.project.resolve().parent.name}"
-    causes = weighed_causes(prepared.block, adjusted)
+    causes = misfit_hypotheses(prepared.block, adjusted)
     refuse_cause(causes)
     report = summarise(title, result, settings, time.perf_counter() - begun)
     report = replace(report, notes=(*cause_notes(causes, result), *report.notes))

@@ -16,7 +16,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.series import SeriesFrame, SeriesGroup, frame_pixels, plane_mask, split
 from photoplan.products.characterise.data import SeriesData
-from photoplan.quality.linearise import piled_ends
+from photoplan.quality.linearise import clipped_levels
 
 #: Share of a window that may be saturated, and samples of it that are looked at for the value where frames are cut off.
 _MOST, _SAMPLE = 0.01, 4096
@@ -115,7 +115,7 @@ def window_means(data: SeriesData, group: FrameGroup, window: Window, advice: st
             last[name] = values
             samples[name].append(values.ravel()[:: max(1, values.size // _SAMPLE)])
     for parts in samples.values():
-        top = piled_ends(np.concatenate(parts))[1]
+        top = clipped_levels(np.concatenate(parts))[1]
         for frame, part in zip(group.frames, parts):
             if float((part >= top).mean()) > _MOST:
                 raise InputError(

@@ -36,7 +36,7 @@ from photoplan.quality.edges.groups import (
     sigma_of_interval,
 )
 from photoplan.quality.edges.response import EdgeMeasurement, EdgeSettings, EdgeSpread, measure_edge, spread_of_edge
-from photoplan.quality.linearise import Linearisation, piled_ends
+from photoplan.quality.linearise import Linearisation, clipped_levels
 from photoplan.requests.quality import MtfRequest
 
 #: Said where nobody states how 8 bits are encoded.
@@ -288,7 +288,7 @@ class LightImage:
         before = self.extremes.get(band, seen)
         self.extremes[band] = min(seen[0], before[0]), max(seen[1], before[1])
         smallest, largest = self.extremes[band]
-        first, last = piled_ends(between)
+        first, last = clipped_levels(between)
         return (max(low, first) if first <= smallest else low), (min(high, last) if last >= largest else high)
 
     def _span(self, channel: int) -> float:

@@ -29,7 +29,7 @@ _KNOWN = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Approach:
+class Settling:
     """y(t) = end + (start − end) · exp(−t / τ), with t counted from the first value."""
 
     mean: float
@@ -91,7 +91,7 @@ def check_times(times: Floats, what: str) -> Floats:
     return t
 
 
-def fit_approach(times: Floats, values: Floats, what: str = "series") -> Approach:
+def fit_settling(times: Floats, values: Floats, what: str = "series") -> Settling:
     """Exponential by least squares, tested against a constant."""
     t, y = _checked(times, values, what)
     t = t - t[0]
@@ -105,11 +105,11 @@ def fit_approach(times: Floats, values: Floats, what: str = "series") -> Approac
     if probability >= LEVEL:
         rms = math.sqrt(rss0 / (n - 1))
         verdict = "no significant change"
-        return Approach(mean=mean, rms=rms, probability=probability, redundancy=n - 1, verdict=verdict)
+        return Settling(mean=mean, rms=rms, probability=probability, redundancy=n - 1, verdict=verdict)
     rms = math.sqrt(rss1 / (n - 3))
     sigmas = _sigmas(t, (start, end, tau), rms)
     verdict = _verdict(t, tau, sigmas[2], (abs(end - start), sigmas[3]))
-    seen = Approach(mean=mean, rms=rms, probability=probability, redundancy=n - 3, verdict=verdict)
+    seen = Settling(mean=mean, rms=rms, probability=probability, redundancy=n - 3, verdict=verdict)
     if verdict.startswith("the series"):  # its end is not seen
         return replace(seen, start=start)
     seen = replace(seen, end=end)
@@ -201,7 +201,7 @@ class Course:
     values: Floats
     """Against the reference, shape (m,)."""
     sigmas: Floats
-    approach: Approach | None
+    approach: Settling | None
     """Exponential course; None: too few epochs."""
     largest: float
     """Largest minus smallest value."""
@@ -429,7 +429,7 @@ def _courses(t: Floats, values: Floats, sigmas: Floats, model: str) -> tuple[Cou
     for k, name in enumerate(names):
         y, s = values[:, k], sigmas[:, k]
         use = np.isfinite(y)
-        approach = fit_approach(t[use], y[use], what=f"warm-up, {name}") if use.sum() >= LEAST_VALUES else None
+        approach = fit_settling(t[use], y[use], what=f"warm-up, {name}") if use.sum() >= LEAST_VALUES else None
         out.append(
             Course(
                 name=name,

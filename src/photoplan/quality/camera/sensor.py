@@ -822,7 +822,7 @@ def bandwidth_hz(points: float, frame_hz: float) -> float:
     return 0.5 * points * frame_hz
 
 
-def lengthened(length: float, blanking: float, period: float) -> float:
+def blanking_corrected(length: float, blanking: float, period: float) -> float:
     """A line or picture lengthened by the part of its time that is blanked (Behr 1989, eq. 3.8 to 3.10)."""
     if not 0.0 <= blanking < period:
         raise InputError(f"a blanking of {blanking:g} in a period of {period:g}; it is shorter than the period")
@@ -854,8 +854,8 @@ class VideoNorm:
     """Of a frame: 2 with interlace."""
 
     def __post_init__(self) -> None:
-        lengthened(1.0, self.line_blanking_s, self.line_s)
-        lengthened(1.0, self.frame_blanking_s, self.frame_s)
+        blanking_corrected(1.0, self.line_blanking_s, self.line_s)
+        blanking_corrected(1.0, self.frame_blanking_s, self.frame_s)
         if not 0.0 < self.kell_factor <= 1.0:
             raise InputError(f"a Kell factor of {self.kell_factor:g}; it lies between 0 and 1")
 
@@ -882,12 +882,12 @@ class VideoNorm:
     @property
     def columns_factor(self) -> float:
         """By which blanking lengthens a line (Behr 1989, eq. 3.9)."""
-        return lengthened(1.0, self.line_blanking_s, self.line_s)
+        return blanking_corrected(1.0, self.line_blanking_s, self.line_s)
 
     @property
     def lines_factor(self) -> float:
         """By which blanking adds to the lines (Behr 1989, eq. 3.10)."""
-        return lengthened(1.0, self.frame_blanking_s, self.frame_s)
+        return blanking_corrected(1.0, self.frame_blanking_s, self.frame_s)
 
     @property
     def plain_hz(self) -> float:

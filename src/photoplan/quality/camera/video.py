@@ -13,7 +13,7 @@ from photoplan.adjustment.least_squares import levenberg, solve, spread
 from photoplan.adjustment.statistics import chance_f, chance_normal, chance_t
 from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
-from photoplan.quality.camera.drift import LEAST_VALUES, Approach, check_times, fit_approach
+from photoplan.quality.camera.drift import LEAST_VALUES, Settling, check_times, fit_settling
 from photoplan.quality.camera.geometry import LEAST_LINES
 
 #: Frames before the step below which nothing is said about the noise there.
@@ -46,7 +46,7 @@ class GainControl:
     before: float
     """Mean grey value before the step."""
     sigma_before: float | None
-    approach: Approach
+    approach: Settling
     """Grey values after the step: `change` is what the control adds, with sign."""
     noise: NoiseChange
     first: int
@@ -90,7 +90,7 @@ def gain_control(times: Floats, values: Floats, *, step_time: float | None = Non
         raise InputError(
             f"{name}: {len(y) - first} frames after the step; at least {LEAST_VALUES} are needed to follow the control"
         )
-    approach = fit_approach(t[first:], y[first:], what=f"{name} after the step")
+    approach = fit_settling(t[first:], y[first:], what=f"{name} after the step")
     ahead = y[:first]
     before = float(ahead.mean())
     spread = float(ahead.std(ddof=1)) if first >= LEAST_BEFORE else None
@@ -150,7 +150,7 @@ def _first_after(t: Floats, y: Floats, step_time: float | None, name: str) -> in
     return k + 1
 
 
-def _ratio_test(spread: float | None, redundancy: int, approach: Approach) -> float | None:
+def _ratio_test(spread: float | None, redundancy: int, approach: Settling) -> float | None:
     if spread is None or not (spread > 0.0 and approach.rms > 0.0):
         return None
     one = chance_f((spread / approach.rms) ** 2, redundancy, approach.redundancy)
