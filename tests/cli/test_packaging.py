@@ -39,10 +39,10 @@ def test_rasters_are_closed_before_the_interpreter_ends(block: Path) -> None:
         "left = []\n"
         "atexit.register(lambda: print(len(left[0].open)))\n"  # registered first, it runs last
         "from pathlib import Path\n"
-        "from photoplan.io import gdal\n"
-        "left.append(gdal._handles)\n"
-        "gdal.handle(Path(sys.argv[1]), 'JPEG')\n"
-        "print(len(gdal._handles.open))\n"
+        "from photoplan.io import disk\n"
+        "left.append(disk._handles)\n"
+        "disk.handle(Path(sys.argv[1]), 'JPEG')\n"
+        "print(len(disk._handles.open))\n"
     )
     image = sorted((block / "images").iterdir())[0]
     said = subprocess.run([sys.executable, "-c", code, str(image)], capture_output=True, text=True, check=True)
