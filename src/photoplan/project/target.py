@@ -120,7 +120,7 @@ def with_target(
     ----------
     project : Project
     text : str
-        `map`, the name of one of the project's targets, or a frame as `--target` takes it.
+        `map`, the name of one of the project's targets, or a frame as the option `target` takes it.
     bounds : (float, float, float, float), optional
         Lowest u, v and highest u, v, metres; None for those that the target states or has.
     relief : str, optional

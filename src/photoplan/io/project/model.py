@@ -554,7 +554,7 @@ class TargetEntry(Entry):
     """A wall, vault, column or image that products lie on instead of the map."""
 
     frame: Annotated[str, Field(min_length=1, max_length=4000)]
-    """`wall:…`, `vault:…`, `column:…` or `image:…`, as `--target` takes it."""
+    """`wall:…`, `vault:…`, `column:…` or `image:…`, as the option `target` takes it."""
     relief: Number | InputName = 0.0
     """Offset of the surface from the frame along its normal, metres, or a raster of offsets by `photoplan surface`."""
     sigma: NotNegative | InputName | None = None
