@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, Strict, model_validator
+from pydantic import Field, Strict, ValidationError, model_validator
 
 from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import Entry, Name, NotNegative, Number, Pair, Pixels, Positive
 from photoplan.io.disk import gdal_settings, open_raster
-from photoplan.io.files import finite, read_entries, read_head, read_text, read_toml
+from photoplan.io.files import build, explain, finite, read_entries, read_head, read_text, read_toml
 from photoplan.io.product import DESCRIPTION
 from photoplan.io.project.file import toml_key, toml_value
 from photoplan.io.raster import read_pixels
@@ -214,7 +214,7 @@ def _text(value: Any) -> str:
 
 
 #: Entry `kind` of a filter file, by which it is told from a project.
-FILTER_KIND = "restoration filter"
+FILTER_KIND: Literal["restoration filter"] = "restoration filter"
 #: A hundred kernels of 101 × 101 values stay below.
 MOST_BYTES = 64_000_000
 MOST_KERNELS = 1024
@@ -223,8 +223,7 @@ MOST_ROWS = 101
 #: Weights beyond it would overflow in single precision, times grey values and summed.
 MOST_WEIGHT = 1e12
 
-_ENTRIES = {"kind", "format", "description", "image_size", "facts", "kernels"}
-_KERNEL_ENTRIES = {"band", "at", "values"}
+_Weight = Annotated[float, Strict(), Field(ge=-MOST_WEIGHT, le=MOST_WEIGHT, allow_inf_nan=False)]
 _HEADER = """\
 # Restoration filter of photoplan: the restored image is the image convolved with it.
 # values[m + i][n + k] is the weight of the pixel i rows above and k columns left of the restored one; m and n are the
@@ -232,47 +231,53 @@ _HEADER = """\
 """
 
 
-@dataclass(frozen=True, eq=False)
-class KernelEntry:
-    """One kernel of a file; see `photoplan.quality.restoration.restorer.FilterKernel`."""
+class KernelEntry(Entry):
+    """``[[kernels]]``: one kernel; see `photoplan.quality.restoration.restorer.FilterKernel`."""
 
-    values: Floats
-    """Rows and columns of finite numbers."""
-    at: tuple[float, float] | None = None
+    values: Annotated[tuple[tuple[_Weight, ...], ...], Field(max_length=MOST_ROWS)]
+    """Rows and columns, an odd number of both."""
+    at: Pair | None = None
     """Column and row."""
-    band: int | None = None
+    band: _Band | None = None
+
+    @model_validator(mode="after")
+    def _odd(self) -> Self:
+        columns = len(self.values[0]) if self.values else 0
+        uneven = next((i for i, row in enumerate(self.values, 1) if len(row) != columns), None)
+        if uneven is not None or columns > MOST_ROWS:
+            at, count = uneven or 1, len(self.values[(uneven or 1) - 1])
+            raise ValueError(
+                f"row {at} of values has {count} numbers, row 1 {columns}; all need equally many, at most {MOST_ROWS}"
+            )
+        if len(self.values) % 2 == 0 or columns % 2 == 0:
+            raise ValueError(f"values of {len(self.values)} rows and {columns} columns; both must be odd")
+        return self
 
 
-@dataclass(frozen=True, eq=False)
-class FilterEntries:
-    """What a filter file says; see `photoplan.quality.restoration.restorer.RestorationFilter`."""
+class FilterEntries(Entry):
+    """A whole filter file; see `photoplan.quality.restoration.restorer.RestorationFilter`."""
 
-    kernels: tuple[KernelEntry, ...]
-    image_size: tuple[int, int] | None = None
+    kind: Literal["restoration filter"] = FILTER_KIND
+    format: Literal[1] = 1
+    kernels: Annotated[tuple[KernelEntry, ...], Field(max_length=MOST_KERNELS)]
+    image_size: tuple[Pixels, Pixels] | None = None
     description: str = ""
-    facts: Mapping[str, object] = field(default_factory=dict)
+    facts: Mapping[str, Any] = {}
 
 
 def read_filter_file(path: Path) -> FilterEntries:
     """Read a filter: TOML by its ending `.toml`, rows of numbers otherwise."""
     path = Path(path)
     if path.suffix.lower() != ".toml":
-        return FilterEntries((KernelEntry(_matrix(path)),), description=f"matrix of {path.name}")
-    contents, _ = read_toml(path, MOST_BYTES)
+        kernel = build(KernelEntry, {"values": _matrix(path)}, str(path))
+        return FilterEntries(kernels=(kernel,), description=f"matrix of {path.name}")
+    contents, text = read_toml(path, MOST_BYTES)
     if contents.get("kind") != FILTER_KIND:
         raise InputError(f'{path}: no filter; a filter file states kind = "{FILTER_KIND}" and has [[kernels]]')
-    _known(contents, _ENTRIES, str(path))
-    if contents.get("format", 1) != 1:
-        raise InputError(f"{path}: format = {contents['format']!r}; this version reads format 1")
-    entries = contents.get("kernels")
-    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_KERNELS:
-        raise InputError(f"{path}: [[kernels]]: 1 to {MOST_KERNELS} kernels are needed")
-    description, facts = contents.get("description", ""), contents.get("facts", {})
-    if not isinstance(description, str) or not isinstance(facts, dict):
-        raise InputError(f"{path}: description is a text and [facts] a table")
-    size = contents.get("image_size")
-    kernels = tuple(_kernel(entry, f"{path}: [[kernels]] {i}") for i, entry in enumerate(entries, 1))
-    return FilterEntries(kernels, None if size is None else _size(size, path), description, facts)
+    try:
+        return FilterEntries.model_validate(contents)
+    except ValidationError as error:
+        raise InputError(explain(error, contents, str(path), text)) from None
 
 
 def is_filter(path: Path) -> bool:
@@ -293,13 +298,14 @@ def filter_text(filter_: FilterEntries) -> str:
         lines += ["", "# How it was made; no entry here changes the result.", "[facts]"]
         lines += [f"{toml_key(str(key))} = {toml_value(value)}" for key, value in facts.items()]
     for kernel in filter_.kernels:
-        gain = float(np.sqrt((kernel.values**2).sum()))
-        lines += ["", f"# Sum {kernel.values.sum():.6g}; noise grows {gain:.4g} times.", "[[kernels]]"]
+        values = np.array(kernel.values)
+        gain = float(np.sqrt((values**2).sum()))
+        lines += ["", f"# Sum {values.sum():.6g}; noise grows {gain:.4g} times.", "[[kernels]]"]
         if kernel.band is not None:
             lines.append(f"band = {kernel.band}")
         if kernel.at is not None:
             lines.append(f"at = [{float(kernel.at[0])!r}, {float(kernel.at[1])!r}]")
-        lines += ["values = [", *(f"  [{', '.join(map(repr, row))}]," for row in kernel.values.tolist()), "]"]
+        lines += ["values = [", *(f"  [{', '.join(map(repr, row))}]," for row in kernel.values), "]"]
     return "\n".join(lines) + "\n"
 
 
@@ -314,55 +320,7 @@ def plain_fact(value: object) -> Any:
     return value if isinstance(value, str | bool | int | float) else str(value)
 
 
-def _known(table: Mapping[str, Any], allowed: set[str], where: str) -> None:
-    unknown = sorted(set(table) - allowed)
-    if unknown:
-        raise InputError(f"{where}: unknown entry {unknown[0]!r}; allowed are {', '.join(sorted(allowed))}")
-
-
-def _size(value: Any, path: Path) -> tuple[int, int]:
-    sides = isinstance(value, list) and len(value) == 2 and all(type(side) is int and side > 0 for side in value)
-    if not sides:
-        raise InputError(f"{path}: image_size = {value!r}; needed are two whole numbers, [width, height]")
-    return value[0], value[1]
-
-
-def _kernel(entry: Any, where: str) -> KernelEntry:
-    if not isinstance(entry, dict):
-        raise InputError(f"{where}: is no table")
-    _known(entry, _KERNEL_ENTRIES, where)
-    band, at = entry.get("band"), entry.get("at")
-    if band is not None and (type(band) is not int or band < 1):
-        raise InputError(f"{where}: band = {band!r}; bands are counted from 1")
-    if at is not None:
-        at = finite(at, f"{where}: at", 2)
-    rows = entry.get("values")
-    if not isinstance(rows, list) or not rows or len(rows) > MOST_ROWS:
-        raise InputError(f"{where}: values are 1 to {MOST_ROWS} rows of numbers")
-    numbers = []
-    for i, row in enumerate(rows, 1):
-        if not isinstance(row, list) or len(row) != len(rows[0]) or len(row) > MOST_ROWS:
-            count = len(row) if isinstance(row, list) else "no"
-            first = len(rows[0]) if isinstance(rows[0], list) else "no"
-            raise InputError(
-                f"{where}: row {i} of values has {count} numbers, row 1 {first}; all need equally many, at most "
-                f"{MOST_ROWS}"
-            )
-        numbers.append([finite(value, f"{where}: row {i} of values") for value in row])
-    return KernelEntry(_odd(numbers, where), at, band)
-
-
-def _odd(rows: list[list[float]], where: str) -> Floats:
-    """Rows as an array, whose sides must have a middle."""
-    values = np.array(rows, np.float64)
-    if values.ndim != 2 or values.shape[0] % 2 == 0 or values.shape[1] % 2 == 0:
-        raise InputError(f"{where}: values of {len(rows)} rows and {len(rows[0])} columns; both must be odd")
-    if np.abs(values).max() > MOST_WEIGHT:
-        raise InputError(f"{where}: a weight of {np.abs(values).max():.3g}; at most {MOST_WEIGHT:g} are allowed")
-    return values
-
-
-def _matrix(path: Path) -> Floats:
+def _matrix(path: Path) -> list[list[float]]:
     """One kernel of rows of numbers, separated by blanks, tabs, commas or semicolons; `#` begins a comment."""
     rows: list[list[float]] = []
     for number, line in enumerate(read_text(path, MOST_BYTES).split("\n"), 1):
@@ -381,7 +339,7 @@ def _matrix(path: Path) -> Floats:
             raise InputError(f"{where}: a filter has at most {MOST_ROWS} rows and columns")
     if not rows:
         raise InputError(f"{path}: holds no numbers; a filter is a .toml file or rows of numbers")
-    return _odd(rows, str(path))
+    return rows
 
 
 _FREQUENCY = {

@@ -30,7 +30,7 @@ from photoplan.io.store import write_atomically
 from photoplan.io.tables import Columns, read_table
 from photoplan.plain import pick
 from photoplan.quality.camera.fall_off import FallOffModel, correct_fall_off, largest_gain
-from photoplan.quality.linearise import Linearisation
+from photoplan.quality.curves import Linearisation
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter, RestoredPixels, Restorer, light_of
 from photoplan.radiometry.tone import Tone, toned
 
@@ -39,7 +39,7 @@ def load_filter(path: Path) -> RestorationFilter:
     """A filter of a file: TOML, or one kernel as rows of numbers."""
     entries = read_filter_file(path)
     try:
-        kernels = tuple(FilterKernel(k.values, k.at, k.band) for k in entries.kernels)
+        kernels = tuple(FilterKernel(np.array(k.values), k.at, k.band) for k in entries.kernels)
         return RestorationFilter(kernels, entries.image_size, entries.description, entries.facts)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -57,9 +57,10 @@ def save_filter(path: Path, filter_: RestorationFilter, *, overwrite: bool = Fal
 
 def entries_of(filter_: RestorationFilter) -> FilterEntries:
     """A filter as its file says it."""
-    kernels = tuple(KernelEntry(k.values, k.at, k.band) for k in filter_.kernels)
+    kernels = tuple(KernelEntry(values=k.values.tolist(), at=k.at, band=k.band) for k in filter_.kernels)
     facts = {str(name): plain_fact(value) for name, value in filter_.facts.items() if value is not None}
-    return FilterEntries(kernels, filter_.image_size, filter_.description, facts)
+    size, words = filter_.image_size, filter_.description
+    return FilterEntries(kernels=kernels, image_size=size, description=words, facts=facts)
 
 
 #: A table of 65536 lines of four long numbers.
