@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from photoplan.cameras.fiducials import MarkPattern
 from photoplan.cameras.marks import Mark
-from photoplan.orientation.marks.template import render
+from photoplan.orientation.marks.locate import render
 from photoplan.project.camera_marks import mark_pattern
 
 MARKS = {

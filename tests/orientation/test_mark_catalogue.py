@@ -15,9 +15,8 @@ from tools.thinned import some, thinned
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.cameras.marks import Mark, disc, turned
 from photoplan.errors import InputError
-from photoplan.orientation.marks.locate import locate_mark
+from photoplan.orientation.marks.locate import coverage, locate_mark, render
 from photoplan.orientation.marks.single import find_mark, fit_edges, pattern_edges
-from photoplan.orientation.marks.template import coverage, render
 
 SNR = 20.0
 SCALE = 40.0

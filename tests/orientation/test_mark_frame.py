@@ -13,8 +13,7 @@ from tools.mark_scans import ArrayScan
 
 from photoplan.cameras import marks
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
-from photoplan.orientation.marks.locate import MarkLayout
-from photoplan.orientation.marks.template import coverage
+from photoplan.orientation.marks.locate import MarkLayout, coverage
 from photoplan.project.camera_marks import mark_pattern
 
 MARKS = tomllib.loads((Path(__file__).parents[1] / "real" / "usgs_marks" / "marks.toml").read_text())

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from photoplan.cameras.fiducials import MarkExample, MarkPart, MarkPattern
 from photoplan.errors import InputError
-from photoplan.orientation.marks.template import Template, coverage, render
+from photoplan.orientation.marks.locate import Template, coverage, render
 
 
 def turned(pixels_per_mm: float, degrees: float, mirrored: bool = False) -> NDArray[np.float64]:

@@ -13,8 +13,8 @@ from tools.edge_scenes import blocks, noisy
 from photoplan.geometry.grid import Window
 from photoplan.products.mtf import edges as mtf_search
 from photoplan.products.mtf.edges import LightImage, join_lines, parted, search_edges, select_spread, tiles_of
+from photoplan.quality.curves import Linearisation
 from photoplan.quality.edges.find import EdgeRegion, EdgeRules, StraightEdge
-from photoplan.quality.linearise import Linearisation
 
 
 @pytest.fixture(scope="module")

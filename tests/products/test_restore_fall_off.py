@@ -19,7 +19,7 @@ from photoplan.products.restore import RestoreReport, RestoreRequest, plan_resto
 from photoplan.project.steps import restoration_of
 from photoplan.quality.camera.fall_off import FallOffModel, FallOffSettings, fit_fall_off
 from photoplan.quality.colour import BandModel, ChromaticModel
-from photoplan.quality.linearise import Linearisation
+from photoplan.quality.curves import Linearisation
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 
 SIZE, POINT, FOCAL = (350, 280), (180.0, 135.0), 400.0

@@ -10,7 +10,7 @@ from tools.patterns import bars, gauss_box, star
 from tools.thinned import some, thinned
 
 from photoplan.errors import InputError
-from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.curves import MtfCurve
 from photoplan.quality.patterns.bars import bar_curve, clipped_pixels, coltman_factor, coltman_mtf, measure_bars
 
 SIGMA, LEVELS = 0.6, (40.0, 200.0)

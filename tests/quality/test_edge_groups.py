@@ -9,8 +9,8 @@ import pytest
 from tools.thinned import some
 
 from photoplan.errors import InputError
+from photoplan.quality.curves import MtfCurve, gaussian_modulation
 from photoplan.quality.edges.groups import combine, field_cell, fit_gaussian, mean_curve, quantiles, sigma_of_interval
-from photoplan.quality.mtf_curve import MtfCurve, gaussian_modulation
 
 
 class TestCombine:

@@ -7,8 +7,8 @@ from tools.edges import edge_image, gaussian
 from tools.koelbl import normalised_edge, spread_from_edge
 
 from photoplan.errors import InputError
+from photoplan.quality.curves import SpreadFunction
 from photoplan.quality.edges.response import measure_edge, spread_from_response, spread_of_edge
-from photoplan.quality.mtf_curve import SpreadFunction
 
 TABLE_1 = np.array([150.0, 148, 133, 67, 52, 50])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality.linearise import Linearisation
+from photoplan.quality.curves import Linearisation
 
 
 def test_srgb_has_the_figures_of_its_standard():

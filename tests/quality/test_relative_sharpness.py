@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from photoplan.quality.mtf_curve import blur_of, detail_energies, detail_quotients
+from photoplan.quality.curves import blur_of, detail_energies, detail_quotients
 
 
 def test_images_and_ground_are_told_apart() -> None:

@@ -21,7 +21,7 @@ from tools.thinned import some
 from tools.unsupervised_wiener import unsupervised_wiener
 
 from photoplan.errors import InputError
-from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.curves import MtfCurve
 from photoplan.quality.restoration.design import (
     DesignOptions,
     Expectation,

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.quality.mtf_curve import SpreadFunction, gaussian_modulation
+from photoplan.quality.curves import SpreadFunction, gaussian_modulation
 from photoplan.quality.restoration.design import (
     BAND_ROWS,
     aperture_filter,

@@ -9,7 +9,7 @@ from tools.blurred_scenes import FINE, NOISE, SIZE, any_edges, sharpness, taken,
 from tools.thinned import some
 
 from photoplan.errors import InputError
-from photoplan.quality.mtf_curve import SpreadFunction
+from photoplan.quality.curves import SpreadFunction
 from photoplan.quality.restoration.design import DesignOptions, Sharpness, curve_transfer, design_filter
 from photoplan.quality.restoration.restorer import SceneStatistics, block_spectra, fit_scene
 

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.quality.linearise import Linearisation
+from photoplan.quality.curves import Linearisation
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter, Restorer, field_weights
 
 TYPES = ("uint8", "uint16", "int16", "float32")

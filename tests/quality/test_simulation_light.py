@@ -9,11 +9,11 @@ from tools.formed import ArrayScene, form_image
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.products.simulate import check_fit
+from photoplan.quality.curves import GAUSSIAN_WIDTH
 from photoplan.quality.formation import optics
 from photoplan.quality.formation.model import ImageModel, model_modulation, model_mtf50, model_transfer
 from photoplan.quality.formation.optics import Aperture, Falloff, Lateral, LineJitterPart, Spread, pixel_kernel
 from photoplan.quality.formation.scenes import PatternScene, parse_pattern
-from photoplan.quality.mtf_curve import GAUSSIAN_WIDTH
 
 
 def wave(frequency, size=(256, 8), k=8, phase=0.0):

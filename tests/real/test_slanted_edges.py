@@ -11,9 +11,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from photoplan.quality.curves import Linearisation, MtfCurve
 from photoplan.quality.edges.response import EdgeSettings, measure_edge
-from photoplan.quality.linearise import Linearisation
-from photoplan.quality.mtf_curve import MtfCurve
 
 EDGES = {
     "sfrmat3/h_edge_mono.tif": (0.2026, 0.2006),

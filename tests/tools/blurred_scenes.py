@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import ndtr
 
-from photoplan.quality.mtf_curve import MtfCurve, SpreadFunction
+from photoplan.quality.curves import MtfCurve, SpreadFunction
 from photoplan.quality.restoration.design import Sharpness
 
 FINE = 8

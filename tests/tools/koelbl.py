@@ -8,7 +8,7 @@ from scipy.optimize import minimize_scalar
 
 from photoplan.adjustment.least_squares import solve
 from photoplan.errors import InputError
-from photoplan.quality.mtf_curve import SpreadFunction
+from photoplan.quality.curves import SpreadFunction
 
 
 @dataclass(frozen=True, eq=False)

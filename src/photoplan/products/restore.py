@@ -54,7 +54,7 @@ from photoplan.project.steps import (
     save_filter,
 )
 from photoplan.quality.colour import ChromaticModel
-from photoplan.quality.linearise import Linearisation
+from photoplan.quality.curves import Linearisation
 from photoplan.quality.restoration.design import aperture_filter
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 from photoplan.requests.quality import RestoreRequest, table_of

@@ -7,8 +7,7 @@ __getattr__, __dir__, __all__ = public(
     {
         "quality.edges.response": "measure_edge",
         "quality.edges.find": "find_edges",
-        "quality.mtf_curve": "SpreadFunction MtfCurve",
-        "quality.linearise": "Linearisation",
+        "quality.curves": "Linearisation MtfCurve SpreadFunction",
         "quality.patterns.bars": "measure_bars measure_star",
         "quality.patterns.usaf": "measure_usaf",
         "quality.restoration.design": "exact_inverse design_filter",

@@ -16,8 +16,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.products.mtf.edges import LightImage
 from photoplan.products.mtf.patterns import MOST_PIXELS, PatternReport, PatternResult
 from photoplan.products.mtf.result import EdgeGroup, ImageMtf, MeasuredEdge, MtfReport, means, rejected_words
-from photoplan.quality.linearise import Linearisation
-from photoplan.quality.mtf_curve import gaussian_modulation
+from photoplan.quality.curves import Linearisation, gaussian_modulation
 from photoplan.quality.patterns.bars import StarMtf
 from photoplan.quality.patterns.usaf import UsafResult
 from photoplan.report.page import (

@@ -18,8 +18,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.matching.features import Grey, GreyImage, Tracks, to_bytes
 from photoplan.matching.register import APART, FOUND, STATES, TEXTURELESS, UNCERTAIN, UNLIKE
 from photoplan.orientation.marks.fiducials import Scan, mark_window
-from photoplan.orientation.marks.locate import FiducialResult, LocatedMark, MarkLayout, MissingMark
-from photoplan.orientation.marks.template import Template, draw
+from photoplan.orientation.marks.locate import FiducialResult, LocatedMark, MarkLayout, MissingMark, Template, draw
 from photoplan.products.film import (
     FiducialsReport,
     ImageFiducials,

@@ -22,7 +22,7 @@ from photoplan.products.restore import FoundFilter, Job, RestoredImage, RestoreR
 from photoplan.project.align import AlignStep
 from photoplan.project.steps import FallOffStep, fall_off_line, load_filter, restoration_of
 from photoplan.quality.colour import ChromaticModel
-from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.curves import MtfCurve
 from photoplan.quality.restoration.design import Sharpness
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter
 from photoplan.radiometry.balance import Balanced, Pairs

@@ -30,14 +30,15 @@ from photoplan.orientation.marks.locate import (
     MissingMark,
     ScanTurn,
     SoughtMark,
+    Template,
     best_blur,
     combine,
     correlation_surface,
+    draw,
     fit_placement,
     locate_mark,
 )
 from photoplan.orientation.marks.single import fit_edges
-from photoplan.orientation.marks.template import Template, draw
 
 SIDE = 20
 """Pixels that the smaller side of the smallest mark has in the coarse search, about."""

@@ -15,8 +15,7 @@ from photoplan.adjustment.least_squares import bisquare, solve, spread
 from photoplan.arrays import Floats, Floats32, Ints, Mask
 from photoplan.cameras.fiducials import MarkExample, MarkPattern
 from photoplan.errors import InputError
-from photoplan.orientation.marks.locate import Location, correlation_surface, locate_mark
-from photoplan.orientation.marks.template import Template, render
+from photoplan.orientation.marks.locate import Location, Template, correlation_surface, locate_mark, render
 
 _STEP = 1.0
 """Pixels between edge points."""

@@ -16,7 +16,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.series import SeriesFrame, SeriesGroup, frame_pixels, plane_mask, split
 from photoplan.products.characterise.data import SeriesData
-from photoplan.quality.linearise import clipped_levels
+from photoplan.quality.curves import clipped_levels
 
 #: Share of a window that may be saturated, and samples of it that are looked at for the value where frames are cut off.
 _MOST, _SAMPLE = 0.01, 4096

@@ -23,6 +23,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.tables import write_table
 from photoplan.products.mtf.result import EdgeGroup, ImageMtf, LabComparison, MeasuredEdge, MtfReport, rejected_words
 from photoplan.project.steps import linearisation_of
+from photoplan.quality.curves import Linearisation, clipped_levels
 from photoplan.quality.edges.find import EdgePicture, EdgeRegion, EdgeRules, StraightEdge, examine, find_lines, range_of
 from photoplan.quality.edges.groups import (
     CombinedValue,
@@ -36,7 +37,6 @@ from photoplan.quality.edges.groups import (
     sigma_of_interval,
 )
 from photoplan.quality.edges.response import EdgeMeasurement, EdgeSettings, EdgeSpread, measure_edge, spread_of_edge
-from photoplan.quality.linearise import Linearisation, clipped_levels
 from photoplan.requests.quality import MtfRequest
 
 #: Said where nobody states how 8 bits are encoded.

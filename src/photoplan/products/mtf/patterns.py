@@ -20,8 +20,7 @@ from photoplan.plain import pick
 from photoplan.products.mtf.edges import ENCODED, LUMINANCE, LightImage, check_files, measure_edges, unique_names
 from photoplan.products.mtf.result import MtfReport
 from photoplan.project.steps import linearisation_of
-from photoplan.quality.linearise import Linearisation
-from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.curves import Linearisation, MtfCurve
 from photoplan.quality.patterns.bars import (
     BarCurve,
     StarMtf,

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from photoplan.findings import Findings, Result, Table
 from photoplan.plain import pick
+from photoplan.quality.curves import MtfCurve, SpreadFunction
 from photoplan.quality.edges.find import REASONS
 from photoplan.quality.edges.groups import CombinedValue, Enhancement, GaussianFit
 from photoplan.quality.edges.response import EdgeMeasurement, spread_of_edge
-from photoplan.quality.mtf_curve import MtfCurve, SpreadFunction
 from photoplan.quality.restoration.design import point_spread
 
 #: Of a measured edge, in JSON under their own names.

@@ -37,7 +37,7 @@ from photoplan.products.orthophoto.plan import (
     with_resolution,
 )
 from photoplan.products.orthophoto.sheets import Sheet, drawn_sheets, sheets_of
-from photoplan.quality.mtf_curve import BLOCK, blur_of, detail_energies, detail_quotients
+from photoplan.quality.curves import BLOCK, blur_of, detail_energies, detail_quotients
 from photoplan.requests.ortho import Choice, OrthoSettings
 from photoplan.surfaces.objects import Faces, ObjectSurface, SingleObject, painted_surface
 from photoplan.surfaces.polygon_faces import LEAST_AREA

@@ -23,7 +23,7 @@ from photoplan.arrays import Floats, Ints, Mask
 from photoplan.errors import InputError
 from photoplan.findings import with_sigma
 from photoplan.quality.camera.geometry import StraightLine, fit_line
-from photoplan.quality.mtf_curve import pupil_transfer
+from photoplan.quality.curves import pupil_transfer
 
 #: Share of zeros beyond which black is cut off, and mean and variance are not those of the signal.
 ZERO_SHARE = 0.005

@@ -14,8 +14,8 @@ from scipy.special import ndtri, stdtrit
 from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.plain import pick
+from photoplan.quality.curves import MtfCurve, gaussian_modulation
 from photoplan.quality.edges.response import EdgeMeasurement, spread_from_response
-from photoplan.quality.mtf_curve import MtfCurve, gaussian_modulation
 from photoplan.quality.restoration.design import Sharpness
 
 #: Residuals beyond so many standard deviations count less.

@@ -12,6 +12,7 @@ from scipy.special import stdtrit
 from photoplan.adjustment.least_squares import solve
 from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
+from photoplan.quality.curves import GAUSSIAN_WIDTH, MtfCurve, SpreadFunction
 from photoplan.quality.edges.find import (
     EdgeResiduals,
     EdgeSettings,
@@ -36,7 +37,6 @@ from photoplan.quality.edges.line import (
     fit_line,
     fit_profile,
 )
-from photoplan.quality.mtf_curve import GAUSSIAN_WIDTH, MtfCurve, SpreadFunction
 
 #: Line spread function and edge profile are looked at this densely: lines for each standard deviation.
 DENSITY = 25

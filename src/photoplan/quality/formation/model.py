@@ -18,6 +18,7 @@ from scipy import ndimage, special
 
 from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
+from photoplan.quality.curves import MtfCurve
 from photoplan.quality.formation.optics import (
     Aperture,
     AutomaticGain,
@@ -44,7 +45,6 @@ from photoplan.quality.formation.optics import (
     spread_transfer,
 )
 from photoplan.quality.formation.scenes import LightScene
-from photoplan.quality.mtf_curve import MtfCurve
 
 #: Times that circular overflow spreads again where it meets full elements; what is left then goes along the columns.
 _ROUNDS = 60

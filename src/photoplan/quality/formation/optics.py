@@ -16,8 +16,8 @@ from scipy import fft, ndimage, signal
 from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.quality.curves import disc_transfer, pupil_transfer
 from photoplan.quality.formation.scenes import LightScene, disc_share
-from photoplan.quality.mtf_curve import disc_transfer, pupil_transfer
 
 Radius = TypeVar("Radius", float, Floats)
 #: Widths beyond this many pixels come from a wrong unit rather than from optics.

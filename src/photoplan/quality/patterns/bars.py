@@ -15,7 +15,7 @@ from photoplan.adjustment.least_squares import solve
 from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
 from photoplan.findings import with_sigma
-from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.curves import MtfCurve
 
 #: Share of clipped pixels from which on a pattern is refused.
 MOST_CLIPPED = 0.005

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.arrays import Floats, Mask
 from photoplan.errors import InputError
-from photoplan.quality.mtf_curve import GAUSSIAN_WIDTH, MtfCurve, SpreadFunction, disc_transfer
+from photoplan.quality.curves import GAUSSIAN_WIDTH, MtfCurve, SpreadFunction, disc_transfer
 from photoplan.quality.restoration.restorer import (
     FOLDS,
     FilterKernel,

@@ -28,7 +28,7 @@ from photoplan.kernels.raster import (
     pixel_range,
     round_clipped,
 )
-from photoplan.quality.linearise import Linearisation
+from photoplan.quality.curves import Linearisation
 
 Transfer = Callable[[Floats, Floats], tuple[Floats, Floats]]
 """Modulation and its standard deviation at frequencies u along rows and v along columns, cycles per pixel; arrays that
