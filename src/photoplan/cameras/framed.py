@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from photoplan.cameras.base import Camera, ImageField, Parts, Tremor, Vantage, project
 from photoplan.errors import UsageError
@@ -158,5 +158,5 @@ class FramedCamera:
         seen = np.isfinite(at).all(axis=1)
         if not seen.any():
             return np.full((len(xy), 3), np.nan)
-        _, nearest = cKDTree(at[seen]).query(np.where(np.isfinite(xy), xy, 0.0))
+        _, nearest = scipy.spatial.cKDTree(at[seen]).query(np.where(np.isfinite(xy), xy, 0.0))
         return np.asarray(uvh[seen][nearest])
