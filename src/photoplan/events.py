@@ -113,6 +113,9 @@ class Compilations:
 COMPILATIONS = Compilations()
 """The compilations of this process; `photoplan.kernels` reports them."""
 
+COMPILING = "compiling"
+"""The phase in which kernels are compiled before the work; its parts are kernels."""
+
 _LISTENER: ContextVar[Callable[[float, str], None] | None] = ContextVar("listener", default=None)
 
 

@@ -94,3 +94,19 @@ def test_plain_loops_can_be_asked_for():
     environment = {**os.environ, "PHOTOPLAN_PLAIN_KERNELS": "1"}
     done = subprocess.run([sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False True {}"
+
+
+NEWER = """
+import numba
+numba.__version__ = "0.69.0"
+import photoplan.kernels.rectify
+from photoplan.io.store import versions
+print(photoplan.kernels.rectify.gather_runs is not None, versions()["numba"])
+"""
+
+
+@pytest.mark.skipif(not numba_internals.USABLE, reason="plain loops are asked for")
+def test_a_newer_numba_is_a_warning_and_stands_in_the_run_record():
+    done = subprocess.run([sys.executable, "-c", NEWER], capture_output=True, text=True, check=True)
+    assert done.stdout.split("True ")[1].endswith(" (not tried: plain loops)\n")
+    assert done.stderr.count("numba 0.69.0 was not tried") == 1 and "Install 'numba>=0.60,<0.69'" in done.stderr

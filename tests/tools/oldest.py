@@ -23,7 +23,7 @@ def oldest(project: Path = PROJECT) -> Iterator[str]:
         plain = re.sub(r"\[.*", "", name)
         if version and plain not in seen:
             seen.add(plain)
-            yield f"{name}=={version}"
+            yield f"{name}=={version.partition(',')[0]}"
 
 
 if __name__ == "__main__":

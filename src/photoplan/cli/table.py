@@ -12,7 +12,8 @@ from photoplan.findings import Result
 
 if TYPE_CHECKING:
     from photoplan.events import Events
-    from photoplan.requests.project import SchemaRequest
+    from photoplan.products.warmup import WarmupReport
+    from photoplan.requests.project import SchemaRequest, WarmupRequest
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ _PROJECT: dict[str, Verb] = {
         """,
         "requests.project:CheckRequest",
         "products.check:check",
+        kernels="check",
     ),
     "budget": Verb(
         "List what limits the accuracy of products.",
@@ -135,6 +137,7 @@ _ORIENT: dict[str, Verb] = {
         "requests.orient:TieRequest",
         "products.tie:find_ties",
         {"picture": "report.orientation:draw_ties"},
+        kernels="tie",
     ),
     "control": Verb(
         "Propose control points from an orthophoto and heights.",
@@ -171,6 +174,7 @@ _ORIENT: dict[str, Verb] = {
         "requests.orient:AdjustRequest",
         "products.adjust.run:adjust_project",
         {"report": "report.adjust:adjust_page"},
+        kernels="adjust",
     ),
 }
 
@@ -185,6 +189,7 @@ _ORTHO: dict[str, Verb] = {
         "products.orthophoto.make:make_products",
         each="report.products:draw_product",
         figures_first=True,
+        kernels="ortho",
     ),
     "mosaic": Verb(
         "Make one orthophoto of many images.",
@@ -197,6 +202,7 @@ _ORTHO: dict[str, Verb] = {
         "products.orthophoto.make:make_products",
         each="report.products:draw_product",
         figures_first=True,
+        kernels="mosaic",
     ),
     "object": Verb(
         "Make a product of each object alone.",
@@ -209,6 +215,7 @@ _ORTHO: dict[str, Verb] = {
         "products.orthophoto.make:make_products",
         each="report.products:draw_product",
         figures_first=True,
+        kernels="mosaic",
     ),
     "balance": Verb(
         "Find tables that make overlapping images agree in colour.",
@@ -252,6 +259,7 @@ _ORTHO: dict[str, Verb] = {
         "requests.ortho:RunRequest",
         "products.orthophoto.make:run_plan",
         each="report.products:draw_product",
+        kernels="ortho",
     ),
 }
 
@@ -266,6 +274,7 @@ _TERRAIN: dict[str, Verb] = {
         "requests.terrain:BuildRequest",
         "products.dtm.build:dtm_build",
         {"report": "report.dtm:build_report"},
+        kernels="terrain build",
     ),
     "info": Verb(
         "Show the content of a model.",
@@ -318,6 +327,7 @@ _TERRAIN: dict[str, Verb] = {
         "products.dtm.lines:make_contours",
         {"preview": "report.dtm:contours_picture"},
         record="contours",
+        kernels="terrain contours",
     ),
     "shade": Verb(
         "Make a hillshade.",
@@ -327,6 +337,7 @@ _TERRAIN: dict[str, Verb] = {
         """,
         "requests.terrain:ShadeRequest",
         "products.dtm.rasters:dtm_shade",
+        kernels="terrain shade",
     ),
     "slope": Verb(
         "Compute slope, slope classes or aspect.",
@@ -390,6 +401,7 @@ _VIEW: dict[str, Verb] = {
         """,
         "requests.view:ViewRequest",
         "report.views:labelled_picture",
+        kernels="view",
     ),
     "sequence": Verb(
         "Render views along a path, and a film of them.",
@@ -541,6 +553,7 @@ _ALONE: dict[str, Verb] = {
         "products.surface.run:surface_project",
         {"report": "report.maps:surface_page"},
         each="report.maps:surface_drawn",
+        kernels="surface",
     ),
     "demo": Verb(
         "Make the orthophotos of the included real block.",
@@ -551,10 +564,21 @@ _ALONE: dict[str, Verb] = {
         """,
         "requests.ortho:DemoRequest",
         "products.orthophoto.make:make_demo",
+        kernels="ortho",
+    ),
+    "warmup": Verb(
+        "Compile the kernels of commands before their first run.",
+        """Compile what COMMAND… need for images of a kind, and keep it; without COMMAND all commands.
+
+        A command that finds kernels missing does the same before its work. Kernels are compiled anew for another
+        version of photoplan, Numba or Python, and on another kind of processor.
+        """,
+        "requests.project:WarmupRequest",
+        "cli.table:warm_up",
     ),
 }
 
-#: Groups by their names, in the order of a job; `surface` and `demo` stand alone.
+#: Groups by their names, in the order of a job; `surface`, `demo` and `warmup` stand alone.
 GROUPS: dict[str, VerbGroup] = {
     "project": VerbGroup("Begin, check and describe projects.", _PROJECT),
     "orient": VerbGroup("Orient images: marks, tie points, control, adjustment.", _ORIENT),
@@ -603,7 +627,7 @@ HEADINGS: dict[str, tuple[str, ...]] = {
     "Terrain, surfaces and views": ("terrain", "surface", "view"),
     "Measuring": tuple(_MEASURE),
     "Quality of images and cameras": tuple(_QUALITY),
-    "First steps": ("demo",),
+    "First steps": ("demo", "warmup"),
 }
 
 
@@ -633,6 +657,20 @@ def schema(request: SchemaRequest, events: Events) -> Schema:
     if row is None:
         raise UsageError(f"`verb` {' '.join(request.verb)} is no command; `photoplan schema` lists them")
     return Schema({**load(row.request).model_json_schema(), "title": " ".join(request.verb)})
+
+
+def warm_up(request: WarmupRequest, events: Events) -> WarmupReport:
+    """Compile the kernels of commands, a group's word standing for all of its commands."""
+    from photoplan.products.warmup import warm_up as compile_kernels
+
+    rows = [] if request.command else [row for group in GROUPS.values() for row in group.verbs.values()]
+    rows += [] if request.command else _ALONE.values()
+    for words in request.command:
+        group, row = VERBS.get(words), command_at(words.split() or [words])
+        if row is None and not isinstance(group, VerbGroup):
+            raise UsageError(f"`command` {words} is no command; `photoplan schema` lists them")
+        rows += group.verbs.values() if row is None and isinstance(group, VerbGroup) else [row] if row else []
+    return compile_kernels(request, tuple(dict.fromkeys(row.kernels for row in rows if row.kernels)), events)
 
 
 def command_at(words: Sequence[str]) -> Verb | None:

@@ -11,7 +11,7 @@ from contextlib import suppress
 import click
 
 from photoplan.cli.output import is_doubt, say
-from photoplan.events import COMPILATIONS, Compilations
+from photoplan.events import COMPILATIONS, COMPILING, Compilations
 
 #: Seconds between two lines where there is no terminal, and between two changes of the line on one.
 SELDOM, OFTEN = 30.0, 0.1
@@ -105,11 +105,12 @@ class Telling:
 
     def line(self, now: float) -> str:
         """Return what there is to say at a time: phase, units done, rate, time left; or the kernels being compiled."""
-        if self._compilations.running:
+        if self._compilations.running and self._phase != COMPILING:
             kernels, seconds = self._compiled_before
             count, compiled = self._compilations.kernels - kernels, self._compilations.seconds - seconds
             return f"compiling kernels: {count} so far, for {_time(compiled)}"
-        took = max(now - self._began - (self._compilations.seconds - self._compiled), 1e-6)
+        compiled = 0.0 if self._phase == COMPILING else self._compilations.seconds - self._compiled
+        took = max(now - self._began - compiled, 1e-6)
         words, finished = [f"{self._phase}:"], self._finished + self._begun
         if self._units:
             share = min(1.0, finished / self._units)
@@ -123,7 +124,7 @@ class Telling:
         if self._pixels:
             rate = self._pixels / took
             words.append(f"{rate / 1e6:.3g} Mpx/s" if rate >= _SLOW else f"{rate:.0f} px/s")
-        if self._kept + _FEW < finished < self._units:
+        if self._kept + _FEW < finished < self._units and self._phase != COMPILING:  # the dearest kernels come first
             words.append(f"{_time(took / (finished - self._kept) * (self._units - finished))} left")
         else:
             words.append(f"for {_time(took)}")

@@ -48,6 +48,8 @@ class Verb:
     """Figures are printed before the files, and these in the order of the options."""
     files: str = ""
     """Key of the JSON that lists all files, if there is one instead of a key for each drawing."""
+    kernels: str = ""
+    """Name in the list of kernels (`kernels/signatures.txt`), which are compiled before the work."""
 
     def command(self, name: str) -> click.Command:
         """Return the click command."""
@@ -159,6 +161,8 @@ def command(verb: Verb, request: Any, as_json: bool, quiet: bool) -> None:
     ):
         run = _Run(verb, request, quiet, files_at_once=not (grouped or as_json))
         with run.events as events:
+            if verb.kernels:
+                load("products.warmup:compile_before")(verb.kernels, request, events)
             result = load(verb.make)(request, events)
             if all(part is not result for part in events.results):
                 run.draw(result)

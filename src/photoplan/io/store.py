@@ -960,6 +960,9 @@ def versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
     for name in _PACKAGES:
         found[name] = _installed(name)
+    kernels = sys.modules.get("photoplan.kernels.numba_internals")  # not imported for its version alone
+    if kernels is not None and kernels.UNTRIED:
+        found["numba"] += " (not tried: plain loops)"
     found["GDAL"] = rasterio.__gdal_version__
     found["PROJ"] = rasterio.__proj_version__
     found["JPEG decoder"] = jpeg_decoder()

@@ -7,12 +7,14 @@ import stat
 import tempfile
 import warnings
 from collections.abc import Callable
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
 from numba import config, njit, typeof
 
 from photoplan.errors import PhotoplanWarning
+from photoplan.kernels import numba_internals
 from photoplan.kernels.numba_internals import INNER_OPTIONS, KERNEL_OPTIONS, MAKER_OPTIONS, enable_cache, is_cached
 
 COMPILED: bool = not config.DISABLE_JIT
@@ -22,6 +24,10 @@ COMPILED: bool = not config.DISABLE_JIT
 # NaN and infinity keep their meaning: relief uses NaN for "no surface".
 _FAST = {"contract", "arcp", "nsz"}
 _OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": _FAST}
+
+
+if numba_internals.UNTRIED and parent_process() is None:  # workers would all repeat it
+    warnings.warn(numba_internals.UNTRIED, PhotoplanWarning, stacklevel=1)
 
 
 def kernel(function: Callable[..., Any]) -> Any:

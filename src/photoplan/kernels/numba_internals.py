@@ -64,6 +64,14 @@ def _is_usable(version: str, plain: str | None) -> bool:
 
 USABLE = _is_usable(numba.__version__, os.environ.get("PHOTOPLAN_PLAIN_KERNELS"))
 
+UNTRIED = (
+    f"numba {numba.__version__} was not tried with these kernels: they run from plain loops, up to 18 times slower, "
+    f"with the same values within a grey level. Install 'numba>=0.{TRIED[0][1]},<0.{TRIED[1][1] + 1}'"
+    if not (USABLE or numba.config.DISABLE_JIT or os.environ.get("PHOTOPLAN_PLAIN_KERNELS"))
+    else ""
+)
+"""Why plain loops are compiled although nobody has asked for them; empty if they are not."""
+
 # A call from Python or from C code needs wrappers, which are never used here; a call between parts is inlined, since
 # arrays are many machine words each. Parts neither make nor return arrays, so that those who call them hold all that
 # they touch: without counting references (two atomic operations for each array that is taken out of a tuple) a pixel is

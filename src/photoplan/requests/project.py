@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from photoplan.errors import UsageError
 from photoplan.io.orientation.block import TableFormat
-from photoplan.request import BEYOND_AREA, IMAGES, OVERWRITE, PROJECT, Request, arg, opt
+from photoplan.request import BEYOND_AREA, IMAGES, OVERWRITE, PROJECT, WORKERS, Request, arg, opt
 
 
 def _input(help: str, metavar: str) -> Any:
@@ -132,3 +132,17 @@ class SchemaRequest(Request):
     """Options of the description of commands."""
 
     verb: tuple[str, ...] = opt("Words of the command.", (), argument=True)
+
+
+class WarmupRequest(Request):
+    """Options of the compilation of kernels before the first run."""
+
+    command: tuple[str, ...] = opt("Commands, such as ortho or terrain [all].", (), argument=True)
+    dtypes: tuple[Literal["uint8", "uint16", "int16", "float32"], ...] = opt(
+        "Types of the images' pixels [uint8].", ("uint8",), flag="dtype", metavar="TYPE", listed=True, section="input"
+    )
+    bands: int = opt("Bands of the images [3].", 3, ge=1, section="input")
+    kernel: Literal["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"] = opt(
+        "Resampling kernel [bicubic].", "bicubic"
+    )
+    workers: int | None = WORKERS
