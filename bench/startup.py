@@ -9,10 +9,12 @@ start of Python. As for a user, no process compiles all modules anew: PYTHONDONT
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 import tempfile
+import time
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -55,6 +57,21 @@ def cpu_of(*words: object) -> float:
     return min(taken)
 
 
+def cold(folder: Path, command: str, *words: object) -> str:
+    """Seconds and kernels of `photoplan warmup COMMAND` with an empty cache, then seconds of the command."""
+    cache = {**environment(), "NUMBA_CACHE_DIR": str(folder / f"cold-{command}")}
+    said = []
+    for call in (["warmup", command, "--json", "-q"], [command, *words, "--overwrite", "-q"]):
+        before, began = os.times(), time.perf_counter()
+        line = [sys.executable, "-m", "photoplan", *map(str, call)]
+        done = subprocess.run(line, check=True, capture_output=True, text=True, env=cache)
+        after, clock = os.times(), time.perf_counter() - began
+        cpu = after.children_user + after.children_system - before.children_user - before.children_system
+        kernels = f", {json.loads(done.stdout)['kernels']} kernels" if call[0] == "warmup" else ""
+        said.append(f"{call[0]} {cpu:.1f} CPU s, {clock:.1f} s by the clock{kernels}")
+    return "; then ".join(said)
+
+
 def main() -> None:
     """All rows."""
     with as_file(files("photoplan") / "demo_block") as block, tempfile.TemporaryDirectory() as name:
@@ -75,6 +92,9 @@ def main() -> None:
             "without its quick look": cpu_of(*ortho, "--no-quicklook"),
             "start-up of photoplan ortho": start_up(*ortho[2:]),
         }
+        project = [folder / "project.toml", "--images", "DJI_001*", "--resolution", 0.1]
+        for command_ in ("ortho", "mosaic"):
+            print(f"empty cache: {cold(folder, command_, *project)}")
     for what, seconds in rows.items():
         print(f"{what:<28} {seconds:6.2f} CPU s")
 
