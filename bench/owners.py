@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.engine.execute import Source, render
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose

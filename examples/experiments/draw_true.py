@@ -9,16 +9,14 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose
 from photoplan.plan.ground import TileGround
 from photoplan.plan.sources import hidden_pixels
 from photoplan.products.rectify import rectify
 from photoplan.surfaces.base import LevelSurface, Terrain
-from photoplan.surfaces.objects import Faces, ObjectSurface
-from photoplan.surfaces.polygon_faces import filled
+from photoplan.surfaces.objects import Faces, ObjectSurface, filled
 from photoplan.targets.map import MapTarget
 
 #: Middle, length, width, eaves and ridge of houses, metres.

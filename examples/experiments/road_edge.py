@@ -22,8 +22,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.engine.execute import Source, render
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
@@ -37,7 +36,7 @@ from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, MemoryUnits,
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import Built, build_terrain, plan_build
 from photoplan.terrain.clean import clean
-from photoplan.terrain.settings import BuildSettings
+from photoplan.terrain.observations import BuildSettings
 
 CENTRE, RADIUS = np.array([70.0, -85.0]), 150.0
 """Of the circle that the road's axis is a part of, metres."""

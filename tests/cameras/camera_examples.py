@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from photoplan.cameras.fiducials import Bilinear2D
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, Fisheye, Lens, NoLens, OpenCV, RadialTable, Reversed
+from photoplan.cameras.lenses import Brown, Fisheye, Interior, Lens, NoLens, OpenCV, RadialTable, Reversed
 
 #: USGS report OSL/1785 (Jena LMK 1000, Lamegon PI/C 7384525C): mean radial distortion, camera constant 152.299 mm.
 OSL_1785_ANGLES = (7.5, 15.0, 22.7, 30.0, 35.0, 40.0)

@@ -9,12 +9,10 @@ from pyproj import Proj, Transformer
 from tools.resolution import curvature_displacement
 
 from photoplan.cameras.base import Camera, project
-from photoplan.cameras.build import oriented_camera
-from photoplan.cameras.corrected import CurvatureCorrection, corrected_camera
 from photoplan.cameras.curvature import Refraction, WarpedCamera, _profile, curved_camera
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.framed import CurvatureCorrection, corrected_camera, oriented_camera
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose, rotation_opk

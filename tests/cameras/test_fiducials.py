@@ -8,8 +8,7 @@ import pytest
 from photoplan.cameras.base import project
 from photoplan.cameras.fiducials import Affine2D, Bilinear2D, FiducialFit, fit_affine, fit_bilinear
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import Pose, rotation_opk
 

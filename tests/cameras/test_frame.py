@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from photoplan.cameras.base import project
 from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Lens, NoLens
+from photoplan.cameras.lenses import Interior, Lens, NoLens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.pose import Pose, rotation_opk
 

@@ -9,11 +9,9 @@ from tools.sim_strip import AHEAD, ORIGIN, line_camera, track
 from tools.small_block import CRS, X0, Y0
 
 from photoplan.cameras.base import Camera, project
-from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.framed import FramedCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown
+from photoplan.cameras.framed import FramedCamera, oriented_camera
+from photoplan.cameras.lenses import Brown, Interior
 from photoplan.geometry.frames import CylinderFrame, Frame, ImageFrame, WallFrame
 from photoplan.geometry.pose import Pose
 

@@ -18,9 +18,8 @@ from pyproj import Transformer
 from tools.ign_block import unaltered_height
 
 from photoplan.cameras.base import project
-from photoplan.cameras.build import oriented_camera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.framed import oriented_camera
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.geometry.local import LocalFrame
 from photoplan.geometry.pose import Pose
 

@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from camera_examples import (
-    INTERIORS,
-    LENSES,
-    OSL_1785_ANGLES,
-    OSL_1785_C,
-    OSL_1785_MICROMETRES,
-    numeric_derivative,
-)
+from camera_examples import INTERIORS, LENSES, OSL_1785_ANGLES, OSL_1785_C, OSL_1785_MICROMETRES, numeric_derivative
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses import (
     Brown,
     FieldLimited,
     Fisheye,
+    Interior,
     Lens,
     NoLens,
     OpenCV,

@@ -10,8 +10,7 @@ from test_chips import FIRST, strip_file
 from tools.shaken_strip import ShakenStrip
 
 from photoplan.cameras.base import project
-from photoplan.cameras.correctable import CorrectableLine, TrackPriors
-from photoplan.cameras.line_correction import LineCorrection
+from photoplan.cameras.correctable import CorrectableLine, LineCorrection, TrackPriors
 from photoplan.cameras.pushbroom import ChippedLine, LineCamera
 from photoplan.io.camera.line import read_line
 

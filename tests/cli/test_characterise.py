@@ -314,8 +314,7 @@ def test_fault_08_frame_whose_pixels_are_damaged_stops_its_analysis_only(folder,
 
 def test_black_is_that_of_the_exposure_and_temperature(tmp_path):
     from photoplan.io.series import read_series
-    from photoplan.products.characterise.common import black_of
-    from photoplan.products.characterise.data import SeriesData
+    from photoplan.products.characterise.data import SeriesData, black_of
 
     noise = np.random.default_rng(8)
     for kind, exposure, celsius, mean in (

@@ -12,8 +12,7 @@ from tools.command import inside
 
 from photoplan.cameras.base import project as project_points
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.geometry.pose import Pose, rotation_from_angles
 from photoplan.plain import shown_metres
 from photoplan.report.adjust import plain

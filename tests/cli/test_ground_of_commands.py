@@ -25,7 +25,7 @@ from photoplan.products.tie import _placed
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import ground_of
 from photoplan.project.scene import open_scene
-from photoplan.terrain.monoplot import MonoplotErrors, monoplot
+from photoplan.terrain.analysis import MonoplotErrors, monoplot
 
 GROUND, DECK = 100.0, 250.0
 

@@ -365,7 +365,7 @@ class TestGrossErrors:
 def rendered(block: Path) -> list[str]:
     """Twelve control points, written, and their lines of measurements in image a2."""
     from photoplan.cameras.base import project as project_points
-    from photoplan.cameras.build import oriented_camera
+    from photoplan.cameras.framed import oriented_camera
     from photoplan.geometry.pose import Pose
     from photoplan.io.project.file import load_project
     from photoplan.io.project.model import interior_of, lens_of

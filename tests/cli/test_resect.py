@@ -14,9 +14,8 @@ from click.testing import CliRunner, Result
 from tools.recorded import recorded
 
 from photoplan.cameras.base import project as project_points
-from photoplan.cameras.build import oriented_camera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown
+from photoplan.cameras.framed import oriented_camera
+from photoplan.cameras.lenses import Brown, Interior
 from photoplan.cli.table import VERBS
 from photoplan.errors import GeometryError, InputError, TilesFailed, UsageError
 from photoplan.geometry.pose import Pose, rotation_from_angles

@@ -12,7 +12,7 @@ from tools.command import Here
 from tools.formed import form_image
 
 from photoplan.io.raster import write_whole_image
-from photoplan.products.chromatic import load_chromatic
+from photoplan.products.measured_filter import load_chromatic
 from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.optics import Gain, Lateral, Quantisation, Spread
 from photoplan.quality.formation.scenes import PatternScene

@@ -15,7 +15,7 @@ from photoplan.kernels.footprint import depth_tilt
 from photoplan.plan.anchors import AnchorRule
 from photoplan.plan.footprint import Tile, Tiles
 from photoplan.plan.product import CompiledTile, ProductPlan, compile_tile
-from photoplan.targets.base import Target
+from photoplan.targets.map import Target
 
 SIDE = 1600
 HEIGHT = 40.0

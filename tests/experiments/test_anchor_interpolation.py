@@ -6,8 +6,7 @@ import pytest
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.anchors import AnchorRule, compile_anchors

@@ -102,7 +102,7 @@ def test_example_is_understood(verb, arguments):
 def test_figures_of_linear_prediction_on_the_pages_are_those_of_the_code():
     from photoplan.terrain import build, covariance
     from photoplan.terrain import observations as leaves
-    from photoplan.terrain.settings import SHARE, BuildSettings
+    from photoplan.terrain.observations import SHARE, BuildSettings
 
     page = " ".join((DOCS / "explanation" / "linear-prediction.md").read_text("utf-8").split())
     table = (DOCS / "reference" / "dtm.md").read_text("utf-8")

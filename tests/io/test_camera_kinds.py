@@ -12,9 +12,9 @@ from typing import get_args
 import pytest
 
 import photoplan
-from photoplan.cameras import corrected, frame
 from photoplan.cameras import curvature as curved
 from photoplan.cameras import curvature as warped
+from photoplan.cameras import frame, framed
 from photoplan.cameras.lenses import Brown, Fisheye, NoLens, OpenCV
 from photoplan.io.camera.model import BrownLens, Camera, CameraEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
 
@@ -34,9 +34,7 @@ ALLOWED = {
     "cameras/__init__.py": "public names",
     "cameras/frame.py": "a kind",
     "cameras/curvature.py": "a kind",
-    "cameras/corrected.py": "a kind",
-    "cameras/build.py": "registry of cameras that compute",
-    "cameras/body_frame.py": "a kind in the axes of a body",
+    "cameras/framed.py": "registry of cameras that compute, and kinds in other axes",
     "io/camera/satellite.py": "makes a kind of what files state",
     "io/camera/model.py": "kinds, and their registry",
     "io/orientation/projects.py": "reads a format that knows frames in millimetres alone",
@@ -64,7 +62,7 @@ def test_only_a_kinds_own_file_and_the_registries_name_it() -> None:
 def test_the_names_are_those_of_the_code() -> None:
     assert {c.__name__ for c in DESCRIBED} == {"FrameEntry", "FilmEntry"}
     assert all(hasattr(module, name) for module, name in ((frame, "FrameCamera"), (warped, "WarpedCamera")))
-    assert all(hasattr(module, name) for module, name in ((corrected, "corrected_camera"), (curved, "curved_camera")))
+    assert all(hasattr(module, name) for module, name in ((framed, "corrected_camera"), (curved, "curved_camera")))
 
 
 @pytest.mark.parametrize("kind", DESCRIBED)

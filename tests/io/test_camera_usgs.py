@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses import Interior
 from photoplan.errors import InputError
 from photoplan.io.camera.model import FilmEntry
 from photoplan.io.formats import distance_differences, read_cameras

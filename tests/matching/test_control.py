@@ -9,8 +9,7 @@ from scipy import ndimage
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.geometry.pose import Pose, rotation_opk
 from photoplan.matching.register import (
     FoundPatch,

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown
+from photoplan.cameras.lenses import Brown, Interior
 from photoplan.geometry.pose import Pose, rotation_opk
 from photoplan.matching.features import (
     Calibration,

@@ -10,8 +10,7 @@ from pyproj import Transformer
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, NoLens
+from photoplan.cameras.lenses import Brown, Interior, NoLens
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import ANGLE_UNITS, ROTATION_ORDERS, Pose, angles_from_rotation, rotation_from_angles

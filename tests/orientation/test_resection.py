@@ -10,10 +10,9 @@ from tools.photos import AERIAL, PLACE, aerial_pose, at, frame, ground_below, me
 from tools.thinned import some, thinned
 
 from photoplan.cameras.base import Camera
-from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, Lens, NoLens, OpenCV
+from photoplan.cameras.framed import oriented_camera
+from photoplan.cameras.lenses import Brown, Interior, Lens, NoLens, OpenCV
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.pose import Pose, rotation_opk

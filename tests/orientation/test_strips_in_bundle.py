@@ -12,8 +12,7 @@ from tools.thinned import some, thinned
 from photoplan.cameras.base import project
 from photoplan.cameras.correctable import TrackPriors
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose, rotation_opk

@@ -11,8 +11,7 @@ from tools.source_errors import moved, pose_errors
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, NoLens
+from photoplan.cameras.lenses import Brown, Interior, NoLens
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
@@ -27,7 +26,7 @@ from photoplan.plan.accuracy import (
     tile_accuracy,
 )
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.monoplot import MonoplotErrors, monoplot
+from photoplan.terrain.analysis import MonoplotErrors, monoplot
 
 SIZE, FOCAL, HEIGHT = (1200, 900), 1000.0, 1000.0
 WIDE = Brown(k1=-0.08, k2=0.02, p1=1e-3)

@@ -14,8 +14,7 @@ from tools.thinned import some
 from photoplan.cameras.base import project
 from photoplan.cameras.fiducials import Affine2D, Bilinear2D
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown
+from photoplan.cameras.lenses import Brown, Interior
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import rotation_vector
 from photoplan.orientation.bundle.adjust import adjust_block

@@ -13,8 +13,7 @@ from tools.twin import TwinSource, twin_compose
 from photoplan.cameras.base import project
 from photoplan.cameras.fiducials import Bilinear2D
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, Fisheye, Lens, NoLens, RadialTable, Reversed
+from photoplan.cameras.lenses import Brown, Fisheye, Interior, Lens, NoLens, RadialTable, Reversed
 from photoplan.engine.execute import ArrayReader, Source, render
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose

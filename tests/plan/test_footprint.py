@@ -13,9 +13,8 @@ from tools.pinhole import Pinhole, vertical
 from tools.thinned import some, thinned
 
 from photoplan.cameras.base import CentralCamera, project
-from photoplan.cameras.build import oriented_camera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Lens, NoLens
+from photoplan.cameras.framed import oriented_camera
+from photoplan.cameras.lenses import Interior, Lens, NoLens
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.footprint import FAR, covered_tiles, footprint, image_border

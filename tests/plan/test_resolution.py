@@ -145,8 +145,7 @@ def test_formulas_of_the_angles_against_a_camera() -> None:
     """Eq. 4.27–4.29 against a rotation of the image itself."""
     from photoplan.cameras.base import project
     from photoplan.cameras.frame import FrameCamera
-    from photoplan.cameras.interior import Interior
-    from photoplan.cameras.lenses import NoLens
+    from photoplan.cameras.lenses import Interior, NoLens
     from photoplan.geometry.pose import Pose
 
     c, w, small = 0.150, 0.733, 1e-6

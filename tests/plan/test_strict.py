@@ -7,8 +7,7 @@ import pytest
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown
+from photoplan.cameras.lenses import Brown, Interior
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.kernels.positions import positions

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses import Interior
 from photoplan.io.camera.model import Camera
 from photoplan.io.project.model import Image, interior_of, lens_of
 from photoplan.orientation.bundle.model import AdjustedCamera, BlockCamera

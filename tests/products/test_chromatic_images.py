@@ -12,7 +12,7 @@ from tools.thinned import some
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader, write_whole_image
-from photoplan.products.chromatic import (
+from photoplan.products.measured_filter import (
     ChromaticRequest,
     load_chromatic,
     measure_chromatic,

@@ -17,8 +17,7 @@ from tools.landxml import write_landxml
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.bounds import area_fault, area_note, beyond_area, is_no_fix
 from photoplan.geometry.crs import crs_step, grid_rotation, is_left_handed, require_projected_metres

@@ -19,9 +19,8 @@ from tools.recorded import recorded
 from tools.small_block import hills
 
 from photoplan.cameras.base import project
-from photoplan.cameras.build import oriented_camera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.framed import oriented_camera
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.cli.main import run
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose, axes_of_angles
@@ -29,7 +28,7 @@ from photoplan.io.project.file import load_project
 from photoplan.products.monoplot import MonoplotRequest, monoplot_file
 from photoplan.project.scene import open_scene
 from photoplan.surfaces.base import LevelSurface
-from photoplan.terrain.monoplot import MonoplotErrors, MonoplotPoints, monoplot
+from photoplan.terrain.analysis import MonoplotErrors, MonoplotPoints, monoplot
 
 X0, Y0, H = 500_000.0, 5_300_000.0, 900.0
 INTERIOR = Interior.digital((2000, 1125), (1435.5, 1432.9), (3.2, -5.1))

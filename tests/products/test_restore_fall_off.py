@@ -14,7 +14,7 @@ from tools.thinned import some
 
 from photoplan.geometry.grid import Window
 from photoplan.io.quality_files import FallOffEntry, TermEntry, fall_off_text
-from photoplan.products.characterise.fall_off import correction_text
+from photoplan.products.characterise.response import correction_text
 from photoplan.products.restore import RestoreReport, RestoreRequest, plan_restoration, restore_images
 from photoplan.project.steps import restoration_of
 from photoplan.quality.camera.fall_off import FallOffModel, FallOffSettings, fit_fall_off

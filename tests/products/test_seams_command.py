@@ -18,7 +18,7 @@ from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Z0, Block, make_project,
 
 from photoplan.io.disk import FileLock, lock_of
 from photoplan.products import seams as run
-from photoplan.products.orthophoto.shown import shown
+from photoplan.products.balance import shown
 
 AWAY = (-60.0, 0.0, 60.0)
 NOISE = gaussian_filter(np.random.default_rng(5).normal(size=(3, 420, 420)), (0, 3, 3))

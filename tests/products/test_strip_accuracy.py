@@ -14,8 +14,7 @@ from tools.line_strip import Strip
 from tools.sim_strip import lines, places, projection, seen_by, simulated
 
 from photoplan.cameras.base import project
-from photoplan.cameras.correctable import TrackPriors
-from photoplan.cameras.line_correction import PoseErrors, displaced, map_axes
+from photoplan.cameras.correctable import PoseErrors, TrackPriors, displaced, map_axes
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.io.camera.line import read_pose_errors
 from photoplan.io.project.file import load_project

@@ -11,8 +11,7 @@ from tools.small_model import CRS, write_small
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown
+from photoplan.cameras.lenses import Brown, Interior
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose

@@ -24,7 +24,7 @@ from photoplan.surfaces.mesh import constrained_faces
 from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, Tin
 from photoplan.terrain.build import Built, build_terrain, plan_build
 from photoplan.terrain.clean import clean
-from photoplan.terrain.settings import BuildSettings
+from photoplan.terrain.observations import BuildSettings
 
 CELL = 0.25
 """Side of the squares in which volumes are compared, metres."""

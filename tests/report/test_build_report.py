@@ -19,7 +19,7 @@ from photoplan.report.page import ReportFile, text
 from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.terrain.build import build_terrain, plan_build
 from photoplan.terrain.clean import Finding, clean
-from photoplan.terrain.settings import FAMILIES, BuildSettings
+from photoplan.terrain.observations import FAMILIES, BuildSettings
 
 pytest.importorskip("matplotlib")
 

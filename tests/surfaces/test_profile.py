@@ -13,8 +13,8 @@ from tools.thinned import examples
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.surfaces.profile import profile
 from photoplan.surfaces.raster import RasterSurface
+from photoplan.surfaces.seen import profile
 from photoplan.surfaces.units import UnitLayout
 
 LAYOUT = UnitLayout(500_000.3, 5_300_000.7, 12.34, 2, 2)

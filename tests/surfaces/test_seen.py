@@ -10,8 +10,7 @@ from tools.thinned import some
 
 from photoplan.cameras.curvature import EarthBend, Exaggeration
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, NoLens
+from photoplan.cameras.lenses import Brown, Interior, NoLens
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose

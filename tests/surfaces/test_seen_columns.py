@@ -12,8 +12,7 @@ from tools.thinned import examples, some
 
 from photoplan.cameras.curvature import EarthBend, Exaggeration
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, NoLens
+from photoplan.cameras.lenses import Brown, Interior, NoLens
 from photoplan.geometry.grid import Window
 from photoplan.geometry.local import LocalFrame
 from photoplan.geometry.pose import Pose

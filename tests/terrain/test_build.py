@@ -14,7 +14,7 @@ from photoplan.errors import GeometryError, InputError
 from photoplan.products.dtm.build import describe_plan
 from photoplan.surfaces.units import MeasuredTerrain
 from photoplan.terrain.build import Built, plan_build
-from photoplan.terrain.settings import BuildSettings
+from photoplan.terrain.observations import BuildSettings
 
 
 def smooth(XY: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from photoplan.terrain.calibration import KNOTS, NONE, HeldOut, Surroundings, calibrate, joined, signal_share
+from photoplan.terrain.fit import KNOTS, NONE, HeldOut, Surroundings, calibrate, joined, signal_share
 
 LINE = 0.5
 """On lines, errors are so much larger."""

@@ -17,8 +17,7 @@ from photoplan.surfaces.units import MeasuredLine
 from photoplan.terrain.build import Built, plan_build
 from photoplan.terrain.covariance import Covariance, Neighbours, estimate_all
 from photoplan.terrain.fit import _members, unit_of
-from photoplan.terrain.observations import quadtree
-from photoplan.terrain.settings import FAMILIES, BuildSettings
+from photoplan.terrain.observations import FAMILIES, BuildSettings, quadtree
 
 STEP = 0.2
 #: Few posts: what is asked here is asked of the fit, and of places themselves.

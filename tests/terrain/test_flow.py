@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError, UsageError
-from photoplan.terrain.flow import flow_of, snapped
+from photoplan.terrain.analysis import flow_of, snapped
 
 #: Directions, of eight from east by north.
 EAST, SOUTH_EAST = 0, 7

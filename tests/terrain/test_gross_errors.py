@@ -19,7 +19,7 @@ from tools.thinned import some
 
 from photoplan.terrain.build import plan_build
 from photoplan.terrain.fit import Neighbourhoods, Screened, TerrainFit, screen
-from photoplan.terrain.settings import BuildSettings
+from photoplan.terrain.observations import BuildSettings
 
 SIDE, NOISE = 60.0, 0.1
 Floats = NDArray[np.float64]

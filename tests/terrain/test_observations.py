@@ -10,8 +10,7 @@ from tools.build_terrain import line, scattered, terrain
 
 from photoplan.errors import GeometryError
 from photoplan.surfaces.units import MeasuredTerrain, PointGroup
-from photoplan.terrain.observations import Observations, observe, spacing_of
-from photoplan.terrain.settings import SHARE, BuildSettings
+from photoplan.terrain.observations import SHARE, BuildSettings, Observations, observe, spacing_of
 
 GROUND = np.column_stack([scattered(40.0, 1600, 1), np.full(1600, 100.0)])
 WAY = np.array([[5.0, 5, 101], [20, 10, 104], [35, 5, 101]])

@@ -12,8 +12,7 @@ from tools.build_terrain import built, line, scattered, surface_of, terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.units import representation
 from photoplan.terrain.build import Built
-from photoplan.terrain.observations import observe
-from photoplan.terrain.settings import BuildSettings
+from photoplan.terrain.observations import BuildSettings, observe
 
 Height = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 NORMAL = (0.8, 1.25)

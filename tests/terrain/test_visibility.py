@@ -9,7 +9,7 @@ import pytest
 
 from photoplan.engine.run import steps
 from photoplan.errors import InputError, UsageError
-from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights
+from photoplan.terrain.analysis import Observer, SightSettings, horizon, needed_heights
 
 FLAT_EARTH = SightSettings(curvature=False)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import project
-from photoplan.cameras.build import oriented_camera
+from photoplan.cameras.framed import oriented_camera
 from photoplan.geometry.pose import ANGLE_UNITS, Pose, angles_from_rotation, rotation_from_angles
 from photoplan.io.project.file import toml_value
 from photoplan.io.project.model import Project, interior_of, lens_of

@@ -11,8 +11,8 @@ from photoplan.engine.run import steps
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, MemoryUnits, PointGroup
 from photoplan.terrain.build import Built, build_terrain, plan_build
+from photoplan.terrain.observations import BuildSettings
 from photoplan.terrain.predict import heights_at
-from photoplan.terrain.settings import BuildSettings
 
 __all__ = ["built", "directly", "line", "scattered", "surface_of", "terrain", "unit_of"]
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from photoplan.cameras.base import Camera, project
-from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.framed import oriented_camera
 from photoplan.geometry.pose import Pose
 from photoplan.io.camera.model import BrownLens, FrameEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
 from photoplan.io.formats import read_orientation_block, write_orientation

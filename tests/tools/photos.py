@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.base import Camera, project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Lens, NoLens
+from photoplan.cameras.lenses import Interior, Lens, NoLens
 from photoplan.geometry.pose import Pose, rotation_opk
 from photoplan.orientation.resection import MeasuredPoints
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown
+from photoplan.cameras.lenses import Brown, Interior
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
 from photoplan.geometry.pose import Pose, rotation_opk, small_rotations
 from photoplan.orientation.bundle.model import Block, BlockCamera, BlockImage

@@ -9,8 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import Camera, project
-from photoplan.cameras.correctable import Correctable, CorrectableLine, CorrectableRpc, TrackPriors
-from photoplan.cameras.line_correction import TURNED, LineCorrection
+from photoplan.cameras.correctable import (
+    TURNED,
+    Correctable,
+    CorrectableLine,
+    CorrectableRpc,
+    LineCorrection,
+    TrackPriors,
+)
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.cameras.pushbroom import LineCamera
 from photoplan.cameras.pushbroom_rays import LineLook, LineTrack

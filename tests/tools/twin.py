@@ -16,7 +16,7 @@ from photoplan.cameras.base import Projection, project
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.surfaces.base import Surface
-from photoplan.targets.base import Target
+from photoplan.targets.map import Target
 
 
 def strict_positions(

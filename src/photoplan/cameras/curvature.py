@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import ImageField, Vantage
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Lens
+from photoplan.cameras.lenses import Interior, Lens
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Placement
 from photoplan.geometry.local import LocalFrame, earth_radius

@@ -1,4 +1,4 @@
-"""The frame camera: central projection, lens and interior orientation."""
+"""Frame cameras: interior orientation, collinearity equations, oriented cameras."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import ImageField, Vantage
 from photoplan.cameras.fiducials import Affine2D
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import FieldLimited, Lens, NoLens, field_limited
+from photoplan.cameras.lenses import FieldLimited, Interior, Lens, NoLens, field_limited
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose
 

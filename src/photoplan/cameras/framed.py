@@ -1,18 +1,238 @@
-"""A camera in the coordinates of a frame: over a wall or a vault, or along another image."""
+"""Cameras in other coordinates: over a wall or a vault, with corrections of image points, and taken apart."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import Camera, ImageField, Parts, Tremor, Vantage, project
-from photoplan.errors import UsageError
+from photoplan.cameras.base import Camera, CentralCamera, ImageField, Parts, Projection, Tremor, Vantage, project
+from photoplan.cameras.curvature import Refraction, Warp, WarpedCamera, curved_camera, inverse_by_newton
+from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.lenses import Interior, Lens
+from photoplan.cameras.pushbroom_rays import heights_of, meet, vantage_over
+from photoplan.errors import InputError, UsageError
 from photoplan.geometry.frames import Frame
 from photoplan.geometry.grid import Breaks
+from photoplan.geometry.local import MEAN_RADIUS, BodyGround, LocalFrame, earth_radius
+from photoplan.geometry.pose import Pose
+
+#: How earth curvature may be regarded.
+EARTH_CURVATURE = ("none", "correction", "strict")
+
+
+def oriented_camera(
+    interior: Interior,
+    lens: Lens,
+    pose: Pose,
+    *,
+    crs: str | None = None,
+    earth_curvature: str = "none",
+    refraction: bool = False,
+    mean_ground: float = 0.0,
+) -> CentralCamera:
+    """A camera in map coordinates from its interior and exterior orientation.
+
+    Parameters
+    ----------
+    interior, lens
+        Interior orientation and lens.
+    pose : Pose
+        Projection centre in map coordinates, angles relative to the map's axes at the station.
+    crs : str, optional
+        The projected CRS; needed for ``"strict"``.
+    earth_curvature : str
+        ``"none"``: map coordinates are Cartesian (orientations that were adjusted in map coordinates with their own
+        correction, small blocks); ``"correction"``: image-coordinate correction (Ecker 1991, eq. 4.16);
+        ``"strict"``: through a local tangential system at the station.
+    refraction : bool
+        Whether the standard atmosphere bends the rays; heights are then those above sea level, roughly.
+    mean_ground : float
+        Height of the ground below the camera, metres; ``"correction"`` refers to it.
+
+    Raises
+    ------
+    UsageError
+        `earth_curvature` is unknown, or ``"strict"`` without a CRS.
+    InputError
+        The lens folds back inside the image, or the CRS cannot be used.
+    """
+    if earth_curvature not in EARTH_CURVATURE:
+        raise UsageError(f"earth curvature {earth_curvature!r}; allowed are {', '.join(EARTH_CURVATURE)}")
+    X, Y, Z = pose.center.tolist()
+    before: tuple[Warp, ...] = (Refraction((X, Y, Z)),) if refraction else ()
+    if earth_curvature == "strict":
+        if crs is None:
+            raise UsageError("strict earth curvature needs the CRS of the map coordinates")
+        return curved_camera(interior, lens, pose, LocalFrame(crs, (X, Y), mean_ground), before)
+    frame = FrameCamera(interior, lens, pose)
+    if earth_curvature == "correction":
+        radius = MEAN_RADIUS if crs is None else earth_radius(crs, (X, Y))
+        return corrected_camera(frame, mean_ground, radius + mean_ground, before)
+    return WarpedCamera(frame, before, pose.center) if before else frame
+
+
+def taken_apart(camera: Projection) -> tuple[FrameCamera, tuple[Warp, ...], float] | None:
+    """A camera as one with straight rays, and the warps and the curvature, 1/m, that lead from the map to its space.
+
+    None: its rays do not meet in a point.
+    """
+    if isinstance(camera, WarpedCamera):
+        return camera.frame, camera.warps, camera.curvature
+    return (camera, (), 0.0) if isinstance(camera, FrameCamera) else None
+
+
+@dataclass(frozen=True)
+class CurvatureCorrection:
+    """Ecker 1991, eq. 4.16, for computations that treat map coordinates as if they were Cartesian.
+
+    The equation states by how much the image coordinates that are computed from map coordinates are too long:
+
+        Δx = x / 2R · (r² (Z0 − Z) / c² − 2 Z),    heights above the nadir point.
+
+    Here the same amount is taken off in the equivalent vertical image, as a displacement of the ground towards the
+    nadir. For a vertical image that is the equation itself; for a tilted one it stays right, where the
+    equation about the principal point would not. Terms of second order in distance / R are neglected.
+
+    Points whose ray is so flat that the formula runs back (d² > R (Z0 − Z) / 2, more than 15 flying heights away even
+    from 14 km) and points above the camera give NaN.
+    """
+
+    center: tuple[float, float, float]
+    """Projection centre X0, Y0, Z0 in map coordinates, metres."""
+    nadir_height: float
+    """Height of the ground below the camera, metres."""
+    radius: float
+    """Earth radius increased by that height, metres."""
+
+    def __post_init__(self) -> None:
+        if not self.radius > 0:
+            raise InputError(f"earth radius {self.radius}; a positive number of metres is needed")
+
+    def __call__(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Map points (..., 3) to the points that a Cartesian projection takes to their true image."""
+        out = np.array(XYZ, float)
+        dx, dy, factor, _ = self._terms(out)
+        out[..., 0] = self.center[0] + dx * factor
+        out[..., 1] = self.center[1] + dy * factor
+        return out
+
+    def jacobian(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Derivative of the displaced by the given point, shape (..., 3, 3)."""
+        XYZ = np.asarray(XYZ, float)
+        dx, dy, factor, depth = self._terms(XYZ)
+        by_x, by_y = -dx / (self.radius * depth), -dy / (self.radius * depth)
+        by_z = (1.0 - (dx * dx + dy * dy) / (2.0 * depth * depth)) / self.radius
+        J = np.zeros((*XYZ.shape, 3))
+        J[..., 0, 0], J[..., 0, 1], J[..., 0, 2] = factor + dx * by_x, dx * by_y, dx * by_z
+        J[..., 1, 0], J[..., 1, 1], J[..., 1, 2] = dy * by_x, factor + dy * by_y, dy * by_z
+        J[..., 2, 2] = 1.0
+        return J
+
+    def inverse(self, displaced: ArrayLike) -> NDArray[np.float64]:
+        """Return where displaced points (..., 3) are; NaN where there is no such point."""
+        return inverse_by_newton(self, displaced)
+
+    def _terms(
+        self, XYZ: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Distances from the nadir, the factor that shortens them, and the depth below the camera."""
+        dx, dy = XYZ[..., 0] - self.center[0], XYZ[..., 1] - self.center[1]
+        depth = self.center[2] - XYZ[..., 2]
+        d2 = dx * dx + dy * dy
+        with np.errstate(invalid="ignore"):
+            depth = np.where((depth > 0) & (d2 <= 0.5 * self.radius * depth), depth, np.nan)
+        factor = 1.0 - (d2 / depth - 2.0 * (XYZ[..., 2] - self.nadir_height)) / (2.0 * self.radius)
+        return dx, dy, factor, depth
+
+
+def corrected_camera(
+    frame: FrameCamera, nadir_height: float, radius: float, before: tuple[Warp, ...] = ()
+) -> WarpedCamera:
+    """A frame camera in map coordinates with earth curvature as a correction (Ecker 1991, §4.6.5.2)."""
+    X, Y, Z = frame.center.tolist()
+    correction = CurvatureCorrection((X, Y, Z), nadir_height, radius)
+    return WarpedCamera(frame, (*before, correction), frame.center, 1.0 / radius)
+
+
+_Floats = NDArray[np.float64]
+#: Points on a side of the grid over an image that is followed to the ground: a body may fill little of it.
+_SIDE = 33
+
+
+@dataclass(frozen=True, eq=False)
+class BodyFrameCamera:
+    """A frame image in the axes of its body, over the ground of a project.
+
+    What the body itself hides, on its far side, has no position.
+    """
+
+    frame: FrameCamera
+    """The camera in the axes of the body."""
+    ground: BodyGround
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in pixels."""
+        return self.frame.size
+
+    @property
+    def field(self) -> ImageField | None:
+        """Lens of the frame camera."""
+        return self.frame.field
+
+    @property
+    def breaks(self) -> None:
+        """The mapping is smooth."""
+        return None
+
+    @cached_property
+    def vantage(self) -> Vantage:
+        """Above the middle of what it sees."""
+        w, h = self.size
+        rows, columns = np.linspace(-0.5, h - 0.5, _SIDE), np.linspace(-0.5, w - 0.5, _SIDE)
+        xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        return vantage_over(self.ground, self.frame.center[None], lambda level: self.rays(xy, level)[0])
+
+    def project_homogeneous(self, XYZ: ArrayLike) -> _Floats:
+        """Ground (..., 3) to ideal (x·w, y·w, w), w = depth in metres; NaN behind the body."""
+        P = self.ground(XYZ)
+        out = self.frame.project_homogeneous(P)
+        out[self._hidden(P)] = np.nan
+        return out
+
+    def derivatives(self, XYZ: ArrayLike) -> _Floats:
+        """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN behind the camera and the body."""
+        P = self.ground(XYZ)
+        out = self.frame.derivatives(P) @ self.ground.jacobian(XYZ)
+        out[self._hidden(P)] = np.nan
+        return np.asarray(out)
+
+    def rays(self, xy: ArrayLike, height: ArrayLike | None = None) -> tuple[_Floats, _Floats]:
+        """Image points (..., 2) to rays: the point of the ray at `height` and its tangent there, each (..., 3).
+
+        `height` is one number or one for each point. NaN where a ray passes the body.
+        """
+        if height is None:
+            raise UsageError("rays over a body are curved on the map; give a height")
+        xy = np.asarray(xy, float)
+        S, d = self.frame.rays(xy.reshape(-1, 2))
+        point, tangent = meet(self.ground, S, d, np.broadcast_to(np.asarray(height, float), xy.shape[:-1]).ravel())
+        return point.reshape(*xy.shape[:-1], 3), tangent.reshape(*xy.shape[:-1], 3)
+
+    def _hidden(self, P: _Floats) -> NDArray[np.bool_]:
+        """Return whether the lowest ground there may be lies between the camera and points (..., 3) of the body."""
+        a, b = (radius + heights_of(self.ground)[0] for radius in self.ground.radii)
+        s = self.frame.center / (a, a, b)
+        way = P / (a, a, b) - s
+        # Where on the way the centre of the body, a sphere now, is nearest.
+        part = np.clip(-(way @ s) / (way**2).sum(axis=-1), 0.0, 1.0)
+        return np.asarray(((s + part[..., None] * way) ** 2).sum(axis=-1) < 1.0)
+
 
 _Doubles = NDArray[np.float64]
 

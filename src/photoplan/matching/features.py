@@ -22,8 +22,7 @@ from scipy.sparse.csgraph import connected_components
 
 from photoplan.adjustment.least_squares import cauchy, solve
 from photoplan.arrays import Floats, Floats32, Ints, Mask
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Lens
+from photoplan.cameras.lenses import Interior, Lens
 from photoplan.codec import storable
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window

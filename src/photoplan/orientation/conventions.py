@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photoplan.arrays import Floats, Ints
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Lens
+from photoplan.cameras.lenses import Interior, Lens
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, InputError, PhotoplanError
 from photoplan.geometry.bounds import HIGHEST_FLIGHT

@@ -14,9 +14,8 @@ from photoplan.adjustment.least_squares import levenberg, spread
 from photoplan.adjustment.statistics import reach_t
 from photoplan.arrays import Floats, Ints, Mask
 from photoplan.cameras.base import Camera, project
-from photoplan.cameras.build import oriented_camera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, Lens, NoLens, field_limited
+from photoplan.cameras.framed import oriented_camera
+from photoplan.cameras.lenses import Brown, Interior, Lens, NoLens, field_limited
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.pose import UNKNOWNS, Pose, skew, small_rotations
 from photoplan.orientation.bundle.equations import by_coefficient

@@ -15,7 +15,7 @@ from photoplan.geometry.grid import Window
 from photoplan.kernels.anchors import FIGURES, ground_errors, interpolate_trilinear
 from photoplan.kernels.weights import KERNELS
 from photoplan.surfaces.base import Surface
-from photoplan.targets.base import Target
+from photoplan.targets.map import Target
 
 #: Distance of an image corner from the principal point, 23 cm film format, metres (Ecker 1991, tables 4.2, 4.3).
 FILM_CORNER = 0.140

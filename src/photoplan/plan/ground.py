@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from photoplan.geometry.grid import Window
 from photoplan.kernels.anchors import owned_bounds
 from photoplan.kernels.terrain import height_ranges
-from photoplan.targets.base import Target
+from photoplan.targets.map import Target
 
 #: Side of the squares with heights of their own from which it is found what a tile needs of a source, pixels.
 SQUARE = 64

@@ -18,7 +18,7 @@ from photoplan.plan.footprint import Tile, Tiles
 from photoplan.plan.ground import TileGround
 from photoplan.plan.sources import Drawn, Feather, Ownership, Share
 from photoplan.surfaces.base import Surface
-from photoplan.targets.base import Target
+from photoplan.targets.map import Target
 
 #: Columns from the edge of a part of an image within which another part may leave something to it.
 _NEAR = 8.0

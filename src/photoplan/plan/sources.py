@@ -21,8 +21,7 @@ from photoplan.plan.ground import TileGround
 from photoplan.plan.options import Weights
 from photoplan.surfaces.base import Lattice, Surface, Terrain
 from photoplan.surfaces.objects import ObjectSurface, RaisedSurface, without_objects
-from photoplan.targets.base import Target
-from photoplan.targets.map import MapTarget
+from photoplan.targets.map import MapTarget, Target
 
 #: Nodes of directions along a side of a tile.
 _NODES = 5

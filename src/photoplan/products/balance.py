@@ -1,4 +1,4 @@
-"""Colour balance of the images of a project."""
+"""Ground that single images show where nothing hides it: in memory, at a coarse resolution."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from photoplan.adjustment.least_squares import spread
 from photoplan.cameras.base import project as into_image
 from photoplan.cameras.curvature import MapProjection
-from photoplan.engine.execute import MOST_SOURCE_BYTES, Source, render
+from photoplan.engine.execute import MOST_SOURCE_BYTES, Painted, Source, render
 from photoplan.engine.executors import executor_factory
 from photoplan.engine.run import steps, tiles_in_flight
 from photoplan.errors import GeometryError, InputError, PhotoplanError, UsageError
@@ -35,9 +35,9 @@ from photoplan.plain import pick
 from photoplan.plan.anchors import AnchorRule
 from photoplan.plan.footprint import Bounds, Tile, Tiles, covered_tiles
 from photoplan.plan.product import ProductPlan
+from photoplan.plan.sources import InSight
 from photoplan.products.orthophoto.mosaic import refuse_mixed
 from photoplan.products.orthophoto.plan import Looked, look_at, two_figures
-from photoplan.products.orthophoto.shown import shown
 from photoplan.products.plausibility import one_colour_told
 from photoplan.products.run import BASE_MEMORY, load_on_target, question, refuse_inputs
 from photoplan.project.cameras import is_there
@@ -48,6 +48,23 @@ from photoplan.requests.ortho import BalanceRequest
 from photoplan.surfaces.base import LevelSurface
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
+
+_KERNEL, _TOLERANCE = "bilinear", 0.5
+
+
+def shown(scene: Scene, grid: MapGrid, window: Window, side: int) -> Painted:
+    """Return what an image shows of a window of a map whose tiles have a side; nothing where the ground is hidden."""
+    rule = AnchorRule.of(_KERNEL, _TOLERANCE)
+    plan = ProductPlan(
+        name="shown",
+        sources=("image",),
+        target=MapTarget(grid),
+        rule=rule,
+        tiles=Tiles.every(grid.window, side),
+        owners=InSight(),
+    )
+    return render(plan, Tile(0, window, (0,)), scene.sources, scene.surface, _KERNEL)
+
 
 #: Pairs of neighbours that are looked at, places along both axes of what a pair may have in common, pixels of a window.
 _PAIRS, _PLACES, _SIDE = 6, 5, 16
@@ -124,7 +141,7 @@ def _means(scene: Scene, XYZ: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-_KERNEL, _TOLERANCE = "bilinear", 0.1
+_REFERENCE_KERNEL, _REFERENCE_TOLERANCE = "bilinear", 0.1
 
 
 @dataclass(frozen=True)
@@ -140,7 +157,7 @@ class Reference:
 
     def pixels(self, grid: MapGrid, window: Window) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
         """Return its pixels in a window of the map, (bands, height, width), and where there are any; None if none."""
-        rule = AnchorRule.of(_KERNEL, _TOLERANCE)
+        rule = AnchorRule.of(_REFERENCE_KERNEL, _REFERENCE_TOLERANCE)
         plan = ProductPlan(
             name="reference",
             sources=("reference",),
@@ -148,7 +165,7 @@ class Reference:
             rule=rule,
             tiles=Tiles.every(grid.window, 512),
         )
-        made = render(plan, Tile(0, window), (_source(self),), LevelSurface(0.0), _KERNEL)
+        made = render(plan, Tile(0, window), (_source(self),), LevelSurface(0.0), _REFERENCE_KERNEL)
         if made.values is None or made.valid is None:
             return None
         return made.values.astype(np.float32), made.valid

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Lens
+from photoplan.cameras.lenses import Interior, Lens
 from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Result, noted

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.fiducials import (
     MODELS,
     AffineFacts,
@@ -23,8 +22,8 @@ from photoplan.cameras.fiducials import (
     film_shrinkage,
     residuals_on_film,
 )
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Lens
+from photoplan.cameras.framed import oriented_camera
+from photoplan.cameras.lenses import Interior, Lens
 from photoplan.errors import GeometryError, InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.findings import Estimate, Result, noted, raise_failed, with_sigma

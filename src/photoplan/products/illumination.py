@@ -31,8 +31,7 @@ from photoplan.radiometry.illumination import LightModel, LitGround, estimate_li
 from photoplan.radiometry.tone import fitted
 from photoplan.requests.ortho import IlluminationRequest
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.options import Lighting
-from photoplan.terrain.shading import directions, even_slopes
+from photoplan.terrain.shading import Lighting, directions, even_slopes
 
 #: Windows along both axes from which parameters are estimated, and their side, pixels.
 _ALONG, _SIDE = 8, 64

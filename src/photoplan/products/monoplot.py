@@ -30,7 +30,7 @@ from photoplan.project.error_model import known_height_errors
 from photoplan.project.ground import Ground, ground_of, open_terrain
 from photoplan.project.scene import input_files
 from photoplan.requests.measure import MonoplotRequest
-from photoplan.terrain.monoplot import REASONS, MonoplotErrors, MonoplotPoints, monoplot
+from photoplan.terrain.analysis import REASONS, MonoplotErrors, MonoplotPoints, monoplot
 
 #: Points higher than this above the bare ground lie on objects, metres.
 _ON_OBJECT = 0.01

@@ -29,8 +29,7 @@ from photoplan.plan.sources import GivenOwners
 from photoplan.project.ground import open_terrain
 from photoplan.public import described, file_of
 from photoplan.surfaces.base import LevelSurface, Surface
-from photoplan.targets.base import Target
-from photoplan.targets.map import MapTarget
+from photoplan.targets.map import MapTarget, Target
 
 _SAVED_TILE = 512
 

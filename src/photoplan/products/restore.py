@@ -35,7 +35,7 @@ from photoplan.io.store import (
 )
 from photoplan.plain import pick
 from photoplan.plan.footprint import Tile, Tiles
-from photoplan.products.chromatic import load_chromatic, measured_once, model_figures, model_lines, save_chromatic
+from photoplan.products.measured_filter import load_chromatic, measured_once, model_figures, model_lines, save_chromatic
 from photoplan.project.align import AlignStep
 from photoplan.project.steps import (
     PART,

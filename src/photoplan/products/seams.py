@@ -33,8 +33,7 @@ from photoplan.io.store import (
     write_run_record,
 )
 from photoplan.io.vector_layer import check_vectors, label_polygons, read_regions, write_regions
-from photoplan.products.balance import Survey, survey
-from photoplan.products.orthophoto.shown import shown
+from photoplan.products.balance import Survey, shown, survey
 from photoplan.products.plausibility import one_colour_told
 from photoplan.products.run import BASE_MEMORY, load_on_target, question
 from photoplan.project.scene import Attempts, SceneAddress, input_files, refuse_unusable

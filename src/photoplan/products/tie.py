@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import CentralCamera, Projection, Rays, project
-from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.curvature import MapProjection
+from photoplan.cameras.framed import oriented_camera
 from photoplan.cameras.observed import ImagePoints
 from photoplan.engine.run import Steps, Store, steps
 from photoplan.errors import GeometryError, InputError, UsageError

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from photoplan.cameras.base import Camera, CentralCamera
-from photoplan.cameras.build import oriented_camera
-from photoplan.cameras.line_correction import displaced, map_axes
+from photoplan.cameras.correctable import displaced, map_axes
+from photoplan.cameras.framed import oriented_camera
 from photoplan.cameras.rpc import RationalFunctions, RpcCamera
 from photoplan.errors import InputError
 from photoplan.geometry.heights import height_step

@@ -23,7 +23,7 @@ from photoplan.project.ground import Ground, ground_of, open_relief, open_terrai
 from photoplan.project.scene import SceneAddress, ScenesAddress, on_target, surface_of
 from photoplan.surfaces.hybrid import HeightErrors, RasterHeightErrors, StatedHeightErrors
 from photoplan.surfaces.objects import ObjectSurface
-from photoplan.targets.base import Target
+from photoplan.targets.map import Target
 
 #: Cameras are moved by so many standard deviations: far above rounding, and small where an angle is badly known.
 _STEP = 1 / 16

@@ -45,11 +45,10 @@ from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.units import MeasuredTerrain, MemoryUnits
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import BuildPlan, Built
-from photoplan.terrain.calibration import ClassFigures, SigmaFactor
 from photoplan.terrain.clean import Finding
 from photoplan.terrain.covariance import Covariance, near_lines
-from photoplan.terrain.fit import TerrainFit
-from photoplan.terrain.settings import FAMILIES
+from photoplan.terrain.fit import ClassFigures, SigmaFactor, TerrainFit
+from photoplan.terrain.observations import FAMILIES
 
 #: Neighbourhoods that are looked at, points of each, and classes of distance.
 _BLOCKS, _POINTS, _CLASSES = 160, 60, 14

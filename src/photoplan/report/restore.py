@@ -14,10 +14,9 @@ from photoplan.arrays import Floats, Mask
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.balance import BalanceReport
-from photoplan.products.chromatic import model_figures
 from photoplan.products.describe import FileFacts, place_of
 from photoplan.products.illumination import IlluminationReport
-from photoplan.products.measured_filter import DesignedPart, MeasuredFilter
+from photoplan.products.measured_filter import DesignedPart, MeasuredFilter, model_figures
 from photoplan.products.restore import FoundFilter, Job, RestoredImage, RestoreReport
 from photoplan.project.align import AlignStep
 from photoplan.project.steps import FallOffStep, fall_off_line, load_filter, restoration_of

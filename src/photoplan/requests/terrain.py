@@ -20,7 +20,7 @@ from photoplan.request import (
     opt,
     path_or,
 )
-from photoplan.terrain.options import ContourOptions, Lighting
+from photoplan.terrain.shading import ContourOptions, Lighting
 
 
 def _model() -> Path:

@@ -9,19 +9,8 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from photoplan.errors import InputError, UsageError
-from photoplan.request import (
-    DRY_RUN,
-    EXECUTOR,
-    MEMORY,
-    ONE_WORKER,
-    OVERWRITE,
-    WORKERS,
-    Request,
-    arg,
-    crs_option,
-    opt,
-)
-from photoplan.terrain.options import Lighting
+from photoplan.request import DRY_RUN, EXECUTOR, MEMORY, ONE_WORKER, OVERWRITE, WORKERS, Request, arg, crs_option, opt
+from photoplan.terrain.shading import Lighting
 
 Colour = tuple[int, int, int]
 #: Coefficient of refraction that is usual by day (Ecker 1991, §5.7.6).

@@ -35,8 +35,7 @@ from photoplan.kernels.rays import (
     pyramid_of,
     set_column_slopes,
 )
-from photoplan.targets.base import Target
-from photoplan.targets.map import MapTarget
+from photoplan.targets.map import MapTarget, Target
 
 #: Bytes of parts, with their pyramids, that are kept for the next rays, if all are as large as the last one.
 CACHE = 128 << 20

@@ -25,8 +25,7 @@ from photoplan.surfaces.base import (
     carried_positions,
     follow_fan,
 )
-from photoplan.targets.base import Target
-from photoplan.targets.map import MapTarget
+from photoplan.targets.map import MapTarget, Target
 
 #: Cells whose ranges are kept (8 bytes each): single posts in small grids, squares of 2, 4, 8 … posts in larger ones.
 MOST_CELLS = 2_000_000

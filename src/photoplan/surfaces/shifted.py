@@ -12,7 +12,7 @@ from photoplan.cameras.base import Camera, Rays
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.base import Hits, Lattice, LevelSurface, Terrain, chords
 from photoplan.surfaces.objects import ObjectSurface
-from photoplan.targets.base import Target
+from photoplan.targets.map import Target
 
 #: A curved ray is followed along chords that it leaves by less than this, metres …
 CURVED = 1e-4

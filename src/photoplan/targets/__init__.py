@@ -5,8 +5,7 @@ from photoplan.public import public
 __getattr__, __dir__, __all__ = public(
     __name__,
     {
-        "targets.base": "Target",
-        "targets.map": "MapTarget",
+        "targets.map": "Target MapTarget",
         "targets.view": "FrameBundle ViewTarget Panorama",
         "geometry.grid": "MapGrid Placement Window",
     },

@@ -1,13 +1,37 @@
-"""The orthophoto's target: a map grid with height as depth."""
+"""Targets in general, and the map: pixels (u, v), depth h, and where they are on the ground."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.geometry.grid import MapGrid, Placement, Window
+from photoplan.geometry.grid import Breaks, MapGrid, Placement, Window
+
+
+class Target(Protocol):
+    """The product's own coordinates: pixel (u, v) = (column, row) and depth h, and where they are on the ground."""
+
+    @property
+    def window(self) -> Window:
+        """All pixels of the product."""
+        ...
+
+    @property
+    def breaks(self) -> Breaks | None:
+        """Columns and rows, in pixels, at which `to_ground` is bent (facets of a profile); None: nowhere."""
+        ...
+
+    @property
+    def placement(self) -> Placement:
+        """Where they lie in the product's own plane: on the map, on a wall; what its file states."""
+        ...
+
+    def to_ground(self, uvh: ArrayLike) -> NDArray[np.float64]:
+        """(u, v, h) of shape (..., 3) to ground X, Y, Z of the same shape."""
+        ...
 
 
 @dataclass(frozen=True)

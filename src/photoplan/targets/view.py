@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import CentralCamera, project
-from photoplan.cameras.build import taken_apart
 from photoplan.cameras.curvature import EarthBend, Exaggeration, Warp
+from photoplan.cameras.framed import taken_apart
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Placement, Window
 from photoplan.geometry.pose import Pose, dot

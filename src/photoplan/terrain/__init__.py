@@ -6,10 +6,9 @@ __getattr__, __dir__, __all__ = public(
     __name__,
     {
         "terrain.build": "BuildPlan Built build_terrain plan_build",
-        "terrain.settings": "BuildSettings",
-        "terrain.options": "ContourOptions Lighting",
-        "terrain.shading": "aspect directions hillshade slope_degrees surface_slopes",
+        "terrain.observations": "BuildSettings",
+        "terrain.shading": "ContourOptions Lighting aspect directions hillshade slope_degrees surface_slopes",
         "terrain.volume": "volume_between",
-        "terrain.flow": "flow_of",
+        "terrain.analysis": "flow_of",
     },
 )

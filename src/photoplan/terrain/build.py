@@ -18,9 +18,8 @@ from photoplan.surfaces.mesh import build_faces, on_grid, thin
 from photoplan.surfaces.units import LineElement, MeasuredTerrain, MeshFaces, Unit, UnitFigures, UnitLayout
 from photoplan.terrain.clean import domain_of
 from photoplan.terrain.fit import TerrainFit, fit
-from photoplan.terrain.observations import Observations, observe
+from photoplan.terrain.observations import BuildSettings, Observations, observe
 from photoplan.terrain.predict import Domain, calibrated, predict_lines, predict_unit, with_chords
-from photoplan.terrain.settings import BuildSettings
 
 #: Gaps are bridged up to twice this many spacings.
 _REACH = 10.0

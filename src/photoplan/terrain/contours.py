@@ -19,7 +19,7 @@ from photoplan.geometry.grid import Window
 from photoplan.kernels.contour import count_segments, cross_edges, fill_segments, link_segments, smooth_line, thin_line
 from photoplan.surfaces.raster import HeightGrid
 from photoplan.surfaces.units import LineElement, MeshFaces, Unit, UnitSource
-from photoplan.terrain.options import ContourOptions
+from photoplan.terrain.shading import ContourOptions
 
 Bounds = tuple[float, float, float, float]
 """xmin, ymin, xmax, ymax, metres."""

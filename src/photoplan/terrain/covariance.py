@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 from photoplan.adjustment.least_squares import solve, spread
 from photoplan.codec import storable
 from photoplan.kernels.prediction import block_score, sides_of, total_score
-from photoplan.terrain.observations import Observations
-from photoplan.terrain.settings import FAMILIES, BuildSettings
+from photoplan.terrain.observations import FAMILIES, BuildSettings, Observations
 
 #: How many of the nearest data are taken …
 POINTS, LINES = 72, 56
@@ -118,7 +117,7 @@ class Covariance:
     """A covariance function: variance · correlation(distance / length), and the noise of mass points."""
 
     family: int
-    """Number of the family, see `photoplan.terrain.settings.FAMILIES`."""
+    """Number of the family, see `photoplan.terrain.fit.FAMILIES`."""
     variance: float
     """Variance of the signal, m²."""
     length: float

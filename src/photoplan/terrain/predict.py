@@ -15,9 +15,19 @@ from scipy.spatial import cKDTree
 from photoplan.events import Map
 from photoplan.kernels.prediction import predict
 from photoplan.surfaces.units import LineElement, Unit, between_data
-from photoplan.terrain.calibration import HeldOut, Surroundings, calibrate, joined, signal_share
 from photoplan.terrain.covariance import Neighbours
-from photoplan.terrain.fit import REACH, TerrainFit, choose, lines_of, unit_of
+from photoplan.terrain.fit import (
+    REACH,
+    HeldOut,
+    Surroundings,
+    TerrainFit,
+    calibrate,
+    choose,
+    joined,
+    lines_of,
+    signal_share,
+    unit_of,
+)
 from photoplan.terrain.observations import Observations, lines_apart, paraboloids, patches_at, quadtree
 
 #: A prepared polygon builds its index when it is first asked, and GEOS does not guard that against other threads.

@@ -1,4 +1,4 @@
-"""Hillshade, slope, aspect and height tints of any surface, at the pixels of a map grid.
+"""Shaded relief, slope and tint: options and kernels.
 
 Slopes come from the surface itself: differences of its heights half a pixel to the left and right and above and below
 each pixel's centre. Inside a face they are the face's own; a breakline shows in the pixels that it passes and in no
@@ -17,10 +17,39 @@ from scipy.ndimage import uniform_filter1d
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.terrain import gradients, illumination
+from photoplan.request import Request, opt
 from photoplan.surfaces.base import Surface, Terrain
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.options import Lighting
+
+
+class ContourOptions(Request):
+    """Which contours are traced, and how."""
+
+    interval: float = opt("Height difference of neighbouring contours, metres.", gt=0, metavar="M")
+    base: float = opt("Height that contours are counted from, metres.", 0.0)
+    index: int = opt("Number of contours from one index contour to the next; 0 for none.", 5, ge=0)
+    smooth: bool = opt("Smooth lines inside their band; they never cross.", False)
+    simplify: bool = opt("Leave out vertices inside the band; lines never cross.", False)
+    band: float = opt("Half width of the band, as a part of the interval.", 0.25, gt=0, lt=0.5)
+    shortest: float = opt("Leave out lines shorter than this, metres.", 0.0, ge=0)
+
+
+class Lighting(Request):
+    """Direction of the light, and exaggeration of the terrain."""
+
+    azimuth: float = opt("Direction of the sun, degrees clockwise from north.", 315.0)
+    altitude: float = opt("Height of the sun above the horizon, degrees.", 45.0, gt=0, le=90)
+    exaggeration: float = opt("Factor of all heights.", 1.0, ge=0.01, le=1000)
+    # At the azimuth, 45 degrees to its right, and 45 and 90 to its left, weighted by the squared cosine of the angle
+    # between their azimuth and the slope's, as `gdaldem hillshade -multidirectional` has it.
+    multidirectional: bool = opt("Four suns instead of one.", False)
+
+    @property
+    def level(self) -> float:
+        """Light on flat ground, 0 to 1."""
+        return math.sin(math.radians(self.altitude))
+
 
 #: Half the distance of two posts at most over which slopes are means, pixels.
 _WIDEST = 64

@@ -38,7 +38,7 @@ from numpy.polynomial import Chebyshev, polynomial
 from pydantic import Field, model_validator
 
 from photoplan.arrays import Floats
-from photoplan.cameras.line_correction import LineCorrection, PoseErrors, TrackSpline
+from photoplan.cameras.correctable import LineCorrection, PoseErrors, TrackSpline
 from photoplan.cameras.pushbroom import ChippedLine, LineCamera
 from photoplan.cameras.pushbroom_rays import LineBend, LineLook, LineTrack
 from photoplan.errors import HeightSystemError, InputError

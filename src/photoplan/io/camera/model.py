@@ -25,8 +25,7 @@ from pydantic import (
 )
 
 from photoplan.cameras.fiducials import MODELS, FiducialFit, fit_marks
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, Fisheye, Lens, NoLens, OpenCV, RadialTable, Reversed
+from photoplan.cameras.lenses import Brown, Fisheye, Interior, Lens, NoLens, OpenCV, RadialTable, Reversed
 from photoplan.cameras.marks import EachMark, Marks
 from photoplan.errors import InputError
 from photoplan.io.files import build, check_input_name

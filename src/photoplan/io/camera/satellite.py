@@ -36,11 +36,10 @@ import numpy as np
 import rasterio
 
 from photoplan.arrays import Floats
-from photoplan.cameras.body_frame import BodyFrameCamera
 from photoplan.cameras.fiducials import Affine2D
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, Cubic, Lens, NoLens, OpenCV, Reversed
+from photoplan.cameras.framed import BodyFrameCamera
+from photoplan.cameras.lenses import Brown, Cubic, Interior, Lens, NoLens, OpenCV, Reversed
 from photoplan.cameras.pushbroom_rays import to_sphere
 from photoplan.cameras.rpc import RationalFunctions
 from photoplan.errors import InputError

@@ -15,8 +15,7 @@ from pydantic.json_schema import SkipJsonSchema
 
 from photoplan.arrays import Floats
 from photoplan.cameras.fiducials import Affine2D, FiducialFit
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Lens
+from photoplan.cameras.lenses import Interior, Lens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import area_fault, bounds_fault, odd_angles, odd_place
 from photoplan.geometry.frames import CylinderFrame, ImageFrame, WallFrame

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from photoplan.adjustment.statistics import chance_gain
 from photoplan.arrays import Floats, Ints
-from photoplan.cameras.corrected import CurvatureCorrection
 from photoplan.cameras.curvature import Refraction, local_pose
+from photoplan.cameras.framed import CurvatureCorrection
 from photoplan.cameras.observed import GroundPoints, ObservedAttitudes, ObservedPositions
 from photoplan.errors import GeometryError, PhotoplanError
 from photoplan.geometry.heights import HeightStep

@@ -12,10 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import Camera
-from photoplan.cameras.correctable import FORMS, Correctable, CorrectableLine, CorrectableRpc, TrackPriors
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import Brown, NoLens, OpenCV, Reversed
-from photoplan.cameras.line_correction import TURNED, LineCorrection, map_axes
+from photoplan.cameras.correctable import (
+    FORMS,
+    TURNED,
+    Correctable,
+    CorrectableLine,
+    CorrectableRpc,
+    LineCorrection,
+    TrackPriors,
+    map_axes,
+)
+from photoplan.cameras.lenses import Brown, Interior, NoLens, OpenCV, Reversed
 from photoplan.errors import HeightSystemError, InputError, UsageError
 from photoplan.geometry.heights import OPTIONS, check_height_system, declared_pair, height_step
 from photoplan.geometry.local import LocalFrame

@@ -9,10 +9,20 @@ import numpy as np
 from photoplan.errors import InputError
 from photoplan.findings import Chart, Estimate, Findings, Subject, Table, Trace, joined, known
 from photoplan.io.series import ReducedPoint
-from photoplan.products.characterise import dark, pattern
-from photoplan.products.characterise.common import SettingsRun, exposure_runs, of_one_temperature, tried, used_and_rest
-from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.transfer import reduced_level
+from photoplan.products.characterise.data import (
+    SeriesData,
+    Setting,
+    SettingsRun,
+    exposure_runs,
+    of_one_temperature,
+    tried,
+    used_and_rest,
+)
+from photoplan.products.characterise.noise import analyse_dark_signal as analyse_dark
+from photoplan.products.characterise.noise import analyse_fixed_pattern as analyse_pattern
+from photoplan.products.characterise.noise import missing_for_dark_signal as missing_dark
+from photoplan.products.characterise.noise import missing_for_fixed_pattern as missing_pattern
+from photoplan.products.characterise.noise import reduced_level
 from photoplan.quality.camera.photon_transfer import EmvaPoints, EmvaSheet, emva_sheet
 from photoplan.quality.camera.sensor import Level, cut_off, dark_current
 
@@ -30,7 +40,7 @@ _TAKEN = (
 _Point = tuple[float, float | None, Level]
 
 
-def missing(data: SeriesData) -> str | None:
+def missing_for_emva1288(data: SeriesData) -> str | None:
     """Return what the series lacks."""
     if len(data.series.reduced_of("flat")) >= _LEAST:
         return None if data.series.reduced_of("dark") else "reduced figures of dark frames"
@@ -43,12 +53,13 @@ def _runs(data: SeriesData) -> list[SettingsRun]:
     return exposure_runs(data, ("flat",), _LEAST)
 
 
-def analyse(data: SeriesData) -> Findings:
+def analyse_emva1288(data: SeriesData) -> Findings:
     """Sheets of every plane and run."""
     if data.series.reduced_of("flat"):
         return _of_reduced(data)
     outcomes = []
-    others = [module.analyse(data) for module in (pattern, dark) if module.missing(data) is None]
+    parts = ((missing_pattern, analyse_pattern), (missing_dark, analyse_dark))
+    others = [found(data) for lacks, found in parts if lacks(data) is None]
     for run in _runs(data):
         for plane in data.planes:
             of = Subject(plane.name, run.label)

@@ -1,11 +1,11 @@
-"""The analyses of a camera: what each needs, and the function that does it. Adding one is a line here and a module.
+"""The analyses of a camera: what each needs, and its functions. Adding one is a line here and two functions.
 
-The module of an analysis holds two functions::
+The module of an analysis NAME holds::
 
-    def missing(data: SeriesData) -> str | None     # None: it can run; else what the series lacks, one sentence
-    def analyse(data: SeriesData) -> Findings       # figures with sigmas, tables, plots, refusals
+    def missing_for_NAME(data: SeriesData) -> str | None  # None if it can run; else what the series lacks, one sentence
+    def analyse_NAME(data: SeriesData) -> Findings        # figures with sigmas, tables, plots, refusals
 
-`analyse` raises `InputError` if nothing can be known; it refuses single figures in `Findings.refused`.
+`analyse_NAME` raises `InputError` if nothing can be known; it refuses single figures in `Findings.refused`.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ class Analysis:
     needs: str
     """Frames that it needs, for the documentation and dry runs."""
     module: str
-    """Holds `missing` and `analyse`; imported when it is asked."""
+    """Module of its two functions; imported when it is asked."""
 
     def missing(self, data: SeriesData) -> str | None:
         """Return what the series lacks for it, or None."""
-        return cast(Callable[[SeriesData], str | None], self._function("missing"))(data)
+        return cast(Callable[[SeriesData], str | None], self._function("missing_for"))(data)
 
     def analyse(self, data: SeriesData) -> Findings:
         """Run it."""
         return cast(Callable[[SeriesData], Findings], self._function("analyse"))(data)
 
     def _function(self, name: str) -> object:
-        return getattr(importlib.import_module(f"photoplan.products.characterise.{self.module}"), name)
+        return getattr(importlib.import_module(f"photoplan.products.characterise.{self.module}"), f"{name}_{self.name}")
 
 
 #: In the order of the report.
@@ -49,7 +49,7 @@ ANALYSES: tuple[Analysis, ...] = (
         "photon_transfer",
         "Photon transfer",
         "flat frames, two or more at each of three or more brightnesses (dark frames improve it)",
-        "transfer",
+        "noise",
     ),
     Analysis(
         "noise",
@@ -61,59 +61,59 @@ ANALYSES: tuple[Analysis, ...] = (
         "dark_signal",
         "Dark signal",
         "dark frames at three or more exposures (at two or more temperatures: the doubling temperature)",
-        "dark",
+        "noise",
     ),
-    Analysis("linearity", "Linearity", "flat or scene frames at three or more exposures or illuminations", "linearity"),
-    Analysis("wedge", "Grey wedge", "wedge frames with three or more densities", "wedge"),
+    Analysis("linearity", "Linearity", "flat or scene frames at three or more exposures or illuminations", "response"),
+    Analysis("wedge", "Grey wedge", "wedge frames with three or more densities", "response"),
     Analysis(
         "saturation",
         "Saturation",
         "flat or scene frames at four or more exposures or illuminations, the longest of them saturated",
-        "saturation",
+        "response",
     ),
     Analysis(
         "blooming",
         "Blooming",
         "scene frames of a bright object at four or more exposures, from unsaturated to saturated",
-        "blooming",
+        "response",
     ),
     Analysis(
         "fixed_pattern",
         "Fixed pattern",
         "two or more dark frames (DSNU) and two or more flat frames (PRNU) at one setting",
-        "pattern",
+        "noise",
     ),
-    Analysis("defects", "Defect elements", "dark or flat frames, two or more at a setting", "defects"),
+    Analysis("defects", "Defect elements", "dark or flat frames, two or more at a setting", "noise"),
     Analysis(
         "emva1288",
         "EMVA 1288 release 4",
         "flat frames or reduced figures with photons per pixel, and dark ones at the same exposures",
         "emva",
     ),
-    Analysis("fall_off", "Light fall-off", "flat frames (dark frames at their exposure improve it)", "fall_off"),
-    Analysis("drift", "Brightness drift", "drift frames with times, ten or more", "drift"),
+    Analysis("fall_off", "Light fall-off", "flat frames (dark frames at their exposure improve it)", "response"),
+    Analysis("drift", "Brightness drift", "drift frames with times, ten or more", "stability"),
     Analysis(
         "gain_control",
         "Automatic gain control",
         "step frames with times: one entry per transition, eight or more frames after it",
-        "gain",
+        "response",
     ),
     Analysis(
         "line_jitter",
         "Line jitter",
         "plumb frames: a straight vertical edge (two parallel ones, a horizontal one as control)",
-        "jitter",
+        "stability",
     ),
     Analysis(
         "warm_up",
         "Warm-up drift",
         "target frames with times, or a table of positions; two targets for scale",
-        "warm_up",
+        "stability",
     ),
     Analysis(
         "stage",
         "Stage calibration",
         "stage frames with stage coordinates, or a table of positions; four points or more",
-        "stage",
+        "stability",
     ),
 )

@@ -17,8 +17,7 @@ from photoplan.io.series import Plane, Series, grey_step, largest_of_steps, read
 from photoplan.io.store import write_atomically
 from photoplan.io.tables import write_table
 from photoplan.plain import pick, plain
-from photoplan.products.characterise.common import SettingsRun, exposure_runs
-from photoplan.products.characterise.data import SeriesData
+from photoplan.products.characterise.data import SeriesData, SettingsRun, exposure_runs
 from photoplan.products.characterise.registry import ANALYSES, Analysis
 from photoplan.quality.camera.photon_transfer import FullWell, full_well
 from photoplan.requests.quality import CharacteriseRequest

@@ -33,8 +33,17 @@ from photoplan.products.dtm.rasters import GridOptions, write_grid
 from photoplan.project.ground import OpenTerrain, open_terrain
 from photoplan.requests.terrain import FlowRequest, VisibleRequest, VolumeRequest
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.flow import CELL_BYTES, Flow, flow_of, snapped
-from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights, parts
+from photoplan.terrain.analysis import (
+    CELL_BYTES,
+    Flow,
+    Observer,
+    SightSettings,
+    flow_of,
+    horizon,
+    needed_heights,
+    parts,
+    snapped,
+)
 from photoplan.terrain.volume import TILE, ErrorModel, Volume, VolumeSettings, VolumeSigma, volume_between, volume_sigma
 
 

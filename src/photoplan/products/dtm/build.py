@@ -33,13 +33,13 @@ from photoplan.io.vector_layer import read_features
 from photoplan.plain import pick
 from photoplan.project.ground import open_terrain
 from photoplan.requests.terrain import BuildRequest, RefineRequest
+from photoplan.surfaces.hybrid import LinedUnits, RasterUnits, refine_units
 from photoplan.surfaces.raster import RasterSurface
-from photoplan.surfaces.refined_units import LinedUnits, RasterUnits, refine_units
 from photoplan.surfaces.units import LineElement, MeasuredTerrain, Unit, UnitFigures, unit_range
 from photoplan.terrain.build import BuildPlan, Built, build_terrain, plan_build
-from photoplan.terrain.calibration import ClassFigures
 from photoplan.terrain.clean import Finding, clean
-from photoplan.terrain.settings import BuildSettings
+from photoplan.terrain.fit import ClassFigures
+from photoplan.terrain.observations import BuildSettings
 
 #: Bytes that a build needs for each point, measured; more than the machine has is refused before any work.
 _BYTES_PER_POINT = 700

@@ -25,8 +25,8 @@ from photoplan.io.vector_layer import ContourRow, LabelRow, contour_files, read_
 from photoplan.plain import pick
 from photoplan.project.ground import OpenTerrain, open_terrain
 from photoplan.requests.terrain import ContourRequest, ProfileRequest, SampleRequest
-from photoplan.surfaces.profile import profile
 from photoplan.surfaces.raster import RasterSurface
+from photoplan.surfaces.seen import profile
 from photoplan.terrain.contours import (
     ContourLine,
     Labeller,
@@ -36,7 +36,7 @@ from photoplan.terrain.contours import (
     trace_contours,
     unit_parts,
 )
-from photoplan.terrain.options import ContourOptions
+from photoplan.terrain.shading import ContourOptions
 
 PART = 100_000
 """Points that are in memory at once."""

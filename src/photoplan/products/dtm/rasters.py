@@ -31,8 +31,7 @@ from photoplan.project.ground import OpenTerrain, open_terrain
 from photoplan.requests.terrain import ExportRequest, PictureRequest, ShadeRequest, SlopeRequest, TintRequest
 from photoplan.targets.map import MapTarget
 from photoplan.terrain import shading
-from photoplan.terrain.options import Lighting
-from photoplan.terrain.shading import surface_slopes
+from photoplan.terrain.shading import Lighting, surface_slopes
 
 GridTile = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]] | None
 """Values (bands, h, w); or values and validity (h, w), True = valid; or None: nothing is valid."""

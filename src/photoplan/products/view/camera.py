@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.build import oriented_camera, taken_apart
 from photoplan.cameras.curvature import EarthBend, Exaggeration, Warp
-from photoplan.cameras.interior import Interior
-from photoplan.cameras.lenses import NoLens
+from photoplan.cameras.framed import oriented_camera, taken_apart
+from photoplan.cameras.lenses import Interior, NoLens
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.bounds import odd_place
 from photoplan.geometry.local import LocalFrame, earth_radius

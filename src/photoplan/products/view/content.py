@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from photoplan.cameras.base import CentralCamera, Projection
-from photoplan.cameras.build import taken_apart
 from photoplan.cameras.curvature import MapProjection
+from photoplan.cameras.framed import taken_apart
 from photoplan.engine.execute import Reader, Source, render
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label, crs_step, same_crs
@@ -35,10 +35,9 @@ from photoplan.project.scene import open_scene
 from photoplan.requests.view import ContentRequest
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.seen import LIFT_OF_POINTS, LinesOfSight, Seen, SeenLines, SeenSurface, best_photos
-from photoplan.targets.base import Target
+from photoplan.targets.map import Target
 from photoplan.targets.view import ViewTarget
-from photoplan.terrain.options import Lighting
-from photoplan.terrain.shading import RAMPS, Ramp, built_in_ramp, directions, shaded
+from photoplan.terrain.shading import RAMPS, Lighting, Ramp, built_in_ramp, directions, shaded
 
 #: Colours of slopes, at degrees.
 SLOPES = Ramp(

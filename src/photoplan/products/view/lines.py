@@ -23,7 +23,7 @@ from photoplan.project.ground import open_terrain
 from photoplan.requests.view import CameraRequest, LinesRequest, number_in
 from photoplan.surfaces.seen import Lines
 from photoplan.terrain.contours import trace_contours
-from photoplan.terrain.options import ContourOptions
+from photoplan.terrain.shading import ContourOptions
 
 T = TypeVar("T")
 Colour = tuple[int, int, int]

@@ -57,8 +57,7 @@ from photoplan.requests.view import (
 )
 from photoplan.surfaces.seen import LinesOfSight, Seen, SeenSurface, ground_size
 from photoplan.targets.view import Bundle, FrameBundle, ViewTarget
-from photoplan.terrain.options import Lighting
-from photoplan.terrain.shading import directions
+from photoplan.terrain.shading import Lighting, directions
 
 _LUMINANCE = (0.299, 0.587, 0.114)
 
