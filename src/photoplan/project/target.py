@@ -13,7 +13,7 @@ from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.bounds import HIGHEST_FLIGHT, odd_place
 from photoplan.geometry.frames import CylinderFrame, Frame, ImageFrame, WallFrame
 from photoplan.geometry.heights import HeightStep
-from photoplan.io.project.model import PlacedTarget, Project, TargetEntry
+from photoplan.io.project.model import PlacedTarget, Project, StatedTarget
 from photoplan.plan.footprint import Bounds, image_border
 from photoplan.project.ground import ground_of, open_relief
 from photoplan.project.scene import Scene, open_scene
@@ -102,9 +102,9 @@ def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | No
     return _along(project, name, next(iter(_numbers(last)), math.nan), text)
 
 
-def stated_target(project: Project, text: str) -> TargetEntry:
+def stated_target(project: Project, text: str) -> StatedTarget:
     """Return the target of a project of this name, or the one that the text describes."""
-    return project.targets.get(text) or TargetEntry(frame=text)
+    return project.targets.get(text) or StatedTarget(frame=text)
 
 
 def with_target(

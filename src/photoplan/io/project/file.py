@@ -26,7 +26,7 @@ from photoplan.io.project.model import (
     OrthoDefaults,
     Project,
     StatedTerrain,
-    TargetEntry,
+    StatedTarget,
 )
 from photoplan.io.raster_info import read_info
 from photoplan.io.store import write_atomically
@@ -123,7 +123,7 @@ def _objects(objects: Objects) -> list[str]:
     return ["[[objects]]", *_given(objects, comments), ""]
 
 
-def _target(name: str, target: TargetEntry) -> list[str]:
+def _target(name: str, target: StatedTarget) -> list[str]:
     comments = {
         "frame": "wall:X,Y,Z,AZIMUTH[,TILT], vault:…, column:… or image:NAME[,DISTANCE]",
         "relief": "offset of the surface from the frame, metres, or a raster of offsets",

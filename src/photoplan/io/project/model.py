@@ -549,7 +549,7 @@ class Objects(Entry):
 Bounds = tuple[Number, Number, Number, Number]
 
 
-class TargetEntry(Entry):
+class StatedTarget(Entry):
     """A wall, vault, column or image that products lie on instead of the map."""
 
     frame: Annotated[str, Field(min_length=1, max_length=4000)]
@@ -578,7 +578,7 @@ def _frame_kind(frame: Any) -> str:
     return "image" if "distance" in names else "cylinder" if "radius" in names else "wall"
 
 
-class PlacedTarget(TargetEntry):
+class PlacedTarget(StatedTarget):
     """A target with its frame as numbers, in the height system of the cameras: what a worker needs of it."""
 
     space: Annotated[
@@ -730,7 +730,7 @@ class Project(Entry):
     cameras: dict[Name, Camera] = Field(default_factory=dict)
     images: tuple[AnyImage, ...]
     ortho: OrthoDefaults = OrthoDefaults()
-    targets: dict[Name, TargetEntry] = Field(default_factory=dict)
+    targets: dict[Name, StatedTarget] = Field(default_factory=dict)
     """Walls, vaults, columns and images that products can lie on, by their names."""
     target: SkipJsonSchema[PlacedTarget | None] = None
     """The target on which the products at hand lie; None for the map. A project file does not state it."""
