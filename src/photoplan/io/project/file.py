@@ -25,8 +25,8 @@ from photoplan.io.project.model import (
     Orientation,
     OrthoDefaults,
     Project,
-    StatedTerrain,
     StatedTarget,
+    StatedTerrain,
 )
 from photoplan.io.raster_info import read_info
 from photoplan.io.store import write_atomically
