@@ -28,8 +28,8 @@ from photoplan.kernels.weights import KERNELS
 _MOST_PROCESSES, _WORTH = 8, 3.0
 
 
-class Pixels(NamedTuple):
-    """Pixels of the images: what decides which variants of the resampling kernels are needed."""
+class PixelSignatures(NamedTuple):
+    """PixelSignatures of the images: what decides which variants of the resampling kernels are needed."""
 
     dtype: str = "uint8"
     bands: int = 3
@@ -59,7 +59,7 @@ def signatures() -> tuple[Signature, ...]:
 
 def compile_for(
     commands: Sequence[str],
-    pixels: Sequence[Pixels],
+    pixels: Sequence[PixelSignatures],
     begin: Callable[[int], None],
     done: Callable[[], None],
     processes: int | None = None,
@@ -86,7 +86,7 @@ def compile_for(
     return len(jobs)
 
 
-def _wanted(commands: Sequence[str], pixels: Sequence[Pixels]) -> dict[tuple[str, str], float]:
+def _wanted(commands: Sequence[str], pixels: Sequence[PixelSignatures]) -> dict[tuple[str, str], float]:
     """Return kernels and types, each once, with seconds."""
     wanted: dict[tuple[str, str], float] = {}
     for row in signatures():
