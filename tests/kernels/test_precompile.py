@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from photoplan.kernels import numba_internals, precompile
-from photoplan.kernels.precompile import Pixels, signatures, text_of, types_of
+from photoplan.kernels.precompile import PixelSignatures, signatures, text_of, types_of
 
 #: The list is of use where the cache is.
 pytestmark = pytest.mark.skipif(not numba_internals.USABLE, reason="nothing is compiled, or by documented ways alone")
@@ -31,7 +31,7 @@ if sys.argv[2] == "dead":
 told = []
 for command in sys.argv[1].split(","):
     began = time.process_time()
-    count = compile_for([command], [precompile.Pixels()], told.append, lambda: told.append("done"), 2)
+    count = compile_for([command], [precompile.PixelSignatures()], told.append, lambda: told.append("done"), 2)
     print(command, count, *told, time.process_time() - began < 0.05)
     told.clear()
 """  # noqa: E501
@@ -55,7 +55,7 @@ def test_every_line_names_a_kernel_and_its_arguments():
     for row in signatures():
         assert row.seconds >= 0.1 and row.commands
         function = precompile._dispatcher(row.kernel).py_func
-        for pixels in (Pixels(), Pixels("float32", 1, "lanczos3")):
+        for pixels in (PixelSignatures(), PixelSignatures("float32", 1, "lanczos3")):
             for kernel, text in precompile._wanted(row.commands, [pixels]):
                 if kernel == row.kernel:
                     kinds = types_of(kernel, text)
@@ -86,8 +86,8 @@ def test_a_command_finds_all_that_it_needs(tmp_path):
 import sys
 from photoplan.cli.main import run
 from photoplan.events import COMPILATIONS
-from photoplan.kernels.precompile import Pixels, compile_for
-compile_for([sys.argv[1]], [Pixels()], lambda n: None, lambda: None)
+from photoplan.kernels.precompile import PixelSignatures, compile_for
+compile_for([sys.argv[1]], [PixelSignatures()], lambda n: None, lambda: None)
 before = COMPILATIONS.kernels
 assert run(sys.argv[1:]) == 0
 print(COMPILATIONS.kernels - before)

@@ -13,7 +13,7 @@ from photoplan.events import COMPILING, Events
 from photoplan.findings import Result
 from photoplan.io.files import read_toml, resolve_input
 from photoplan.io.raster_info import read_info
-from photoplan.kernels.precompile import Pixels, compile_for
+from photoplan.kernels.precompile import PixelSignatures, compile_for
 from photoplan.plain import pick
 from photoplan.requests.project import WarmupRequest
 
@@ -41,7 +41,7 @@ class WarmupReport(Result):
 def warm_up(request: WarmupRequest, commands: Sequence[str], events: Events) -> WarmupReport:
     """Compile the kernels of commands, by their names in the list of kernels."""
     began = time.perf_counter()
-    pixels = [Pixels(dtype, request.bands, request.kernel) for dtype in request.dtypes]
+    pixels = [PixelSignatures(dtype, request.bands, request.kernel) for dtype in request.dtypes]
     count = _compile(commands, pixels, events, request.workers)
     return WarmupReport(tuple(commands), count, time.perf_counter() - began)
 
@@ -51,18 +51,20 @@ def compile_before(command: str, request: Any, events: Events) -> None:
     if getattr(request, "dry_run", False) or getattr(request, "plan_file", None) is not None:
         return
     with suppress(Exception):
-        pixels = Pixels(kernel=getattr(request, "kernel", None) or Pixels().kernel)
+        pixels = PixelSignatures(kernel=getattr(request, "kernel", None) or PixelSignatures().kernel)
         project = getattr(request, "project", None)
         _compile([command], [_of_images(Path(project), pixels) if project is not None else pixels], events)
 
 
-def _compile(commands: Sequence[str], pixels: Sequence[Pixels], events: Events, processes: int | None = None) -> int:
+def _compile(
+    commands: Sequence[str], pixels: Sequence[PixelSignatures], events: Events, processes: int | None = None
+) -> int:
     return compile_for(
         commands, pixels, lambda count: events.begin(COMPILING, count, "kernels"), lambda: events.done(), processes
     )
 
 
-def _of_images(project: Path, pixels: Pixels) -> Pixels:
+def _of_images(project: Path, pixels: PixelSignatures) -> PixelSignatures:
     """Return the kind of pixels of a project's first image.
 
     Raises
@@ -73,4 +75,4 @@ def _of_images(project: Path, pixels: Pixels) -> Pixels:
     table = read_toml(project)[0]
     info = read_info(resolve_input(project.resolve().parent, table["images"][0]["file"]))
     stated = table.get("ortho", {}).get("kernel", pixels.kernel)
-    return Pixels(str(info.dtype), info.bands, stated if pixels == Pixels() else pixels.kernel)
+    return PixelSignatures(str(info.dtype), info.bands, stated if pixels == PixelSignatures() else pixels.kernel)
