@@ -135,10 +135,15 @@ def test_a_target_of_the_project_has_a_relief_of_its_own(made: Made, tmp_path: P
         (("--target", "south"), "target south; give `map`, `wall:"),
         (("--target", "wall:500000,5300000,100,0", "--bounds", -2, -1, 2, 1), "it stands behind the target"),
         (("--target", "wall:500000,5300000,100,180", "--bounds", 2, -1, -2, 1), "are empty"),
+        (("--target", "wall:500000,5300000,100,180", "--bounds", -2, -1, 2, 1, "--relief", "nan"), "relief: "),
+        (("--target", "wall:500000,5300000,100,180", "--bounds", -2, -1, 2, 1, "--relief-sigma", -1), "sigma: "),
+        (("--target", "wall:500000,5300000,100,180", "--bounds", -2, -1, 2, 1, "--relief", "i0.tif"), "i0.tif"),
+        (("--target", "wall:1e300,5300000,100,180", "--bounds", -2, -1, 2, 1), "wall:1e300"),
+        (("--target", "itself", "--bounds", -2, -1, 2, 1), "target itself; give `map`"),
     ],
 )
 def test_what_cannot_be_is_refused(words: tuple[object, ...], told: str, tmp_path: Path) -> None:
-    made = write(wall(), tmp_path)
+    made = write(wall(), tmp_path, '[targets.itself]\nframe = "itself"\n')
     said = inside("ortho", made.path, "--resolution", PIXEL, "--output", tmp_path / "o", *words)
     assert said.code in (2, 3, 4) and told in said.err, said.err
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from photoplan.cameras.base import Camera
 from photoplan.errors import GeometryError, InputError, UsageError
@@ -71,10 +73,13 @@ def target_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | No
 
     A user states heights in the system of the orientation; the frame is in that of the cameras.
     """
-    if text in project.targets:
-        stated = project.targets[text]
-        frame, own = target_frame(project, stated.frame)
-        return frame, stated.bounds or own
+    stated = stated_target(project, text)
+    frame, own = _stated_frame(project, stated.frame)
+    return frame, stated.bounds or own
+
+
+def _stated_frame(project: Project, text: str) -> tuple[Frame | None, Bounds | None]:
+    """The frame that a text describes, which is no name of a target, and the bounds that it has by itself."""
     kind, _, rest = text.partition(":")
     if text == "map":
         return None, None
@@ -139,27 +144,34 @@ def with_target(
         if relief is not None or sigma is not None:
             raise UsageError("`relief` and `relief_sigma` require `target`; over the map the terrain is the surface")
         return project
-    stated = stated_target(project, text)
-    given = {
+    asked = {
         name: _number_or_path(value) for name, value in (("relief", relief), ("sigma", sigma)) if value is not None
     }
-    stated = stated.model_copy(update=given)
-    frame, own = target_frame(project, stated.frame)
+    try:
+        stated = StatedTarget(**{**dict(stated_target(project, text)), **asked})
+    except ValidationError as error:
+        raise UsageError(f"target {text}: " + "; ".join(_told(each) for each in error.errors())) from None
+    frame, own = _stated_frame(project, stated.frame)
     if frame is None:
         return project
     if isinstance(stated.relief, str):
         path = project.resolve(stated.relief)
         surface, over = open_relief(path)
-        if over is not None and target_frame(project, over)[0] != frame:
+        if over is not None and _stated_frame(project, over)[0] != frame:
             raise InputError(f"{path}: its heights lie over {over}, not over {stated.frame}")
         own = surface.bounds
     around = bounds or stated.bounds or own
     if around is None:
         raise UsageError(f"target {text}: it has no end; set `bounds`, u and v on it in metres")
-    if not (around[0] < around[2] and around[1] < around[3]):
+    if not (all(map(math.isfinite, around)) and around[0] < around[2] and around[1] < around[3]):
         raise UsageError(f"target {text}: bounds {around} are empty; they are lowest u, lowest v, highest u, highest v")
     placed = PlacedTarget(**{**dict(stated), "space": frame, "bounds": around})
     return project.model_copy(update={"target": placed})
+
+
+def _told(error: Any) -> str:
+    """A fault of an entry: its name and what is wrong."""
+    return f"{error['loc'][0] if error['loc'] else 'entry'}: {error['msg'].removeprefix('Value error, ').lower()}"
 
 
 def _number_or_path(text: str) -> float | str:

@@ -752,6 +752,8 @@ class Project(Entry):
             names.add(image.name)
             if isinstance(image, Image):
                 self._check_posed(image, where)
+        if "map" in self.targets:
+            raise ValueError("[targets.map]: `map` is the map itself; give the target another name")
         unknown = [name for name in self.adjustment.calibrate if name not in self.cameras]
         if unknown:
             raise ValueError(f"[adjustment] calibrate: camera {unknown[0]!r} is not described")
