@@ -15,7 +15,7 @@ from pydantic import Field, Strict, ValidationError, model_validator
 from photoplan.arrays import Floats
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.camera.model import Entry, Name, NotNegative, Number, Pair, Pixels, Positive
+from photoplan.io.camera.model import LARGEST, Entry, Name, NotNegative, Number, Pair, Pixels, Positive
 from photoplan.io.disk import gdal_settings, open_raster
 from photoplan.io.files import build, explain, finite, read_entries, read_head, read_text, read_toml
 from photoplan.io.product import DESCRIPTION
@@ -25,7 +25,7 @@ from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.store import write_atomically
 from photoplan.io.tables import Columns, read_table
 
-_MAX_BYTES = 10_000_000
+_MAX_BYTES, _FEW_BYTES = 10_000_000, 1_000_000
 _Side = Annotated[int, Strict(), Field(gt=0, le=10_000_000)]
 _Power = Annotated[int, Strict(), Field(ge=0, le=8)]
 _Numbers = Annotated[tuple[Number, ...], Field(min_length=2, max_length=65_536)]
@@ -99,7 +99,6 @@ def write_balance_file(path: Path, size: tuple[int, int], description: str, band
     write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
-_MAX_BYTES_FALL_OFF_FILE = 1_000_000
 _Degree = Annotated[int, Strict(), Field(ge=-20, le=20)]
 
 
@@ -137,7 +136,7 @@ class FallOffEntry(Entry):
 
 def read_fall_off_entry(path: Path) -> FallOffEntry:
     """Contents of a correction file."""
-    return read_entries(path, FallOffEntry, _MAX_BYTES_FALL_OFF_FILE)
+    return read_entries(path, FallOffEntry, _FEW_BYTES)
 
 
 def fall_off_text(entry: FallOffEntry) -> str:
@@ -157,7 +156,6 @@ def _stated(entries: Iterable[tuple[str, Any]]) -> list[str]:
     return [f"{name} = {toml_value(value)}" for name, value in entries if value not in (None, "")]
 
 
-_MAX_BYTES_CHROMATIC_FILE = 1_000_000
 _Band = Annotated[int, Strict(), Field(ge=1, le=1000)]
 _ChromaticPower = Annotated[int, Strict(), Field(ge=0, le=5)]
 _Count = Annotated[int, Strict(), Field(ge=0)]
@@ -187,7 +185,7 @@ class ChromaticFile(Entry):
 
 def read_chromatic(path: Path) -> ChromaticFile:
     """A model of lateral chromatic aberration."""
-    return read_entries(path, ChromaticFile, _MAX_BYTES_CHROMATIC_FILE)
+    return read_entries(path, ChromaticFile, _FEW_BYTES)
 
 
 def write_chromatic(path: Path, contents: Mapping[str, Any], bands: Sequence[Mapping[str, Any]]) -> None:
@@ -435,14 +433,10 @@ class MatrixFile:
         return np.where(True if valid is None else valid, pixels, np.nan)
 
 
-_MAX_BYTES_SENSOR_FILE = 1_000_000
-#: Nothing that is described is larger, or smaller than its reciprocal; it keeps every figure finite.
-_LARGEST_SENSOR_FILE = 1e15
-
-Amount = Annotated[float, Strict(), Field(ge=1 / _LARGEST_SENSOR_FILE, le=_LARGEST_SENSOR_FILE, allow_inf_nan=False)]
-LimitedNotNegative = Annotated[float, Strict(), Field(ge=0, le=_LARGEST_SENSOR_FILE, allow_inf_nan=False)]
+#: Nothing that is described is larger than LARGEST, or smaller than its reciprocal; it keeps every figure finite.
+Amount = Annotated[float, Strict(), Field(ge=1 / LARGEST, le=LARGEST, allow_inf_nan=False)]
 Count = Annotated[int, Strict(), Field(gt=0, le=10_000_000)]
-Share = Annotated[float, Strict(), Field(ge=1 / _LARGEST_SENSOR_FILE, le=1, allow_inf_nan=False)]
+Share = Annotated[float, Strict(), Field(ge=1 / LARGEST, le=1, allow_inf_nan=False)]
 Celsius = Annotated[float, Strict(), Field(ge=-273.15, le=300, allow_inf_nan=False)]
 
 
@@ -475,8 +469,8 @@ class Video(Entry):
 
     lines: Count
     line_us: Amount
-    line_blanking_us: LimitedNotNegative = 0.0
-    frame_blanking_us: LimitedNotNegative = 0.0
+    line_blanking_us: NotNegative = 0.0
+    frame_blanking_us: NotNegative = 0.0
     aspect: tuple[Amount, Amount] = (4.0, 3.0)
     kell_factor: Share = 1.0
     fields: Annotated[int, Strict(), Field(ge=1, le=16)] = 2
@@ -534,7 +528,7 @@ class PictureEntry(Entry):
     reference_pixels: tuple[Amount, Amount] | None = None
     bits: Annotated[int, Strict(), Field(ge=1, le=32)] | None = None
     sampling_mhz: Amount | None = None
-    jitter_ns: LimitedNotNegative | None = None
+    jitter_ns: NotNegative | None = None
     grey_step: Amount | None = None
 
     @model_validator(mode="after")
@@ -561,15 +555,15 @@ class Noise(Entry):
 
     signal_e: Amount | None = None
     full_well_e: Amount | None = None
-    dark_e: LimitedNotNegative | None = None
+    dark_e: NotNegative | None = None
     dark_share: Share | None = None
-    dark_current_e_per_s: LimitedNotNegative | None = None
+    dark_current_e_per_s: NotNegative | None = None
     exposure_s: Amount | None = None
     temperature_c: Celsius | None = None
     dark_reference_c: Celsius | None = None
     dark_doubling_c: Annotated[float, Strict(), Field(ge=1, le=1000, allow_inf_nan=False)] = 10.0
-    read_noise_e: LimitedNotNegative | None = None
-    output_capacitance_pf: LimitedNotNegative | None = None
+    read_noise_e: NotNegative | None = None
+    output_capacitance_pf: NotNegative | None = None
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -610,7 +604,7 @@ class SensorDescription(Entry):
 
 def read_sensor(path: Path) -> SensorDescription:
     """The description of a sensor."""
-    described = read_entries(path, SensorDescription, _MAX_BYTES_SENSOR_FILE)
+    described = read_entries(path, SensorDescription, _FEW_BYTES)
     if not described.model_fields_set - {"name", "stated"}:
         raise InputError(
             f"{path}: describes nothing; write at least one of the tables [viewing], [video], [sensor], [image], "

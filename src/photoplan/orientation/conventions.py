@@ -204,18 +204,7 @@ def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Convention, 
         for swapped, direction in product((False, True), DIRECTIONS):
             q = _along(R, poses.centers, sights, direction, swapped)
             for axes, turned, mirrored in others:
-                yield (
-                    Convention(
-                        angle_unit=unit,
-                        rotation=order,
-                        direction=direction,
-                        camera_axes=axes,
-                        turned=turned,
-                        mirrored=mirrored,
-                        swapped=swapped,
-                    ),
-                    q,
-                )
+                yield Convention(unit, order, direction, axes, turned, mirrored, swapped), q
 
 
 def _components(poses: StatedPoses, sights: Sights, reading: Convention) -> Floats:
@@ -273,16 +262,7 @@ class AlternativeConvention:
     @property
     def changes(self) -> int:
         """Differences from the declared reading."""
-        return sum(
-            (
-                self.unit is not None,
-                self.order is not None,
-                self.transposed,
-                self.camera_flipped,
-                self.ground_flipped,
-                self.swapped,
-            )
-        )
+        return sum(getattr(self, name) != getattr(DECLARED, name) for name in _CHANGES)
 
     def sentence(self, mirrored: bool = False) -> str:
         """Say what the user would have to declare or repair; `mirrored`: the scan is stated to be mirrored.
@@ -336,6 +316,7 @@ class AlternativeConvention:
 
 
 DECLARED = AlternativeConvention()
+_CHANGES = ("unit", "order", "transposed", "camera_flipped", "ground_flipped", "swapped")
 
 
 def readings(order: str, unit: str = "deg") -> list[AlternativeConvention]:

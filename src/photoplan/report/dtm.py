@@ -276,19 +276,10 @@ def contours_picture(facts: ContourFacts) -> bytes:
         axes.add_collection(lines)
     axes.set(xlim=(xmin, xmax), ylim=(ymin, ymax), aspect="equal")
     points = max(5.0, 72 / 100 * (facts.text_height or 1.0) / sketch.pixel)
+    style = {"ha": "center", "va": "center", "size": points, "color": "#5a3208"}
     for label in facts.labels:
         box = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
-        axes.text(
-            label.X,
-            label.Y,
-            label.text,
-            rotation=label.angle,
-            ha="center",
-            va="center",
-            size=points,
-            color="#5a3208",
-            bbox=box,
-        )
+        axes.text(label.X, label.Y, label.text, rotation=label.angle, bbox=box, **style)
     return png(figure, dpi=100, facecolor="white")
 
 
@@ -526,9 +517,6 @@ def _errors(
     )
 
 
-#: What lines of each kind are called.
-LINE_WORDS = {"breakline": "breaklines", "formline": "form lines", "border": "border lines", "hole": "holes"}
-
 LINE_COLOURS = {"breakline": "#7a1f00", "formline": PURPLE, "border": INK, "hole": INK}
 _WIDTH = 7.2
 #: Numbers in the map of gross errors.
@@ -671,16 +659,9 @@ def _bar(fig: Any, axes: Any, tints: Any, norm: Any, label: str, extend: str = "
 def _lines_plots(axes: Any, area: ReportMap) -> None:
     for kind in sorted({kind for kind, _ in area.lines}):
         some = [xy for k, xy in area.lines if k == kind]
-        dashes = {"formline": "--", "hole": ":"}.get(kind, "-")
-        axes.add_collection(
-            mpl.collections.LineCollection(
-                some,
-                colors=LINE_COLOURS.get(kind, INK),
-                linewidths=0.5,
-                linestyles=dashes,
-                label=LINE_WORDS.get(kind, kind),
-            )
-        )
+        dashes, colour = {"formline": "--", "hole": ":"}.get(kind, "-"), LINE_COLOURS.get(kind, INK)
+        drawn = {"linewidths": 0.5, "linestyles": dashes, "label": WORDS.get(kind, kind)}
+        axes.add_collection(mpl.collections.LineCollection(some, colors=colour, **drawn))
     if area.lines:
         axes.figure.legend(loc="outside lower center", ncols=4)
 
@@ -792,7 +773,7 @@ def _headline(model: BuildReport, samples: BuildSamples) -> list[tuple[str, str,
 
 
 def _surface(area: ReportMap) -> list[str]:
-    kinds = [LINE_WORDS.get(kind, kind) for kind in sorted({kind for kind, _ in area.lines})]
+    kinds = [WORDS.get(kind, kind) for kind in sorted({kind for kind, _ in area.lines})]
     return [
         figure(
             draw_heights(area),
