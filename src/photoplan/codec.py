@@ -1,4 +1,4 @@
-"""Values as bytes and back: JSON and raw arrays, without any way to run code (unlike `pickle`).
+"""Values as bytes and back: JSON and raw arrays, which (unlike `pickle`) cannot run code.
 
 What may be written is data: numbers, text, bytes, paths, enumerations, arrays of numbers or text, tuples, lists, sets,
 mappings, and data classes that are registered by `storable`. Reading trusts nothing: types are compared with the

@@ -1,4 +1,4 @@
-"""The error tree.
+"""Errors, and the exit code of each.
 
 ::
 

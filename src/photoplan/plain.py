@@ -1,4 +1,4 @@
-"""From values to JSON: the one way to what verbs print, run records hold, and other JSON files.
+"""Conversion of values to JSON, for results of commands, run records, and other JSON files.
 
 A data class becomes an object of its fields, under their names. One whose JSON has other keys says so with a method
 ``json_fields``; `pick` helps it.

@@ -1,4 +1,4 @@
-"""Public names of packages, loaded when they are first used, so that importing a package costs nothing.
+"""Public names of packages, loaded when they are first used, so that importing a package is quick.
 
 Arguments are judged here by the types that requests and functions declare: one path where several may be given, text
 for a path, NumPy's numbers and open datasets are brought into form; what cannot be meant is refused by name. Code

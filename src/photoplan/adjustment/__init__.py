@@ -1,1 +1,1 @@
-"""Least squares once: scales, weights, linear and iterated fits with their accuracy, tests, and blocks of unknowns."""
+"""Least squares: scales, weights, linear and iterated fits with their accuracy, tests, blocks of unknowns."""

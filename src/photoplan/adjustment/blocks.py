@@ -1,4 +1,4 @@
-"""Blocks of unknowns: what they are called, where they stand in the vector of unknowns, how a step changes them.
+"""Blocks of unknowns: their names, their positions in the vector of unknowns, and how a step changes them.
 
 An adjustment asks nothing else of its unknowns. A new kind (the knots of a trajectory, corrections of an RPC) is a
 value with an update rule, a line in the layout, and the rows that have it.

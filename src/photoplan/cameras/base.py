@@ -1,4 +1,4 @@
-"""Projections and cameras in general: everything that maps ground to an image; the rest of photoplan knows no more."""
+"""Camera protocols: projection from ground to image, and rays. The rest of photoplan knows nothing more of a camera."""
 
 from __future__ import annotations
 

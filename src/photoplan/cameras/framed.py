@@ -1,4 +1,4 @@
-"""Cameras in other coordinates: over a wall or a vault, with corrections of image points, and taken apart."""
+"""Cameras in the coordinates of a wall or vault, cameras with corrected image points, and the parts of both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lenses and the interior orientation: Brown, OpenCV, fisheye, tables; Newton's method for the way back."""
+"""Lens distortion and interior orientation: Brown, OpenCV, fisheye, tables; inversion by Newton's method."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fiducial marks of film cameras: descriptions as a project states them, and the patterns that are sought in scans.
+"""Fiducial marks of film cameras: their descriptions in a project, and the patterns to search for in scans.
 
 Lengths are millimetres on the film, angles degrees anticlockwise; x is right and y up about the mark's reference point.
 """

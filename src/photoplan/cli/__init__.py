@@ -1,1 +1,1 @@
-"""The command line, one file per verb."""
+"""The command line: table of commands, options, progress, output and exit codes."""

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first one unwinds what runs; if that takes some seconds, the run is ended as it stands.
+"""Ctrl-C and SIGTERM: the first signal stops the run cleanly; if that takes too long, the process ends at once.
 
 Whatever is on the disk survives death at any moment, so that ending hard costs only the tiles under way.
 """

@@ -1,4 +1,4 @@
-"""Groups of verbs that are imported only when they are used, so that `--help` answers at once."""
+"""Groups of commands that are imported only when they are used, so that `--help` answers at once."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class LazyGroup(click.Group):
                 formatter.write_dl([(name, self.verbs[name].short) for name in names])
         if ctx.parent is None:
             rest = set(self.verbs).difference(*headings.values())
-            with formatter.section("Groups (their commands may also be called without the name of the group)"):
+            with formatter.section("Groups (their commands can also be called without the group name)"):
                 formatter.write_dl([(name, verb.short) for name, verb in self.verbs.items() if name in rest])
 
 

@@ -1,4 +1,4 @@
-"""Results on stdout, messages on stderr, and parameters under the names that the command line gives them.
+"""Results on stdout, messages on stderr, and parameters under their names on the command line.
 
 The library names a parameter in backticks: ``give `overwrite` to replace it``. Here, and nowhere else, that becomes the
 option of the verb that runs: ``give --overwrite to replace it``. `` `report=False` `` becomes ``--no-report``.

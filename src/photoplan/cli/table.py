@@ -1,4 +1,4 @@
-"""The table of commands: a row for each, in groups as a job goes."""
+"""The table of commands: one row each, with request, function, report and drawings, in the usual order of work."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ _PROJECT: dict[str, Verb] = {
         {"picture": "report.restore:draw_filter"},
     ),
     "report": Verb(
-        "Join what the runs of a project found into one report.",
+        "Combine the results of a project's runs in one report.",
         """Write one quality report of PROJECT from the run records that its commands have left.
 
         Records (*.run.json) in the folder of the project and in the folders in it are read. Sections follow the chain:
@@ -180,7 +180,7 @@ _ORIENT: dict[str, Verb] = {
 
 _ORTHO: dict[str, Verb] = {
     "images": Verb(
-        "Make orthophotos.",
+        "Make an orthophoto of each image.",
         """Make an orthophoto of each image: NAME_ortho.tif (a cloud-optimised GeoTIFF) and its run record.
 
         The same command continues a run that was interrupted.
@@ -193,7 +193,7 @@ _ORTHO: dict[str, Verb] = {
     ),
     "mosaic": Verb(
         "Make one orthophoto of many images.",
-        """Make one orthophoto of all images: each pixel from the best of those that see it.
+        """Make one orthophoto of all images; each pixel comes from the best image that sees it.
 
         The area that no image sees is left empty and reported in square metres. The same command continues a run that
         was interrupted.
@@ -205,8 +205,8 @@ _ORTHO: dict[str, Verb] = {
         kernels="mosaic",
     ),
     "object": Verb(
-        "Make a product of each object alone.",
-        """Make a product of each object in POLYGONS alone: NAME_object.tif, its pixels and no others.
+        "Make an orthophoto of each single object.",
+        """Make an orthophoto of each object in POLYGONS: NAME_object.tif, without its surroundings.
 
         POLYGONS holds polygons with heights (GeoPackage, GeoJSON, Shapefile, DXF), CityJSON, or a mesh. Each pixel is
         taken from the best image that sees it. The same command continues a run that was interrupted.
@@ -218,8 +218,8 @@ _ORTHO: dict[str, Verb] = {
         kernels="mosaic",
     ),
     "balance": Verb(
-        "Find tables that make overlapping images agree in colour.",
-        """Find tables by which the images of PROJECT agree in colour where they overlap.
+        "Match the colours of overlapping images.",
+        """Match the colours of the images of PROJECT where they overlap.
 
         Each image gets a file with a table for every band, and an entry `balance` in PROJECT: `ortho` and `mosaic`
         apply it from then on.
@@ -229,19 +229,19 @@ _ORTHO: dict[str, Verb] = {
         {"picture": "report.restore:draw_balance"},
     ),
     "seams": Verb(
-        "Find where images of a mosaic are best joined.",
-        """Find seams between the images of PROJECT where they are least seen.
+        "Find the least visible seams of a mosaic.",
+        """Find the least visible seams between the images of PROJECT.
 
-        They run where two images show the same, around what stands out of the ground. The regions are a GeoPackage with
-        a column `image`, which `photoplan mosaic --seams` takes and QGIS edits.
+        They run where two images look alike, and around anything that rises above the ground. The regions are a
+        GeoPackage with a column `image`: edit it in QGIS, and pass it to `photoplan mosaic --seams`.
         """,
         "requests.ortho:SeamsRequest",
         "products.seams:make_seams",
         {"picture": "report.maps:seams_picture"},
     ),
     "illumination": Verb(
-        "Take the light on slopes, and haze, out of an orthophoto.",
-        """Take the light on slopes, and haze, out of PICTURE, an orthophoto.
+        "Correct an orthophoto for light on slopes, and for haze.",
+        """Correct PICTURE, an orthophoto, for light on slopes, and for haze.
 
         Parameters are estimated from the orthophoto and printed with standard deviations. Slopes in the shadow of
         terrain, and slopes that turn away from the sun, are not corrected.
@@ -254,7 +254,7 @@ _ORTHO: dict[str, Verb] = {
         "Execute a plan written by `ortho --plan`.",
         """Execute PLAN, a GeoPackage written by `photoplan ortho PROJECT --plan PLAN`.
 
-        Inputs that have changed since it was written are refused.
+        The command stops if an input has changed since the plan was written.
         """,
         "requests.ortho:RunRequest",
         "products.orthophoto.make:run_plan",
@@ -462,8 +462,8 @@ _MEASURE: dict[str, Verb] = {
         "products.monoplot:monoplot_file",
     ),
     "register": Verb(
-        "Measure the shift between two images, to a small part of a pixel.",
-        """Measure the shift of SECOND against FIRST, patch by patch, to a small part of a pixel.
+        "Measure the shift between two images, to subpixel accuracy.",
+        """Measure the shift of SECOND against FIRST, patch by patch, to subpixel accuracy.
 
         Both have the same pixels, or places on one map. Each vector, in pixels of FIRST, is the distance of the content
         of a patch from its expected place in SECOND, with its standard deviation.
@@ -528,7 +528,7 @@ _QUALITY: dict[str, Verb] = {
         files="written",
     ),
     "simulate": Verb(
-        "Form an image of a scene with blur, noise, jitter …",
+        "Simulate an image of a scene with blur, noise, jitter …",
         """Form images of a scene with blur, noise, jitter, blooming and all else that a camera does.
 
         SCENE is an image file, or a pattern: flat, edge:ANGLE, bars:PERIOD,ANGLE, star:SECTORS, wedge:STEPS or
@@ -556,7 +556,7 @@ _ALONE: dict[str, Verb] = {
         kernels="surface",
     ),
     "demo": Verb(
-        "Make the orthophotos of the included real block.",
+        "Make orthophotos of the demo images in the package.",
         """Copy the included drone block (18 reduced images of Brighton Beach) to FOLDER and make its orthophotos.
 
         Every step is the command that you would call yourself; it is printed before it runs. A project, images or
@@ -580,10 +580,10 @@ _ALONE: dict[str, Verb] = {
 
 #: Groups by their names, in the order of a job; `surface`, `demo` and `warmup` stand alone.
 GROUPS: dict[str, VerbGroup] = {
-    "project": VerbGroup("Begin, check and describe projects.", _PROJECT),
+    "project": VerbGroup("Create, check and describe projects.", _PROJECT),
     "orient": VerbGroup("Orient images: marks, tie points, control, adjustment.", _ORIENT),
     "ortho": VerbGroup(
-        "Make orthophotos and mosaics, and what belongs to them.",
+        "Make an orthophoto of each image; group of the commands below.",
         _ORTHO,
         words={"": ("images",), "-h": ("images", "-h"), "--help": ("images", "-h")},
     ),
@@ -616,7 +616,7 @@ VERBS: dict[str, Verb | VerbGroup] = {
     **{name: verb for group in GROUPS.values() if group.alone for name, verb in group.verbs.items()},
     **_ALONE,
     **GROUPS,
-    "dtm": replace(GROUPS["terrain"], short="Another name of `terrain`."),
+    "dtm": replace(GROUPS["terrain"], short="Alias of `terrain`."),
 }
 del VERBS["images"]  # which is `ortho`
 #: Headings of the help, and what stands below each.

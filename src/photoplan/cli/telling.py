@@ -1,4 +1,4 @@
-"""Events on stderr: a line that moves on a terminal, a line now and then without one."""
+"""Progress and messages on stderr: one line that is updated on a terminal, occasional lines elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Click commands made from requests: options, defaults that the project states, the run, and what is printed."""
+"""Click commands made from requests: options, defaults of the project file, the run, drawings, printed results."""
 
 from __future__ import annotations
 

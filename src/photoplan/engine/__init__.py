@@ -1,1 +1,1 @@
-"""Tiles executed: the only place where pixels are resampled."""
+"""Execution of tiles: the only place where pixels are resampled."""

@@ -1,5 +1,6 @@
-"""The direct method: pixels of an image are carried to the ground, and lie where they come down (Ecker 1991, §4.6,
-fig. 4.5). Between them gaps are left; what stands in the way of a ray keeps it from ground that is hidden.
+"""The direct method: image pixels are carried to the ground, and painted where they fall (Ecker 1991, §4.6, fig. 4.5).
+
+Gaps remain between them. A pixel whose ray is blocked does not reach the hidden ground behind the obstacle.
 """
 
 from __future__ import annotations

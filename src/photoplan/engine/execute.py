@@ -1,4 +1,4 @@
-"""One tile: compile, read source windows, resample, fill holes, and give the outputs."""
+"""Execution of one tile: compile, read source windows, resample, fill holes, return the outputs."""
 
 from __future__ import annotations
 

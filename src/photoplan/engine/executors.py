@@ -1,4 +1,4 @@
-"""Executors: threads, processes, and Dask clusters; memory and order of tasks."""
+"""Executors: threads, processes and Dask clusters; order of tasks, and tiles in progress at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loop over tiles and steps: progress, resume, sinks."""
+"""The loop over tiles and steps: progress, resuming a killed run, memory limit, and where results go."""
 
 from __future__ import annotations
 

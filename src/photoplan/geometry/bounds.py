@@ -1,4 +1,4 @@
-"""Numbers that are finite and still cannot be meant: angles, places and heights, judged in one place.
+"""Plausibility of numbers: angles, positions and heights that are finite but cannot be right.
 
 Files, tables and options all ask here, so that what is refused in one is refused in the others.
 """

@@ -1,4 +1,4 @@
-"""Coordinate reference systems: what they are, steps between them, and agreement of two of them."""
+"""Coordinate reference systems: axis order (always X east, Y north), transformation, agreement of two systems."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grids, windows, placements and levels of resolution."""
+"""Grids, windows, placements and levels of resolution; the order of pixel coordinates is (column, row)."""
 
 from __future__ import annotations
 

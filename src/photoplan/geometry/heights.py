@@ -1,4 +1,4 @@
-"""Height systems: declared, never guessed, and joined exactly or not at all.
+"""Height systems: declared, never guessed, and transformed exactly or not at all.
 
 A name of a height system is ``"ellipsoidal"``, a vertical CRS (``"EPSG:5773"`` or its WKT), or ``"same"``: declared
 to equal the other input's without being named. None means that nothing is stated.

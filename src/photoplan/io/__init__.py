@@ -1,1 +1,1 @@
-"""Files in and out, one format per file."""
+"""Reading and writing of files, by kind of content."""

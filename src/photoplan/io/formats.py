@@ -1,11 +1,9 @@
-"""File formats of cameras and orientations: the registries, and reading and writing files of any of them.
-
-Camera descriptions from files of any known format.
+"""Registries of camera and orientation file formats; files of any of them are read and written here.
 
 A camera from a calibration report of the U.S. Geological Survey is a camera in photoplan's TOML
 (``docs/templates/usgs-camera.toml`` is a template); beside its ``[cameras.NAME]`` the file may have a table
 ``[report]`` with ``distances_mm``, the printed distances between fiducial marks. Coordinates are typed from paper, and
-a wrong digit would bend every photograph of the camera unseen.
+a wrong digit would bend every image of the camera unnoticed.
 """
 
 from __future__ import annotations

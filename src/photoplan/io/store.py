@@ -1,4 +1,4 @@
-"""Files that survive a crash: staged outputs and their names, tile logs, kept results, run records."""
+"""Files that survive a crash: staged outputs, logs of finished tiles, kept results, run records."""
 
 from __future__ import annotations
 

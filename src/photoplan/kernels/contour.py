@@ -1,4 +1,4 @@
-"""Contour lines of triangles: which edges they cross, where, and in which order.
+"""Contour lines of triangles: the edges that they cross, the crossing points, and their order.
 
 Vertices carry an integer *rank*: the number of the highest level that they reach. Level k crosses an edge when it lies
 above one end's rank and not above the other's; a vertex exactly at a level therefore counts as above it, in every

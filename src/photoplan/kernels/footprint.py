@@ -1,4 +1,4 @@
-"""Footprints of pixels in the source: scales, ellipses, and means over them."""
+"""Footprints of pixels in the source: scales, ellipses, and means over them where a pixel covers many of its pixels."""
 
 from __future__ import annotations
 

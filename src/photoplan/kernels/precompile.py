@@ -1,4 +1,4 @@
-"""Compilation of a command's kernels before its work, in one process per core: the first run waits less.
+"""Compilation of a command's kernels before its work, in one process per core, to shorten the first run.
 
 `signatures.txt` lists kernels with the types that commands call them with, and the seconds that each takes to compile.
 What is missing there, or fails here, is compiled when it is first called.

@@ -1,4 +1,4 @@
-"""Resampling: weighted sums of source pixels under a kernel, at the source's scale and coarser, with validity."""
+"""Resampling: weighted sums of source pixels under a kernel, means where an output pixel covers many, validity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Visibility: lines of sight over a height grid, and triangles of objects in space that hide it."""
+"""Visibility: lines of sight over a height grid, and the ground that objects in space hide from them."""
 
 from __future__ import annotations
 

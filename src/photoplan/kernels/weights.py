@@ -1,4 +1,4 @@
-"""Resampling kernels as polynomials: one row of coefficients per power, one column per tap.
+"""Resampling kernels (bilinear, bicubic, Lanczos) as polynomials: a row for each power, a column for each tap.
 
 A position x lies between the pixels floor(x) and floor(x) + 1; with g = x − floor(x) − 1/2 every weight of the
 nearest, bilinear and bicubic kernels *is* a polynomial in g, and those of the Lanczos kernel are one to 1e-8. So

@@ -1,1 +1,1 @@
-"""Products before their pixels: anchors, tiles, footprints."""
+"""Plans of products before any pixel is computed: anchors, tiles, footprints, source images, accuracy."""

@@ -1,4 +1,4 @@
-"""Accuracy of positions in products, and the error budget."""
+"""Standard deviations of the position of each product pixel, and the error budget."""
 
 from __future__ import annotations
 

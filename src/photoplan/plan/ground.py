@@ -1,4 +1,4 @@
-"""Ground of a tile, the same for all its sources: its relief, and the places of its boxes on the ground."""
+"""Ground of a tile, the same for all its sources: its relief, and the positions of its boxes on the ground."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weights of the score by which a mosaic chooses among its images; without the libraries that pixels need."""
+"""Weights of the score by which a mosaic chooses among its images; imports no library that pixels need."""
 
 from __future__ import annotations
 

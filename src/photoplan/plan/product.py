@@ -1,4 +1,4 @@
-"""A product before its pixels: target, table of sources, tiles, who paints which pixel, how tiles are compiled."""
+"""The plan of a product: target, table of sources, tiles, who paints which pixel, how tiles are compiled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Source image of each pixel of a mosaic: visibility, score, seams and feathering."""
+"""Source image of each pixel of a mosaic: hidden pixels, visibility, score, seams and feathering."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def sight_lines(projection: Projection, target: Target, uvh: NDArray[np.float64]
 
 
 def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) -> NDArray[np.bool_]:
-    """Pixels of a tile that lie in the image, but that something hides."""
+    """Return the pixels of a tile that lie in the image, but that terrain or an object hides."""
     window, target = ground.window, ground.target
     none = np.zeros((window.height, window.width), bool)
     low, high = float(ground.ranges[0].min()), float(ground.ranges[1].max())

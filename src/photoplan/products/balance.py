@@ -1,4 +1,4 @@
-"""Ground that single images show where nothing hides it: in memory, at a coarse resolution."""
+"""Colour balance of a project: sampling its images on common ground, adjustment, and tables in files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Check of a project: plausibility, resolution and sensitivity of its images, by a few windows of their pixels."""
+"""Check of a project: plausibility, resolution and sensitivity of its images, from a few windows of pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Light on slopes and haze, corrected in an orthophoto: parameters from the picture itself, then pixel by pixel."""
+"""Correction of an orthophoto for light on slopes and haze: parameters from its own pixels, then pixel by pixel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Registration: displacements between two images, to a small part of a pixel."""
+"""Registration: displacements between two images, with subpixel accuracy."""
 
 from __future__ import annotations
 

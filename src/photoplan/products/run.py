@@ -1,4 +1,4 @@
-"""Execution of products that are made of images, and protection of their inputs."""
+"""Options of the execution of plans (workers, memory, overwriting), and protection of input files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Seams of a mosaic: where its images are best joined."""
+"""Seams of a mosaic: where to join its images so that the seams are least visible."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""A project's description becomes scenes: cameras, terrain, images with the steps that change their pixels."""
+"""A project's description turned into scenes: cameras, terrain, and images with the steps that change their pixels."""

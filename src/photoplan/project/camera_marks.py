@@ -1,4 +1,4 @@
-"""Appearance of a film camera's fiducial marks: from its description to the patterns that are sought."""
+"""Fiducial marks of a film camera: from their description in a project to the patterns to search for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stated errors of a project's inputs."""
+"""Stated standard deviations of a project's inputs: orientation, cameras, terrain, objects."""
 
 from __future__ import annotations
 

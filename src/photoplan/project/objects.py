@@ -1,4 +1,4 @@
-"""Files of objects become faces on a project's terrain: in its CRS, its heights, and above its ground."""
+"""Files of objects turned into faces on a project's terrain: in its CRS, its heights, and above its ground."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Light on slopes and haze: what they make of grey values, and what is taken off.
+"""Light on slopes and haze: their effect on grey values, and its correction.
 
 Radiometric rectification for which the terrain matters (Ecker 1991, section 4.6.4) is made on the map. The models are
 the usual ones: with i the angle between sun and the normal of the slope, z the sun's zenith angle and V the part of

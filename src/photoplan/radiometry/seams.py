@@ -1,4 +1,4 @@
-"""Seams by minimal cuts."""
+"""Seams between overlapping images, by minimum cuts."""
 
 from __future__ import annotations
 

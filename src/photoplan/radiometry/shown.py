@@ -1,4 +1,4 @@
-"""Grey values of images on a map, by which seams compare them: on pixels of several sizes, kept in a store."""
+"""Grey values of images on a map, which seams compare: at several pixel sizes, kept in a store."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Products as pictures on the map: accuracy, regions, objects; the report of a surface."""
+"""Maps of products: accuracy, source regions, objects; and the report of a surface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of products as soon as each is complete: accuracy, regions of images, objects of a plan as squares."""
+"""Drawings of each product as soon as it is complete: accuracy, source regions, objects of a plan as squares."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views whose lines have labels: the letters are those of all plots."""
+"""Perspective views with labelled lines, in the typeface of all plots."""
 
 from __future__ import annotations
 

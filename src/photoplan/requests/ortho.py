@@ -58,17 +58,17 @@ class Choice(Request):
     weights: Weights = _WEIGHTS
     prefer: tuple[str, ...] = _PREFER
     seams: Path | None = opt(
-        "Regions with their images, that come before the score: an edited NAME_seams.gpkg.", None, metavar="FILE",
-        section="input"
+        "Regions with the image that paints each, in preference to the score: an edited NAME_seams.gpkg.", None,
+        metavar="FILE", section="input"
     )  # fmt: skip
     feather: float = opt(
         "Width of the transition between images along seams, metres, where both see the ground [0].", 0.0, metavar="W"
     )
     blend: Literal["mean", "multiband"] = opt(
-        "All detail passes over the width, or fine detail at the seam and coarse over W.", "mean"
+        "mean: all detail blends over W; multiband: coarse detail over W, fine detail at the seam.", "mean"
     )
     sheets: Annotated[str | float | None, BeforeValidator(lambda given: _number_or_text(given))] = opt(
-        "Squares of SIZE metres or polygons into which it is cut, with STAC items; NAME.vrt shows all.", None,
+        "Cut the mosaic into squares of SIZE metres or into polygons, with STAC items; NAME.vrt joins them.", None,
         metavar="SIZE|FILE", section="result"
     )  # fmt: skip
 
@@ -88,22 +88,22 @@ def _number_or_text(given: Any) -> Any:
 class PixelOptions(Request):
     """Options that decide the pixels and files of all products; those that are not set may be the project's."""
 
-    resolution: float | None = opt("Ground pixel, metres [the images' mean GSD].", None, nan=True, metavar="R")
+    resolution: float | None = opt("Ground pixel size, metres [the images' mean GSD].", None, nan=True, metavar="R")
     bounds: tuple[float, float, float, float] | None = BOUNDS
     kernel: Annotated[Kernel, _one_of("kernel", Kernel)] = opt(
         "Resampling kernel: nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic].", "bicubic", metavar="NAME"
     )
     tolerance: float = opt(
-        "Largest approximation error of the anchors, pixels; 0 if every pixel is computed strictly [0.02].",
+        "Largest approximation error of the anchors, pixels; 0 computes every pixel strictly [0.02].",
         0.02,
         metavar="PX",
     )
     hidden: Annotated[Hidden | None, _one_of("hidden", Hidden)] = opt(
-        "Ground that no image sees: show, nodata, or mark (second raster) [show; mosaics, true orthophotos: nodata].",
+        "Hidden ground: show, nodata, or mark (in a second raster) [show; mosaics, true orthophotos: nodata].",
         None, metavar="HOW"
     )  # fmt: skip
     fill_hidden: int = opt(
-        "Fill hidden holes up to PX wide and high, marked in NAME_sources.tif [0: they stay empty].", 0, ge=0,
+        "Fill hidden holes up to PX wide and high, and mark them in NAME_sources.tif [0: fill none].", 0, ge=0,
         le=MOST_FILLED, metavar="PX"
     )  # fmt: skip
     accuracy: bool = opt("Write a raster of standard deviations, and a preview.", False, section="result")
@@ -112,7 +112,7 @@ class PixelOptions(Request):
         section="result"
     )  # fmt: skip
     nodata: Annotated[str | float, BeforeValidator(str)] = opt(
-        "Value without data: a number, mask, or auto: 0 for integers, NaN for floats.", "auto", section="result"
+        "Nodata value: a number, mask, or auto (0 for integers, NaN for floats).", "auto", section="result"
     )
     overviews: bool = opt("Write overviews into the file [yes].", True, section="result")
     tile: int = opt("Side of a tile, a multiple of 16.", 512, metavar="PX", section="run")
@@ -121,12 +121,12 @@ class PixelOptions(Request):
 class SingleOptions(Request):
     """Options of orthophotos of single images."""
 
-    true: bool = opt("Show objects where they stand, or the ground [ground].", False, other="ground")
+    true: bool = opt("Place objects where they stand, or rectify for the ground alone [ground].", False, other="ground")
     method: Annotated[Method, _one_of("method", Method)] = opt(
-        "indirect: pixels are looked up in the image; direct: its pixels are carried to the ground [indirect].",
+        "indirect: look up each product pixel in the image; direct: carry image pixels to the ground [indirect].",
         "indirect", metavar="NAME"
     )  # fmt: skip
-    fill: int = opt("Distance from which gaps of the direct method are filled, pixels.", 0, metavar="PX")
+    fill: int = opt("Largest distance from which gaps of the direct method are filled, pixels.", 0, metavar="PX")
     stack: str = opt("Show all orthophotos as bands of one raster, NAME.vrt [no].", "", metavar="NAME",
                      section="result")  # fmt: skip
 
@@ -199,11 +199,11 @@ class OnTarget(Request):
 
     target: str = TARGET
     relief: str | None = opt(
-        "Offset of the target's surface along its normal: metres, or a raster by `surface` [0].", None,
+        "Offset of the target's surface along its normal: metres, or a raster made by `surface` [0].", None,
         metavar="M|FILE", section="input"
     )  # fmt: skip
     relief_sigma: str | None = opt(
-        "Standard deviation of these offsets: metres, or a raster by `surface`.", None, metavar="M|FILE",
+        "Standard deviation of these offsets: metres, or a raster made by `surface`.", None, metavar="M|FILE",
         section="input"
     )  # fmt: skip
 
@@ -213,10 +213,12 @@ class ProductRequest(OnTarget, PixelOptions):
 
     project: Path = PROJECT
     images: tuple[str, ...] = IMAGES
-    output: Path | None = opt("Folder of the products [products by the project].", None, folder=True, section="result")
+    output: Path | None = opt(
+        "Folder of the products [products, next to the project].", None, folder=True, section="result"
+    )
     plan_file: Path | None = opt("Write the plan (GeoPackage), and stop.", None, flag="plan", writes=True,
                                   section="run")  # fmt: skip
-    show_quadtree: bool = opt("Show objects of a plan or dry run also as squares.", False, section="result")
+    show_quadtree: bool = opt("Also show the objects of a plan or dry run as squares.", False, section="result")
     force: bool = opt(
         "Continue although an orientation has a FAULT, or the resolution is finer than a quarter of the GSD.", False,
         section="run"
@@ -275,8 +277,8 @@ class ObjectRequest(ProductRequest):
     sources: bool = _SOURCES
     objects: tuple[str, ...] = opt("Objects of the file, or patterns; may be repeated [all].", (), listed=True,
                                    metavar="NAME,…", section="input")  # fmt: skip
-    below: bool = opt("Make also the ground below each object: NAME_below.tif.", False, section="result")
-    layer: str | None = opt("Layer of the file, or type of CityJSON's objects.", None, section="input")
+    below: bool = opt("Also make the ground below each object: NAME_below.tif.", False, section="result")
+    layer: str | None = opt("Layer of the file, or object type in CityJSON.", None, section="input")
     crs: str | None = opt("CRS of a file that states none.", None, metavar="CRS", section="input")
     height_system: str | None = opt(
         "Height system of the file, or `same` as that of the terrain.", None, metavar="NAME", section="input"
@@ -284,8 +286,8 @@ class ObjectRequest(ProductRequest):
     offset: tuple[float, float, float] | None = opt(
         "Offset that is added to all coordinates, metres.", None, metavar="X Y Z", section="input"
     )
-    sigma: tuple[float, float] | None = opt("Standard deviations of the file, metres.", None, metavar="XY Z",
-                                            section="input")  # fmt: skip
+    sigma: tuple[float, float] | None = opt("Standard deviations of the file's coordinates, metres.", None,
+                                            metavar="XY Z", section="input")  # fmt: skip
 
     @property
     def changes(self) -> dict[str, Any]:
@@ -309,8 +311,8 @@ class RunRequest(Request):
 class DemoRequest(Request):
     """Options of the demonstration."""
 
-    folder: Path = arg("Folder that is made.", default=Path("photoplan-demo"), folder=True)
-    resolution: float = opt("Ground pixel, metres.", 0.1)
+    folder: Path = arg("Folder to create.", default=Path("photoplan-demo"), folder=True)
+    resolution: float = opt("Ground pixel size, metres.", 0.1)
     workers: int = ONE_WORKER
     overwrite: bool = OVERWRITE
 
@@ -322,10 +324,10 @@ class SeamsRequest(OnTarget):
     images: tuple[str, ...] = IMAGES
     bounds: tuple[float, float, float, float] | None = BOUNDS
     resolution: float | None = opt(
-        "Size of the pixels along whose edges seams run, metres [256 across an image].", None, gt=0, metavar="R"
+        "Pixel size of the grid on which seams run, metres [256 pixels across an image].", None, gt=0, metavar="R"
     )
     keep: Path | None = opt("Regions whose images stay unchanged.", None, metavar="FILE", section="input")
-    output: Path | None = opt("Regions to write [products/seams.gpkg by the project].", None, metavar="FILE",
+    output: Path | None = opt("Regions to write [products/seams.gpkg, next to the project].", None, metavar="FILE",
                               writes=True)  # fmt: skip
     picture: bool = PICTURE
     dry_run: bool = DRY_RUN
@@ -352,12 +354,12 @@ class BalanceRequest(OnTarget):
     reference: Path | None = opt("Raster on the map whose colours the images take.", None, metavar="FILE",
                                  section="input")  # fmt: skip
     degree: int = opt("Degree of the trend over an image; 0 for tables alone.", 2)
-    factor: bool = opt("Find one factor for each image and band from means, instead of tables.", False)
+    factor: bool = opt("Compute one factor for each image and band from means, instead of tables.", False)
     resolution: float | None = opt(
         "Size of the pixels that are compared, metres [by the images' size].", None, metavar="R"
     )
-    output: Path | None = opt("Folder of the tables [balance by the project].", None, metavar="FOLDER", folder=True,
-                              section="result")  # fmt: skip
+    output: Path | None = opt("Folder of the tables [balance, next to the project].", None, metavar="FOLDER",
+                              folder=True, section="result")  # fmt: skip
     picture: bool = PICTURE
     dry_run: bool = DRY_RUN
     workers: int = ONE_WORKER

@@ -1,4 +1,4 @@
-"""Objects over terrain: faces, polygons in space, quadtree squares."""
+"""Objects over terrain, which hide what is behind them: faces, polygons in space, quadtree squares."""
 
 from __future__ import annotations
 

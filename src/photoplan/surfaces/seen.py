@@ -1,4 +1,4 @@
-"""Profiles: the surface over a polyline, broken wherever the surface bends (Ecker 1991, §5.4.4, fig. 5.9)."""
+"""Profiles: the surface along a polyline, with a point wherever the surface bends (Ecker 1991, §5.4.4, fig. 5.9)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Products' own coordinates and where they are on the ground."""
+"""Targets: the pixel coordinates of products, and where they lie on the ground."""
 
 from photoplan.public import public
 

@@ -1,4 +1,4 @@
-"""Targets in general, and the map: pixels (u, v), depth h, and where they are on the ground."""
+"""Targets in general, and the map: pixels (u, v) with depth h, and where they lie on the ground."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cleaning of measured lines and points."""
+"""Cleaning of measured points and lines before a model is built: repeats, crossings, gaps, points on lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of building a terrain model: grid, covariance function, filter values, gross errors."""
+"""Rejection of gross errors of terrain, and estimation of covariance functions and filter values of a model."""
 
 from __future__ import annotations
 
@@ -324,7 +324,7 @@ class Screened:
 
 
 def screen(seen: Observations, around: Neighbourhoods, limit: float) -> Screened:
-    """Look for gross errors by robust planes and broken borders."""
+    """Find candidates for gross errors by robust planes and broken borders."""
     planes = np.full((seen.points, 3), np.nan)
     used = np.ones(len(seen.xyz), bool)
     fit_planes(seen.xyz, around.near, used, np.arange(seen.points), planes)

@@ -1,4 +1,4 @@
-"""Observations of terrain, grouped into leaves."""
+"""Observations of terrain, and the settings of building a model from them."""
 
 from __future__ import annotations
 

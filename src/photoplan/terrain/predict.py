@@ -1,4 +1,4 @@
-"""Prediction of terrain, also of held-out blocks."""
+"""Prediction of terrain heights, and their test on held-out blocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Descriptions of frame and film cameras, as checked and frozen entries of a project.
+"""Descriptions of cameras and lenses in project and camera files, as checked and frozen entries.
 
 Each knows the lens or the interior orientation that computes. To add a kind of camera, derive it from `CameraEntry` and
 add it to `Camera`; everything else asks the camera.

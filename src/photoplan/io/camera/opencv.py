@@ -1,4 +1,4 @@
-"""Cameras in the forms of other programs: OpenCV's lenses, Brown's with y down, files of OpenCV and orthority.
+"""Cameras in the conventions of OpenCV and Agisoft (Brown, y down), and files of OpenCV and orthority.
 
 Both forms describe the same pixels as photoplan's camera, or there is no such form and None comes back.
 

@@ -1,1 +1,1 @@
-"""Orientations and cameras in everyone's files, one format in each."""
+"""Orientation file formats, one module for each family; the registry is `photoplan.io.formats.FORMATS`."""

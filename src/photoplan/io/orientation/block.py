@@ -1,4 +1,4 @@
-"""Orientations of images as formats read and write them, with what tables of numbers do not state.
+"""Orientations as file formats read and write them; `OrientationFormat`, the declaration of a format.
 
 To add a format, define an `OrientationFormat` of four functions in a module of its family, and add a line to
 `photoplan.io.formats.FORMATS`. Nothing else changes.

@@ -1,4 +1,4 @@
-"""Results written into a project file that exists: only the entries that change, comments and order stay."""
+"""Results written into an existing project file; comments, order and all other entries stay as they are."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Terrain data in and out, one format in each file, and the file of a terrain model."""
+"""Reading and writing of terrain data, one module for each family of formats, and the file of a terrain model."""

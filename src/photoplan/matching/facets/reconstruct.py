@@ -1,4 +1,4 @@
-"""Surface reconstruction with facets from coarse to fine, begun by a search on planes (semi-global matching).
+"""Surface reconstruction with facets from coarse to fine, after a search on planes (semi-global matching).
 
 The planes are those of an object-space sweep (Collins 1996): every image is carried to each of them, where census
 descriptions of their cells are compared. From coarse to fine each post is searched around what the level before found

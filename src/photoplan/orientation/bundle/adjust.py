@@ -1,4 +1,4 @@
-"""The bundle adjustment: frame, the whole run, and causes of misfits."""
+"""Bundle adjustment of a `Block`, on arrays without files: frame, the whole run, and causes of misfits."""
 
 from __future__ import annotations
 

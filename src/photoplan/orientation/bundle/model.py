@@ -1,4 +1,4 @@
-"""The block of a bundle adjustment: observations, unknowns and the model."""
+"""The `Block` of a bundle adjustment: observations, unknowns and settings, and the model built from them."""
 
 from __future__ import annotations
 

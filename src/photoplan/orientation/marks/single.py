@@ -1,4 +1,4 @@
-"""Single marks: edges and ellipses, located alone."""
+"""Location of a single mark by its edges and ellipses."""
 
 from __future__ import annotations
 

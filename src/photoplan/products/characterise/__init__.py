@@ -1,1 +1,1 @@
-"""`photoplan characterise`: the analyses of a camera that a series of frames allows, each in a file."""
+"""`photoplan characterise`: analyses of a camera from a series of frames, each in a module."""

@@ -1,4 +1,4 @@
-"""`photoplan characterise`: everything about a camera that a series of images allows to know."""
+"""`photoplan characterise`: everything that a series of images shows about a camera."""
 
 from __future__ import annotations
 

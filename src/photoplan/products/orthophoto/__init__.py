@@ -1,1 +1,1 @@
-"""Orthophotos: planned, looked at, executed."""
+"""Orthophotos, mosaics and single objects: plans, their inspection, and their execution."""

@@ -1,4 +1,4 @@
-"""Operations that plan products of images and make them, or show and write the plan: one for each command."""
+"""Commands that make orthophotos, mosaics and objects, or print and write their plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The skyline of a view: in every column of the picture the highest ground that is seen, to a small part of a pixel."""
+"""The skyline of a view: the highest visible ground in every column of the rendering, with subpixel accuracy."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Cameras known from series of frames: noise, linearity, patterns, defects, light, time, geometry."""
+"""Cameras measured from series of frames: noise, linearity, patterns, defects, light, time, geometry."""

@@ -1,1 +1,1 @@
-"""Edges of images: found, measured, summed up: spread functions and MTF with intervals."""
+"""Edges of images: found, measured and combined into spread functions and MTF with confidence intervals."""

@@ -1,4 +1,4 @@
-"""The image formation model: what a camera makes of a scene, with the truth beside it.
+"""The image formation model: the image that a camera makes of a scene, and the true image next to it.
 
 Scene → spread → sampling by the pixels' apertures, lines and bands displaced → fall-off → electrons → overflow → smear
 and transfer → noise → gain → edge enhancement → tone curve → whole grey values. Every part is optional; a model without
