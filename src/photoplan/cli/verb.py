@@ -28,18 +28,20 @@ SECTIONS = {"input": "Input", "result": "Result", "method": "Method", "run": "Ru
 
 @dataclass(frozen=True)
 class Verb:
-    """A row of the table of verbs; places are written ``module:name``, below photoplan."""
+    """A command: a row of `photoplan.cli.table`. Functions are written ``module:name``, without ``photoplan.``."""
 
     short: str
     help: str
     request: str
     make: str
     draw: Mapping[str, str] = field(default_factory=dict)
-    """The function that draws a file from the result, by option, option and ending such as ``outputs.png``, or key of
-    `Request.drawn`. That of a folder, such as ``pictures/``, returns pictures by place; `make` has checked places."""
+    """Functions that draw a file (picture, report) from the result. A key is an option, an option with an ending (such
+    as ``outputs.png``), or a key of `Request.drawn`. The function of a folder, such as ``pictures/``, returns drawings
+    by path; `make` has checked the paths."""
     each: str = ""
-    """Function that draws a part of the result as soon as it is announced to the events, and the result, from it, the
-    request and a function that reports whether pictures can be drawn if they are wanted; it returns messages."""
+    """Function that draws each part of the result as soon as it is announced to the events, and the result at the end.
+    It takes the part, the request, and a function that reports whether a wanted drawing is possible, and returns
+    messages."""
     record: str = ""
     """Kind of the run record, for operations that write none themselves."""
     one_by_one: bool = False

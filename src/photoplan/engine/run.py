@@ -182,7 +182,7 @@ class Kept(Generic[T]):
 
 
 def tiles_in_flight(wanted: int, memory: int | None, base: int, each: int) -> int:
-    """Tiles that may be under way at once."""
+    """Return how many tiles may be in progress at once within the memory limit."""
     if memory is None:
         return wanted
     fits = (memory - base) // each

@@ -27,7 +27,7 @@ class Kernel:
     """A separable resampling kernel."""
 
     name: str
-    """What users call it."""
+    """Name that users write, such as ``bicubic``."""
     taps: int
     """Pixels along x and along y that carry weight: 1, 2, 4 or 6."""
     coefficients: NDArray[np.float64]

@@ -188,7 +188,7 @@ def tile_accuracy(
     sources: Mapping[int, SourceErrors],
     owner: NDArray[np.uint16] | None = None,
 ) -> NDArray[np.float32]:
-    """Accuracy of every pixel of a tile."""
+    """Return standard deviations of X, Y, Z and the error ellipse of every pixel of a tile; see `ground_errors`."""
     around = Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2)
     relief = np.asarray(surface.relief(target, around), np.float64)
     slope = _slope(relief)

@@ -332,7 +332,7 @@ class OrientationBlock:
 
 @dataclass(frozen=True)
 class OrientationFormat:
-    """A file format for orientations."""
+    """A file format for orientations; a new one is an instance of this, listed in `photoplan.io.formats.FORMATS`."""
 
     name: str
     """Name as users spell it."""

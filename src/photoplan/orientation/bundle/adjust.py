@@ -249,7 +249,7 @@ _REFITTED = 2
 
 
 def adjust_block(block: Block, settings: AdjustSettings | None = None, progress: Progress | None = None) -> Adjusted:
-    """Adjust a block of images.
+    """Adjust a block of images, given as values and arrays.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
         In a Cartesian system.
     settings : AdjustSettings, optional
     progress : callable, optional
-        Told after each iteration.
+        Called after each iteration.
 
     Raises
     ------

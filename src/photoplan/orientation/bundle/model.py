@@ -78,7 +78,7 @@ class BlockProjection:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Everything that is observed and that is known beforehand."""
+    """Input of a bundle adjustment: cameras, images, observations, and what is known a priori."""
 
     cameras: Mapping[str, BlockCamera]
     images: tuple[BlockImage, ...]
