@@ -51,6 +51,11 @@ def xml_quoted(value: str) -> str:
     return '"' + re.sub("[\t\n\r]", lambda found: f"&#{ord(found[0])};", escaped) + '"'
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, which is plural unless the count is 1."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def advised(least: float, figures: int = 2) -> str:
     """Write the smallest number of some figures that is not below a bound: a user who gives it passes the check."""
     if not (math.isfinite(least) and least > 0):

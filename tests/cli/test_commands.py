@@ -115,7 +115,7 @@ def test_json_is_one_object_and_talk_is_on_stderr(undisturbed: Undisturbed) -> N
         assert product["failed_tiles"] == []
         with rasterio.open(product["path"]) as file:
             assert product["valid_share"] == pytest.approx((file.dataset_mask() > 0).mean(), abs=1e-6)
-    assert "kernel bicubic · tolerance 0.02 px · nodata auto · hidden show · 1 threads" in said.err
+    assert "kernel bicubic · tolerance 0.02 px · nodata auto · hidden show · 1 thread" in said.err
     assert "quick look" in said.err
     names = {f"{n}_ortho{end}" for n in NAMES for end in (".tif", ".run.json")} | {"ortho_overview.png"}
     assert {p.name for p in undisturbed.folder.iterdir()} == names

@@ -31,7 +31,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import placement_of
 from photoplan.io.store import input_entry, locked, run_key, run_times, scratch, together, write_run_record
 from photoplan.io.tables import write_table
-from photoplan.plain import pick
+from photoplan.plain import counted, pick
 from photoplan.plan.anchors import AnchorRule
 from photoplan.plan.footprint import Bounds, Tile, Tiles, covered_tiles
 from photoplan.plan.product import ProductPlan
@@ -365,12 +365,14 @@ class BalanceReport(Result):
         grid, pairs, made = self.survey.grid, self.pairs, self.balanced
         if pairs is None or made is None:
             pixels = f"{grid.width} × {grid.height} pixels of {grid.resolution:g} m"
-            return [f"{len(self.survey.names)} images, compared on {pixels}"]
+            return [f"{counted(len(self.survey.names), 'image')}, compared on {pixels}"]
 
         def row(name: str, *values: NDArray[np.float64]) -> str:
             return f"{name:32}" + "".join(f"  {' '.join(f'{value:6.1f}' for value in each):>24}" for each in values)
 
-        count = f"{len(made.images)} images, {len(pairs.images)} overlaps at {grid.resolution:g} m"
+        count = (
+            f"{counted(len(made.images), 'image')}, {counted(len(pairs.images), 'overlap')} at {grid.resolution:g} m"
+        )
         lines = [f"{count}: rms differences, grey values", f"{'':32}  {'before':>24}  {'after':>24}"]
         lines.append(row("mean of the overlaps", *self.rms()))
         for k in (-pairs.after.mean(axis=1)).argsort()[:_LISTED].tolist():

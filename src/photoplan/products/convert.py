@@ -51,7 +51,7 @@ from photoplan.orientation.conventions import (
     sights_of,
     turn_matrix,
 )
-from photoplan.plain import pick
+from photoplan.plain import counted, pick
 from photoplan.products.budget import write_polynomials
 from photoplan.products.init import camera_name, placed
 from photoplan.products.plausibility import differences, on_map, stated_positions
@@ -90,7 +90,7 @@ class ConvertReport(Result):
     def messages(self) -> Sequence[str]:
         """Return what was converted, what is lost, and how the file was read."""
         nothing = "; nothing is written" if self.dry_run else ""
-        lines = [f"  {self.images} images, from {self.source_format} to {self.target_format}{nothing}"]
+        lines = [f"  {counted(self.images, 'image')}, from {self.source_format} to {self.target_format}{nothing}"]
         lines += [f"  {self.target_format} holds {loss.text}" for loss in self.lost]
         return [*lines, *noted(self.notes)]
 
@@ -324,7 +324,7 @@ class ReadingsReport(Result):
 
     def messages(self) -> Sequence[str]:
         """Return how many points were compared, and notes."""
-        return [f"  medians of {self.points} points in {self.images} images", *noted(self.notes)]
+        return [f"  medians of {counted(self.points, 'point')} in {counted(self.images, 'image')}", *noted(self.notes)]
 
     def _fields(self, found: FittedConvention) -> dict[str, Any]:
         reading = found.reading

@@ -43,7 +43,7 @@ from photoplan.orientation.conventions import fitting_convention, of_resection, 
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
 from photoplan.orientation.marks.locate import FiducialResult, MarkLayout, MarksNotFound, SoughtMark
 from photoplan.orientation.resection import MeasuredPoints, Resected, ResectSettings, resect
-from photoplan.plain import pick
+from photoplan.plain import counted, pick
 from photoplan.products.adjust.inputs import AdjustInputs, decimals_of, read_inputs, stated_accuracy
 from photoplan.products.adjust.sensors import (
     Calibrated,
@@ -561,7 +561,7 @@ class ResectResult(Result):
         if self.left_out:
             names = ", ".join(self.left_out[:5]) + (" …" if len(self.left_out) > 5 else "")
             notes.append(f"{len(self.left_out)} images have fewer than 3 control points: {names}")
-        changed = f"{self.project}: orientation of {len(self.images)} images written"
+        changed = f"{self.project}: orientation of {counted(len(self.images), 'image')} written"
         return [*noted(notes), *([changed] if self.changed else [])]
 
     def raise_failures(self) -> None:
@@ -725,7 +725,7 @@ class ResectedImage:
     def lines(self) -> list[str]:
         """Return the parameters with their standard deviations, and gross errors."""
         found = self.found
-        head = f"{self.image.name}  {int((~found.rejected).sum())} points · redundancy {found.redundancy} · "
+        head = f"{self.image.name}  {counted(int((~found.rejected).sum()), 'point')} · redundancy {found.redundancy} · "
         head += f"sigma0 {found.sigma0:.3g} · rms {found.rms:.2f} px"
         if found.redundancy > 0:
             head += f" · 95 % within {found.reach_95:.1f} times ±"

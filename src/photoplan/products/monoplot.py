@@ -23,7 +23,7 @@ from photoplan.io.project.model import Image, ImageEntry, Project
 from photoplan.io.store import recording
 from photoplan.io.tables import Columns, read_table, write_table
 from photoplan.io.vector_layer import check_vectors, read_features, write_features
-from photoplan.plain import pick
+from photoplan.plain import counted, pick
 from photoplan.plan.footprint import footprint
 from photoplan.project.cameras import camera_without_pixels, pose_of
 from photoplan.project.error_model import known_height_errors
@@ -63,7 +63,7 @@ class MonoplotReport(Result):
 
     def summary(self) -> Sequence[str]:
         """Return counts, reasons, and standard deviations."""
-        lines = [f"{self.met} of {self.points} points on the ground"]
+        lines = [f"{self.met} of {counted(self.points, 'point')} on the ground"]
         lines += [f"  {count} without: {reason}" for reason, count in self.reasons.items()]
         if self.grazing or self.through_holes:
             lines.append(f"  {self.grazing} under less than 5° to the terrain, {self.through_holes} through holes")

@@ -33,6 +33,7 @@ from photoplan.io.store import (
     write_run_record,
 )
 from photoplan.io.vector_layer import check_vectors, label_polygons, read_regions, write_regions
+from photoplan.plain import counted
 from photoplan.products.balance import Survey, shown, survey
 from photoplan.products.plausibility import one_colour_told
 from photoplan.products.run import BASE_MEMORY, load_on_target, question
@@ -78,7 +79,7 @@ class SeamsReport(Result):
         """Return how many images are joined, and how much they differ along the seams."""
         grid, names = self.survey.grid, self.survey.names
         if self.shapes is None or self.differences is None:
-            return [f"{len(names)} images on {grid.width} × {grid.height} pixels of {grid.resolution:g} m"]
+            return [f"{counted(len(names), 'image')} on {grid.width} × {grid.height} pixels of {grid.resolution:g} m"]
         halfway, best = self.differences
         along = "no seams"
         if best is not None and halfway is not None:

@@ -24,7 +24,7 @@ from photoplan.io.store import versions
 from photoplan.io.vector_layer import PointLayer
 from photoplan.orientation.bundle.model import AdjustSettings, BlockImage, Group
 from photoplan.orientation.intersection import CheckAccuracy, check_accuracy
-from photoplan.plain import pick, shown_metres
+from photoplan.plain import counted, pick, shown_metres
 from photoplan.products.adjust.inputs import MapResult
 from photoplan.products.adjust.sensors import Calibrated, FoundParameter
 from photoplan.products.init import some
@@ -209,7 +209,7 @@ class AdjustReport(Result):
         lines = [
             f"sigma0 {self.sigma0:.3f} · image residuals {self.rms_pixels:.3f} px rms · redundancy {self.redundancy} · "
             f"{self.unknowns} unknowns · {self.iterations} iterations · {self.seconds:.1f} s",
-            f"{len(self.images) + len(self.corrections)} images, {self.points} points adjusted · "
+            f"{counted(len(self.images) + len(self.corrections), 'image')}, {counted(self.points, 'point')} adjusted · "
             f"{self.rejected} gross errors taken out",
         ]
         width = max((len(g.name) for g in self.groups), default=0)
@@ -246,7 +246,7 @@ class AdjustReport(Result):
         reasons = Counter(reason for _, reason in self.left_out)
         lines = [f"left out: {count} × {reason}" for reason, count in reasons.items()]
         if self.orientations:
-            lines.append(f"orientations of {self.orientations} images written into the project")
+            lines.append(f"orientations of {counted(self.orientations, 'image')} written into the project")
         return [*noted([*notes, *self.notes]), *lines]
 
     def raise_failures(self) -> None:

@@ -26,7 +26,7 @@ from photoplan.orientation.bundle.adjust import Cause, adjust_block, misfit_hypo
 from photoplan.orientation.bundle.model import Adjusted, AdjustSettings
 from photoplan.orientation.conventions import Evidence, fitting_convention, misfit, rejection_reason
 from photoplan.orientation.resection import ResectSettings
-from photoplan.plain import pick
+from photoplan.plain import counted, pick
 from photoplan.products.adjust.findings import AdjustReport, block_json, point_layers, summarise
 from photoplan.products.adjust.inputs import (
     AdjustInputs,
@@ -310,8 +310,8 @@ def _used(prepared: Prepared) -> str:
     attitudes = 0 if inputs.attitudes is None else len(inputs.attitudes.images)
     free = [f"{name}: {', '.join(camera.free)}" for name, camera in prepared.block.cameras.items() if camera.free]
     return (
-        f"{len(inputs.images) + len(inputs.projected)} images · {len(inputs.points)} measurements of "
-        f"{len(inputs.points.points)} points · "
+        f"{counted(len(inputs.images) + len(inputs.projected), 'image')} · {len(inputs.points)} measurements of "
+        f"{counted(len(inputs.points.points), 'point')} · "
         f"{control} control, {len(inputs.ground) - control} check points · {positions} positions, {attitudes} attitudes"
         + (f" · calibrated {'; '.join(free)}" if free else "")
     )

@@ -16,7 +16,7 @@ from photoplan.findings import Result
 from photoplan.io.disk import make_folder, received
 from photoplan.io.project.file import load_project
 from photoplan.io.store import write_atomically
-from photoplan.plain import pick
+from photoplan.plain import counted, pick
 from photoplan.products.orthophoto.execution import ProductResult, execute_all, overview_path, refuse_failed
 from photoplan.products.orthophoto.plan import OrthoPlan, plan_orthophotos
 from photoplan.products.run import Run, load_on_target
@@ -221,9 +221,9 @@ class _Execution:
         self._compiled = COMPILATIONS.kernels, COMPILATIONS.seconds
         settings = plan.settings
         run.events.talk(
-            f"plan: {plan.what}, {sum(len(p.plan.tiles) for p in plan.products)} tiles · {settings.resolution:g} m · "
+            f"plan: {plan.what}, {counted(sum(len(p.plan.tiles) for p in plan.products), 'tile')} · {settings.resolution:g} m · "
             f"kernel {settings.kernel} · {settings.exactness} · nodata {settings.nodata} · "
-            f"hidden {settings.hidden}{settings.filling} · {run.workers} {run.executor}"
+            f"hidden {settings.hidden}{settings.filling} · {run.workers} {run.executor if run.workers > 1 else run.executor.removesuffix('s')}"
         )
         for line in plan.blind:
             run.events.talk(f"  note: left out: {line}")

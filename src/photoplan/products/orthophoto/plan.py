@@ -25,7 +25,7 @@ from photoplan.geometry.grid import MapGrid, Window, refuse_absurd
 from photoplan.io.disk import nodata_for
 from photoplan.io.project.model import Project
 from photoplan.orientation.conventions import ImagePlausibility, JudgedView
-from photoplan.plain import advised, plain
+from photoplan.plain import advised, counted, plain
 from photoplan.plan.accuracy import in_image
 from photoplan.plan.anchors import AnchorRule
 from photoplan.plan.footprint import Footprint, Tile, Tiles, covered_tiles, image_border, mean_gsd, some_height
@@ -362,7 +362,9 @@ class OrthoPlan:
             return f"{count} product{several} of single objects"
         if self.settings.choice is not None:
             images = len({image for product in self.products for image in product.images})
-            return f"mosaic of {images} images" + ("" if self.settings.choice.sheets is None else f" in {count} sheets")
+            return f"mosaic of {counted(images, 'image')}" + (
+                "" if self.settings.choice.sheets is None else f" in {count} sheets"
+            )
         return f"{count} orthophoto{several}"
 
     def __getitem__(self, name: str) -> OrthoProduct:
@@ -373,12 +375,12 @@ class OrthoPlan:
 
     def __str__(self) -> str:
         tiles = sum(len(p.plan.tiles) for p in self.products)
-        lines = [f"{self.what}, {tiles} tiles, kernel {self.settings.kernel}{self.settings.filling}"]
+        lines = [f"{self.what}, {counted(tiles, 'tile')}, kernel {self.settings.kernel}{self.settings.filling}"]
         for p in self.products:
-            images = "" if self.settings.choice is None else f"{len(p.images)} images, "
+            images = "" if self.settings.choice is None else f"{counted(len(p.images), 'image')}, "
             lines.append(
                 f"  {p.plan.name}: {images}{p.grid.width} × {p.grid.height} px of {p.grid.resolution:g} m, "
-                f"{len(p.plan.tiles)} of {p.plan.tiles.total} tiles, GSD {p.gsd:.3g} m"
+                f"{len(p.plan.tiles)} of {counted(p.plan.tiles.total, 'tile')}, GSD {p.gsd:.3g} m"
             )
         return "\n".join(lines)
 

@@ -26,7 +26,7 @@ from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project
 from photoplan.io.vector_layer import PlanTables, Regions, read_plan_tables, write_plan_tables
-from photoplan.plain import pick, plain
+from photoplan.plain import counted, pick, plain
 from photoplan.plan.footprint import Footprint, Tiles
 from photoplan.plan.product import compile_tile
 from photoplan.products.orthophoto.mosaic import drawn_regions
@@ -130,7 +130,7 @@ class PlanReport(Result):
         worst = f"worst anchor residual {figures.residual:.3g} px"
         return [
             str(plan),
-            f"plan: {plan.what}, {figures.tiles} tiles, {figures.cells} cells, "
+            f"plan: {plan.what}, {counted(figures.tiles, 'tile')}, {figures.cells} cells, "
             + (worst if plan.settings.tolerance else plan.settings.exactness),
             *(f"  left out: {line}" for line in plan.blind),
             *([] if self.squares is None else [f"quadtree: {len(self.squares.bounds)} squares", *self.squares.lines]),
