@@ -16,7 +16,8 @@ from photoplan.plan.ground import TileGround
 from photoplan.plan.sources import hidden_pixels
 from photoplan.products.rectify import rectify
 from photoplan.surfaces.base import LevelSurface, Terrain
-from photoplan.surfaces.objects import Faces, ObjectSurface, filled
+from photoplan.surfaces.objects import Faces, ObjectSurface
+from photoplan.surfaces.polygon_faces import filled
 from photoplan.targets.map import MapTarget
 
 #: Middle, length, width, eaves and ridge of houses, metres.

@@ -214,7 +214,7 @@ def test_values_are_frozen_and_the_schema_is_json(tmp_path: Path) -> None:
     schema = json.loads(project_schema())
     assert "folder" not in schema["properties"]
     tables = {"terrain", "objects", "orientation", "observations", "adjustment", "cameras", "images", "ortho"}
-    assert tables | {"crs", "beyond_area", "defaults", "format"} == set(schema["properties"])
+    assert tables | {"crs", "beyond_area", "defaults", "targets", "format"} == set(schema["properties"])
 
 
 def test_json_round_trip_for_workers(tmp_path: Path) -> None:

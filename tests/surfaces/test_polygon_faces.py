@@ -11,7 +11,7 @@ from tools.thinned import examples
 from tools.town import triangles_of
 
 from photoplan.errors import InputError, UsageError
-from photoplan.surfaces.objects import decompose
+from photoplan.surfaces.polygon_faces import decompose
 
 
 def area_of(triangles: np.ndarray) -> float:

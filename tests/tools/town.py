@@ -9,7 +9,8 @@ import numpy as np
 import shapely
 
 from photoplan.io.vector_layer import VectorLayer, write_geopackage
-from photoplan.surfaces.objects import Faces, cannot_be_used, filled
+from photoplan.surfaces.objects import Faces
+from photoplan.surfaces.polygon_faces import cannot_be_used, filled
 
 
 @dataclass(frozen=True)

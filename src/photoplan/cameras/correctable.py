@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
 
 from photoplan.cameras.base import Camera, project
 from photoplan.cameras.fiducials import Affine2D
@@ -167,7 +167,7 @@ class Corrections:
     """Name in messages; {} stands for the owners: "row shift of {}"."""
     values: _Floats
     """Initial values of an adjustment, (owners, parameters); zero is as delivered."""
-    known: sparse.csr_matrix
+    known: scipy.sparse.csr_matrix
     """A priori knowledge: rows over the flattened values, each observed as zero with unit weight."""
     owner: str = ""
     """Kind of an owner: "image"."""
@@ -208,11 +208,11 @@ class Correctable(Protocol):
         ...
 
 
-def prior_rows(sigma: _Floats) -> sparse.csr_matrix:
+def prior_rows(sigma: _Floats) -> scipy.sparse.csr_matrix:
     """Rows by which each value is known to be zero with a standard deviation, (n, n); infinite: not known at all."""
     known = np.flatnonzero(np.isfinite(sigma))
     weight = 1.0 / np.asarray(sigma, float)[known]
-    return sparse.csr_matrix((weight, (np.arange(len(known)), known)), (len(known), len(sigma)))
+    return scipy.sparse.csr_matrix((weight, (np.arange(len(known)), known)), (len(known), len(sigma)))
 
 
 #: Parameters of each form: column and row shift, then what changes by row, then what changes by column.
@@ -409,10 +409,10 @@ class CorrectableLine:
             count = len(spline.coefficients)
             size = np.tile(np.repeat([p.position, p.attitude], 3), count)
             smooth = np.repeat([p.smooth_position, p.smooth_attitude], 3)
-            second = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
+            second = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
             known = np.flatnonzero(np.isfinite(smooth))
-            pick = sparse.csr_matrix((1.0 / smooth[known], (np.arange(len(known)), known)), (len(known), 6))
-            rows = sparse.vstack([prior_rows(size), sparse.kron(second, pick)]).tocsr()
+            pick = scipy.sparse.csr_matrix((1.0 / smooth[known], (np.arange(len(known)), known)), (len(known), 6))
+            rows = scipy.sparse.vstack([prior_rows(size), scipy.sparse.kron(second, pick)]).tocsr()
             owners = tuple(f"{t:.3g} s of {self.flight}" for t in spline.times)
             began = start.spline
             same = began is not None and began.coefficients.shape == spline.coefficients.shape

@@ -19,7 +19,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import split_compound
 from photoplan.io.files import check_plain_file, elements, finite, members, number_rows, read_head, read_json_lines
 from photoplan.io.vector_layer import is_drawing, read_chosen, states_crs
-from photoplan.surfaces.objects import Rings, filled
+from photoplan.surfaces.polygon_faces import Rings, filled
 
 
 @dataclass(frozen=True, eq=False)

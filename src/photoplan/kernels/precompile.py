@@ -6,6 +6,7 @@ What is missing there, or fails here, is compiled when it is first called.
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib
 import os
@@ -29,7 +30,7 @@ _MOST_PROCESSES, _WORTH = 8, 3.0
 
 
 class PixelSignatures(NamedTuple):
-    """PixelSignatures of the images: what decides which variants of the resampling kernels are needed."""
+    """Pixels of the images: what decides which variants of the resampling kernels are needed."""
 
     dtype: str = "uint8"
     bands: int = 3
@@ -136,7 +137,26 @@ def _dispatcher(kernel: str) -> Any:
 def types_of(kernel: str, text: str) -> tuple[Any, ...]:
     """Return the types of a line; named tuples are those of the kernel's module."""
     module = importlib.import_module(f"photoplan.kernels.{kernel.partition('.')[0]}")
-    return tuple(eval(f"({text},)", {**vars(module), **vars(types)}))
+    names = {**vars(module), **vars(types)}
+    return tuple(_type_of(part, names) for part in ast.parse(f"({text},)", mode="eval").body.elts)  # type: ignore[attr-defined]
+
+
+def _type_of(node: Any, names: dict[str, Any]) -> Any:
+    """Return what an expression of numba's types means: names, calls, tuples and layouts such as `float64[:, ::1]`."""
+    if isinstance(node, ast.Constant):
+        return node.value
+    if isinstance(node, ast.Name):
+        return names[node.id]
+    if isinstance(node, ast.Tuple | ast.List):
+        return tuple(_type_of(part, names) for part in node.elts)
+    if isinstance(node, ast.Slice):
+        return slice(None, None, None if node.step is None else _type_of(node.step, names))
+    if isinstance(node, ast.Subscript):
+        return _type_of(node.value, names)[_type_of(node.slice, names)]
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        given = {key.arg: _type_of(key.value, names) for key in node.keywords if key.arg}
+        return names[node.func.id](*(_type_of(part, names) for part in node.args), **given)
+    raise ValueError(f"{type(node).__name__} is no part of a numba type")
 
 
 def text_of(kind: Any) -> str:

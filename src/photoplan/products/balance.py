@@ -370,10 +370,9 @@ class BalanceReport(Result):
         def row(name: str, *values: NDArray[np.float64]) -> str:
             return f"{name:32}" + "".join(f"  {' '.join(f'{value:6.1f}' for value in each):>24}" for each in values)
 
-        count = (
-            f"{counted(len(made.images), 'image')}, {counted(len(pairs.images), 'overlap')} at {grid.resolution:g} m"
-        )
-        lines = [f"{count}: rms differences, grey values", f"{'':32}  {'before':>24}  {'after':>24}"]
+        count = f"{counted(len(made.images), 'image')}, {counted(len(pairs.images), 'overlap')}"
+        head = f"{'':32}  {'before':>24}  {'after':>24}"
+        lines = [f"{count} at {grid.resolution:g} m: rms differences, grey values", head]
         lines.append(row("mean of the overlaps", *self.rms()))
         for k in (-pairs.after.mean(axis=1)).argsort()[:_LISTED].tolist():
             both = " – ".join(self.named(i)[-15:] for i in pairs.images[k])

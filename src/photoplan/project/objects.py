@@ -17,7 +17,8 @@ from photoplan.geometry.units import agreed_metres, metric_heights, metric_syste
 from photoplan.io.objects import ObjectFile, read_objects
 from photoplan.io.project.model import Objects
 from photoplan.surfaces.base import Terrain
-from photoplan.surfaces.objects import Faces, ObjectSurface, cannot_be_used
+from photoplan.surfaces.objects import Faces, ObjectSurface
+from photoplan.surfaces.polygon_faces import cannot_be_used
 
 #: Objects whose highest point is deeper than this below the ground, metres, are refused.
 DEEP = 0.5

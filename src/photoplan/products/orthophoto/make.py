@@ -219,11 +219,12 @@ class _Execution:
         self.plan, self.folder, self.run = plan, folder, run
         self._started = time.perf_counter()
         self._compiled = COMPILATIONS.kernels, COMPILATIONS.seconds
-        settings = plan.settings
+        settings, tiles = plan.settings, counted(sum(len(p.plan.tiles) for p in plan.products), "tile")
+        workers = "1 thread" if (run.workers, run.executor) == (1, "threads") else f"{run.workers} {run.executor}"
         run.events.talk(
-            f"plan: {plan.what}, {counted(sum(len(p.plan.tiles) for p in plan.products), 'tile')} · {settings.resolution:g} m · "
+            f"plan: {plan.what}, {tiles} · {settings.resolution:g} m · "
             f"kernel {settings.kernel} · {settings.exactness} · nodata {settings.nodata} · "
-            f"hidden {settings.hidden}{settings.filling} · {run.workers} {run.executor if run.workers > 1 else run.executor.removesuffix('s')}"
+            f"hidden {settings.hidden}{settings.filling} · {workers}"
         )
         for line in plan.blind:
             run.events.talk(f"  note: left out: {line}")

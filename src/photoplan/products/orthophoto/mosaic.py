@@ -49,7 +49,8 @@ from photoplan.products.orthophoto.plan import (
 )
 from photoplan.quality.curves import BLOCK, blur_of, detail_energies, detail_quotients
 from photoplan.requests.ortho import Choice, OrthoSettings
-from photoplan.surfaces.objects import LEAST_AREA, Faces, ObjectSurface, SingleObject, painted_surface
+from photoplan.surfaces.objects import Faces, ObjectSurface, SingleObject, painted_surface
+from photoplan.surfaces.polygon_faces import LEAST_AREA
 from photoplan.targets.map import MapTarget
 
 #: Sheets of one run at most.

@@ -33,7 +33,8 @@ from photoplan.products.orthophoto.mosaic import drawn_regions
 from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, keyed, product_plan
 from photoplan.project.scene import input_files, refuse_unusable
 from photoplan.requests.ortho import OrthoSettings, ProductRequest
-from photoplan.surfaces.objects import ObjectSurface, SingleObject, decompose, outlines
+from photoplan.surfaces.objects import ObjectSurface, SingleObject
+from photoplan.surfaces.polygon_faces import decompose, outlines
 
 
 @dataclass(frozen=True, eq=False)
