@@ -74,6 +74,7 @@ __getattr__, __dir__, __all__ = public(
         "products.monoplot": "MonoplotRequest monoplot_file",
         "project.ground": "open_terrain",
         "cameras.frame": "FrameCamera",
+        "cameras.lenses": "Interior",
         "geometry.pose": "Pose",
         "geometry.grid": "MapGrid Placement Window",
         "targets.map": "MapTarget",

@@ -12,7 +12,8 @@ from tools.hybrid_models import line, model
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
 from photoplan.surfaces.base import LevelSurface
-from photoplan.surfaces.hybrid import HybridSurface, LinedUnits, RefinedSurface, clip_line, refine_units
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.surfaces.refined_units import LinedUnits, RefinedSurface, clip_line, refine_units
 from photoplan.surfaces.units import MemoryUnits, UnitLayout
 from photoplan.targets.map import MapTarget
 

@@ -33,8 +33,8 @@ from photoplan.io.vector_layer import read_features
 from photoplan.plain import pick
 from photoplan.project.ground import open_terrain
 from photoplan.requests.terrain import BuildRequest, RefineRequest
-from photoplan.surfaces.hybrid import LinedUnits, RasterUnits, refine_units
 from photoplan.surfaces.raster import RasterSurface
+from photoplan.surfaces.refined_units import LinedUnits, RasterUnits, refine_units
 from photoplan.surfaces.units import LineElement, MeasuredTerrain, Unit, UnitFigures, unit_range
 from photoplan.terrain.build import BuildPlan, Built, build_terrain, plan_build
 from photoplan.terrain.clean import Finding, clean
