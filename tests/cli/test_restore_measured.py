@@ -95,7 +95,7 @@ def test_apertures_of_scanners(photoplan, image, tmp_path):
         (["--aperture", "square:x"], "square or round"),
         (["--filter", "f.toml", "--method", "exact"], "--method"),
         (["--aperture", "square", "--cells", "3"], "--cells"),
-        (["--filter", "f.toml", "--aperture", "square"], "one of them"),
+        (["--filter", "f.toml", "--aperture", "square"], "exclude each other"),
         (["--size", "10"], "odd"),
     ],
 )

@@ -137,7 +137,7 @@ def test_images_pickle_small(small: Block) -> None:
     from photoplan.products.seams import _images, _Map
 
     project = load_project(small.project)
-    found = survey(project, project.select(None), 8.0, SILENT)
+    found = survey(project, project.select(None), 8.0, None, SILENT)
     one, job = _images(found)[0], _Map(found.grid, found.tiles.side)
     assert len(pickle.dumps((job, one))) < 5000
     made = pickle.loads(pickle.dumps(job))(pickle.loads(pickle.dumps(one)))
