@@ -240,7 +240,7 @@ class TestRuns:
     def test_no_filter_and_an_aperture_contradict_each_other(self, photoplan: Here, tmp_path: Path) -> None:
         image = write(tmp_path / "a.tif", texture())
         said = photoplan("restore", image, "--filter", "none", "--aperture", "square")
-        assert said.code == 2 and "one of them" in said.err
+        assert said.code == 2 and "exclude each other" in said.err
 
     def test_the_report_says_it(self, photoplan: Here, tmp_path: Path) -> None:
         image, model = write(tmp_path / "a.tif", texture() * brightness()), model_file(tmp_path)
