@@ -11,7 +11,8 @@ import pytest
 from tools.command import Here
 
 from photoplan.findings import Chart, Estimate, Findings, Trace
-from photoplan.report.page import ReportFile, findings_section, page, section, table
+from photoplan.report.files import ReportFile
+from photoplan.report.page import findings_section, page, section, table
 
 TEMPLATE = Path(__file__).resolve().parents[2] / "docs" / "templates" / "sensor-frame.toml"
 _STRING = re.compile(rb"\(((?:[^()\\]|\\.)*)\)", re.DOTALL)

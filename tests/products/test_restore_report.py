@@ -20,7 +20,7 @@ from photoplan.products.measured_filter import DesignedPart
 from photoplan.products.restore import FoundFilter, RestoreRequest, requested_filter
 from photoplan.quality.restoration.design import DesignOptions, design_filter
 from photoplan.quality.restoration.restorer import FilterKernel, RestorationFilter, SceneStatistics
-from photoplan.report.page import open_report
+from photoplan.report.files import open_report
 from photoplan.report.restore import (
     axis_pictures,
     compare,

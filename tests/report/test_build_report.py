@@ -15,7 +15,8 @@ from photoplan.products.dtm.build import BuildReport
 from photoplan.report import dtm as dtm_covariance
 from photoplan.report import dtm as samples
 from photoplan.report.dtm import build_page, draw_covariance, draw_filter_histograms, draw_heights
-from photoplan.report.page import ReportFile, text
+from photoplan.report.files import ReportFile
+from photoplan.report.page import text
 from photoplan.surfaces.units import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.terrain.build import build_terrain, plan_build
 from photoplan.terrain.clean import Finding, clean

@@ -16,7 +16,7 @@ import click
 from photoplan.cli.interrupt import CODE, catch_interrupts, stop_children
 from photoplan.cli.lazy import LazyGroup
 from photoplan.cli.output import printable
-from photoplan.cli.table import VERBS
+from photoplan.cli.table import VERBS, command_at
 from photoplan.errors import PhotoplanError, PhotoplanWarning, ResourceError
 
 
@@ -69,7 +69,7 @@ def _undecoded(error: BaseException | None) -> bool:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run a verb; every error becomes a message on stderr and an exit code."""
     try:
-        code = photoplan.main(arguments, prog_name="photoplan", standalone_mode=False)
+        code = photoplan.main(arguments, prog_name="photoplan", standalone_mode=False, obj=command_at)
     except (click.exceptions.Abort, KeyboardInterrupt):
         stop_children()
         return _say("interrupted; the same command continues, or begins anew where nothing is kept", CODE)

@@ -19,7 +19,7 @@ from photoplan.cli.output import can_draw, say, show, show_json, spelled, talkin
 from photoplan.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from photoplan.report.page import ReportFile
+    from photoplan.report.files import ReportFile
     from photoplan.request import Request
 
 #: Sections of the help, in their order.
@@ -108,8 +108,6 @@ class VerbCommand(click.Command):
         InputError
             The project states options that no command takes from it, of this command or another one.
         """
-        from photoplan.cli.table import command_at
-
         project = ctx.params.get(_project_of(self.kind))
         if project is None:
             return "", {}
@@ -118,7 +116,7 @@ class VerbCommand(click.Command):
 
         folder, tables = stated_defaults(project)
         for verb, values in tables.items():
-            row = command_at((verb,))
+            row = ctx.obj((verb,))  # the table's `command_at`
             kind = load(row.request) if row is not None else None
             known = kind.may_be_stated() if kind is not None and _project_of(kind) else {}
             for name, value in values.items():
@@ -277,7 +275,8 @@ def _drawn_keys(verb: Verb, request: Any, made: list[Path], files: list[Path]) -
 
 def _opened(path: Path, key: str, request: Any) -> ReportFile | None:
     """Return a picture, a report or a folder of pictures that can be written; its place is checked before any work."""
-    from photoplan.report.page import ReportFile, load_matplotlib, open_picture, open_report
+    from photoplan.report.files import ReportFile, open_picture, open_report
+    from photoplan.report.page import load_matplotlib
 
     if key.endswith("/"):
         load_matplotlib("a picture", "leave the pictures out")

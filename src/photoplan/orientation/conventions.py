@@ -204,7 +204,18 @@ def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Convention, 
         for swapped, direction in product((False, True), DIRECTIONS):
             q = _along(R, poses.centers, sights, direction, swapped)
             for axes, turned, mirrored in others:
-                yield Convention(unit, order, direction, axes, turned, mirrored, swapped), q
+                yield (
+                    Convention(
+                        angle_unit=unit,
+                        rotation=order,
+                        direction=direction,
+                        camera_axes=axes,
+                        turned=turned,
+                        mirrored=mirrored,
+                        swapped=swapped,
+                    ),
+                    q,
+                )
 
 
 def _components(poses: StatedPoses, sights: Sights, reading: Convention) -> Floats:

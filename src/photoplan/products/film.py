@@ -470,7 +470,9 @@ def interior_orientations(request: InteriorRequest, events: Events = SILENT) -> 
     cameras = tuple(dict.fromkeys(i.camera for i in found)) if request.write and not failed else ()
     if cameras:
         edit_project(request.project, ProjectChanges(cameras={name: {"interior": request.model} for name in cameras}))
-    return InteriorResult(request.project, tuple(found), unmeasured, failed, cameras)
+    return InteriorResult(
+        project=request.project, images=tuple(found), unmeasured=unmeasured, failed=failed, cameras=cameras
+    )
 
 
 def _scans(project: Project, request: InteriorRequest) -> list[Image]:

@@ -324,7 +324,16 @@ def _read(path: Path, folder: Path) -> RunRecord:
         finished = None
     shown = Path(entry.file).name if Path(entry.file).name == entry.file else path.name.removesuffix(".run.json")
     name = _text(relative_path(path.parent / shown, folder))
-    return RunRecord(path, name, _text(kind), finished, product, entry.settings or {}, poses, entry.inputs)
+    return RunRecord(
+        path=path,
+        name=name,
+        kind=_text(kind),
+        finished=finished,
+        product=product,
+        settings=entry.settings or {},
+        poses=poses,
+        inputs=entry.inputs,
+    )
 
 
 def _judged(
@@ -437,23 +446,29 @@ def _figures(record: RunRecord, values: Mapping[str, Any], at: str = "") -> list
     if isinstance(listed, list):
         return [
             Estimate(
-                _text(each.get("name", "")),
-                _number(each.get("value")),
-                _number(each.get("sigma")),
-                _text(each.get("label") or each.get("name", "")),
-                _text(each.get("unit") or ""),
-                _text(each.get("plane") or ""),
-                " ".join(filter(None, [at, _text(each.get("at") or "")])),
+                name=_text(each.get("name", "")),
+                value=_number(each.get("value")),
+                sigma=_number(each.get("sigma")),
+                label=_text(each.get("label") or each.get("name", "")),
+                unit=_text(each.get("unit") or ""),
+                plane=_text(each.get("plane") or ""),
+                at=" ".join(filter(None, [at, _text(each.get("at") or "")])),
             )
             for each in listed[:_FIGURES]
             if isinstance(each, dict)
         ]
     return [
-        Estimate(_text(name), _number(value), _number(_at(values, f"sigma_{name}")), _text(_words(name)), _unit(name),
-                 at=at)
+        Estimate(
+            name=_text(name),
+            value=_number(value),
+            sigma=_number(_at(values, f"sigma_{name}")),
+            label=_text(_words(name)),
+            unit=_unit(name),
+            at=at,
+        )
         for name, value in values.items()
         if math.isfinite(_number(value)) and not name.startswith("sigma_")
-    ][:_FIGURES]  # fmt: skip
+    ][:_FIGURES]
 
 
 def _words(name: str) -> str:

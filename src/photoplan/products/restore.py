@@ -682,4 +682,4 @@ def _restore(plan: RestorePlan, events: Events) -> RestoreReport:
     with threads(request.workers) as workers:
         results = Runner(workers, plan.in_flight, events, excuse).run(works())
     images = tuple(result for result in results if result is not None)
-    return RestoreReport(images, failed, plan.found, request.folder, plan.jobs)
+    return RestoreReport(images=images, failed=failed, found=plan.found, folder=request.folder, jobs=plan.jobs)

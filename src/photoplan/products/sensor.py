@@ -137,18 +137,28 @@ def _plots(described: SensorDescription, values: Mapping[str, float]) -> dict[st
         ratio = np.linspace(0.0, 0.5, 201)
         curves = [
             Trace(ratio, np.exp(-product * (1.0 - np.cos(2.0 * np.pi * ratio))), label, "line")
-            for product, label in [(own, f"this sensor, nε = {own:.3g}"),
-                                   *((other, f"{other:g}") for other in (0.01, 0.1, 0.3, 0.7, 2.0))]
-        ]  # fmt: skip
-        found["transfer"] = [Chart(
-            "Modulation after charge transfer",
-            "Also of other transfer inefficiency products nε. 0.5 is the Nyquist frequency. Behr 1989, eq. 3.15.",
-            "signal frequency through clock frequency", "modulation that is left", tuple(curves),
-        )]  # fmt: skip
+            for product, label in [
+                (own, f"this sensor, nε = {own:.3g}"),
+                *((other, f"{other:g}") for other in (0.01, 0.1, 0.3, 0.7, 2.0)),
+            ]
+        ]
+        found["transfer"] = [
+            Chart(
+                title="Modulation after charge transfer",
+                caption="Also of other transfer inefficiency products nε. 0.5 is the Nyquist frequency. "
+                "Behr 1989, eq. 3.15.",
+                x_label="signal frequency through clock frequency",
+                y_label="modulation that is left",
+                curves=tuple(curves),
+            )
+        ]
     chip, optics = described.sensor, described.optics
     periods = {} if chip is None else {f"element, {along}": pitch for along, pitch in zip(_ALONG, chip.pitch)}
-    periods |= {f"pixel, {along}": values[f"pixel_{axis}_um"] for axis, along in zip(_AXES, _ALONG)
-                if f"pixel_{axis}_um" in values}  # fmt: skip
+    periods |= {
+        f"pixel, {along}": values[f"pixel_{axis}_um"]
+        for axis, along in zip(_AXES, _ALONG)
+        if f"pixel_{axis}_um" in values
+    }
     if periods:
         period = np.geomspace(min(periods.values()) / 2.0, max(periods.values()) * 2.0, 200)
         points = [
@@ -156,21 +166,31 @@ def _plots(described: SensorDescription, values: Mapping[str, float]) -> dict[st
             for name, value in periods.items()
         ]
         place = "image" if any(name.startswith("pixel") for name in periods) else "sensor"
-        found[place] = [Chart(
-            "Nyquist frequency", "Half the reciprocal of the period. Behr 1989, eq. 3.23.", "period of sampling µm",
-            "Nyquist frequency LP/mm", (Trace(period, 500.0 / period, style="line"), *points),
-        )]  # fmt: skip
+        found[place] = [
+            Chart(
+                title="Nyquist frequency",
+                caption="Half the reciprocal of the period. Behr 1989, eq. 3.23.",
+                x_label="period of sampling µm",
+                y_label="Nyquist frequency LP/mm",
+                curves=(Trace(period, 500.0 / period, style="line"), *points),
+            )
+        ]
     budget = noise_budget(described)
     if budget is not None and budget.sources():
         text = "The total is the root of the sum of squares, since the sources are independent."
         found["noise"] = [Bars("Noise budget", text, {**budget.sources(), "total": budget.total}, "electrons")]
     if chip is not None and (chip.sensitive_um is not None or optics is not None):
         key = "optics" if optics is not None else "sensor"
-        found.setdefault(key, []).append(Chart(
-            "Modulation transfer", "The sensor can do no better than both together.", "spatial frequency LP/mm",
-            "modulation", tuple(_curves(chip, optics)),
-            marks=tuple((500.0 / pitch, "Nyquist") for pitch in dict.fromkeys(chip.pitch)),
-        ))  # fmt: skip
+        found.setdefault(key, []).append(
+            Chart(
+                title="Modulation transfer",
+                caption="The sensor can do no better than both together.",
+                x_label="spatial frequency LP/mm",
+                y_label="modulation",
+                curves=tuple(_curves(chip, optics)),
+                marks=tuple((500.0 / pitch, "Nyquist") for pitch in dict.fromkeys(chip.pitch)),
+            )
+        )
     return found
 
 

@@ -678,7 +678,9 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     pairs, chosen = chosen_pairs(images, request.pairs)
     if request.dry_run:
         count = 0 if pairs is None else len(pairs)
-        return TieReport(None, tuple(names), chosen, factor, count, tuple(notes))
+        return TieReport(
+            output=None, images=tuple(names), chosen=chosen, factor=factor, pairs=count, notes=tuple(notes)
+        )
     entry = input_entry(request.project)
     settings, verify = FeatureSettings(request.features, factor), VerifySettings(threshold=2.0 * factor)
     log = ResultLog(output.with_suffix(".matches"), f"{_FORM} {settings} {verify}", lock_of(output))

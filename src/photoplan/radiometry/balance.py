@@ -479,7 +479,15 @@ def balanced(
 
         def fitted(band: int, last: bool, ground: float, judged: bool = False) -> AdjustedBand:
             equations = replace(Band.of(inner, band, sizes[images], basis, nodes), curve_last=last)
-            prior = Prior(basis, nodes, _level(equations), kinds.reshape(-1), parts, turns, ground=ground)
+            prior = Prior(
+                basis=basis,
+                nodes=nodes,
+                level=_level(equations),
+                cameras=kinds.reshape(-1),
+                parts=parts,
+                turns=turns,
+                ground=ground,
+            )
             return adjust(equations, Gauge(parts, place), prior, judged=judged)
 
         tried: dict[float, list[tuple[AdjustedBand, AdjustedBand]]] = {GROUND: [], STEEP: []}

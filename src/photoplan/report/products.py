@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from photoplan.products.orthophoto.execution import ProductResult, seams_path
+from photoplan.products.orthophoto.finished import ProductResult, seams_path
 
 
 def draw_product(part: Any, request: Any, can_draw: Callable[[bool], bool]) -> Iterator[str]:

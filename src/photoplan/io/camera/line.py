@@ -209,7 +209,9 @@ def read_csm(isd: Any, path: Path) -> StatedLine:
     source = Isd(isd, path)
     try:
         lens = f"{source.focal_plane().focal:.6g} mm, distortion {source.distortion or 'none'}"
-        return StatedLine(path, FORM, _csm_track(source), look(source), source.radii, lens=lens)
+        return StatedLine(
+            file=path, form=FORM, track=_csm_track(source), look=look(source), radii=source.radii, lens=lens
+        )
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
@@ -283,7 +285,13 @@ def _read_dimap(path: Path) -> StatedLine:
         columns, lines = (int(_dimap_number(root, f".//Raster_Dimensions/{name}")) for name in ("NCOLS", "NROWS"))
         if not (2 <= columns <= _MAX_SIZE and 1 <= lines <= _MAX_SIZE):
             raise InputError(f"an image of {columns} × {lines} pixels")
-        return StatedLine(path, _DIMAP, _dimap_track(model, lines), _dimap_look(model, columns), EARTH_RADII)
+        return StatedLine(
+            file=path,
+            form=_DIMAP,
+            track=_dimap_track(model, lines),
+            look=_dimap_look(model, columns),
+            radii=EARTH_RADII,
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -579,7 +587,15 @@ def _read_strip(path: Path, name: str | None) -> StatedLine:
     try:
         looks, beside = looks_of(detectors, path.parent, MAX_BYTES)
         chips = looks if len(looks) > 1 else ()
-        return StatedLine(path, _STRIP, _strip_track(strip, path), looks[0], EARTH_RADII, beside, chips)
+        return StatedLine(
+            file=path,
+            form=_STRIP,
+            track=_strip_track(strip, path),
+            look=looks[0],
+            radii=EARTH_RADII,
+            beside=beside,
+            chips=chips,
+        )
     except HeightSystemError:
         raise
     except InputError as error:

@@ -101,7 +101,13 @@ def _functions(values: _Texts, where: str, first: float = 0.0) -> RationalFuncti
     x, y, lon, lat, h, xs, ys, dlon, dlat, dh = (_numbers(values[name], f"{where}: {name}", 1)[0] for name in _SINGLE)
     coefficients = np.array([_numbers(values[name], f"{where}: {name}", 20) for name in _GROUPS])
     try:
-        return RationalFunctions((x - first, y - first), (xs, ys), (lon, lat, h), (dlon, dlat, dh), coefficients)
+        return RationalFunctions(
+            image_offset=(x - first, y - first),
+            image_scale=(xs, ys),
+            ground_offset=(lon, lat, h),
+            ground_scale=(dlon, dlat, dh),
+            coefficients=coefficients,
+        )
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

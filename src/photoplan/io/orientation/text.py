@@ -155,7 +155,11 @@ class AngleLines:
             a, b, c = (pok["pok".index(letter)] for letter in rotation)
             images.append(OrientedImage(name, (X, Y, Z), (a, b, c), line=line.line))
         note = f"{path.name}: angles read as {unit}, rotation {rotation}, {DIRECTIONS[direction]}"
-        return OrientationBlock(OrientationTable(path, tuple(images), unit, rotation, direction, notes=(note,)))
+        return OrientationBlock(
+            OrientationTable(
+                file=path, images=tuple(images), angle_unit=unit, rotation=rotation, direction=direction, notes=(note,)
+            )
+        )
 
     def render(self, block: OrientationBlock, path: Path) -> dict[Path, str]:
         """Return the text of a file, angles in gon."""
@@ -179,7 +183,16 @@ class AngleLines:
     def format(self, title: str, suffix: str) -> OrientationFormat:
         """Return the entry in the registry."""
         name = self.program.lower()
-        return OrientationFormat(name, title, self.sniff, self.read, self.render, self.losses, suffix, angles=True)
+        return OrientationFormat(
+            name=name,
+            title=title,
+            sniff=self.sniff,
+            read=self.read,
+            render=self.render,
+            losses=self.losses,
+            suffix=suffix,
+            angles=True,
+        )
 
 
 #: BINGO takes names of 15 characters at most (Catalyst's guide on export to BINGO).
@@ -389,7 +402,9 @@ def _read_csv(path: Path, form: TableFormat) -> OrientationBlock:
             raise InputError(f"{table.where(k)}: the image has no name")
         a, b, c = (opk["opk".index(letter)] for letter in form.rotation)
         camera = table.rows[k][roles["camera"]] if "camera" in roles else None
-        images.append(OrientedImage(name, (X, Y, Z), (a, b, c), camera or None, table.lines[k]))
+        images.append(
+            OrientedImage(name=name, center=(X, Y, Z), angles=(a, b, c), camera=camera or None, line=table.lines[k])
+        )
     beside = crs_beside(path)
     crs, side, heights = (None,) * 3 if beside is None else (beside.crs, beside.file, beside.height_system)
     return OrientationBlock(

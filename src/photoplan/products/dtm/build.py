@@ -216,7 +216,7 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport | P
     measured, findings, crs, system = load(request)
     plan = plan_build(measured, settings)
     if request.dry_run:
-        return PlannedBuild(plan, measured, findings, crs, system)
+        return PlannedBuild(plan=plan, measured=measured, findings=findings, crs=crs, height_system=system)
     events.talk(describe_plan(plan, measured, crs, system))
     facts = [input_facts(path) for path in request.inputs]
     decides = [settings, repr(_reading(request)), repr(plan.layout), crs, system]

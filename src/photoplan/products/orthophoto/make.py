@@ -17,7 +17,8 @@ from photoplan.io.disk import make_folder, received
 from photoplan.io.project.file import load_project
 from photoplan.io.store import write_atomically
 from photoplan.plain import counted, pick
-from photoplan.products.orthophoto.execution import ProductResult, execute_all, overview_path, refuse_failed
+from photoplan.products.orthophoto.execution import execute_all, refuse_failed
+from photoplan.products.orthophoto.finished import ProductResult, overview_path
 from photoplan.products.orthophoto.plan import OrthoPlan, plan_orthophotos
 from photoplan.products.run import Run, load_on_target
 from photoplan.project.scene import Attempts, refuse_unusable
