@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -15,6 +14,7 @@ from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.bounds import HIGHEST_FLIGHT, odd_place
 from photoplan.geometry.frames import CylinderFrame, Frame, ImageFrame, WallFrame
 from photoplan.geometry.heights import HeightStep
+from photoplan.io.files import explain
 from photoplan.io.project.model import PlacedTarget, Project, StatedTarget
 from photoplan.plan.footprint import Bounds, image_border
 from photoplan.project.ground import ground_of, open_relief
@@ -147,10 +147,11 @@ def with_target(
     asked = {
         name: _number_or_path(value) for name, value in (("relief", relief), ("sigma", sigma)) if value is not None
     }
+    values = {**dict(stated_target(project, text)), **asked}
     try:
-        stated = StatedTarget(**{**dict(stated_target(project, text)), **asked})
+        stated = StatedTarget(**values)
     except ValidationError as error:
-        raise UsageError(f"target {text}: " + "; ".join(_told(each) for each in error.errors())) from None
+        raise UsageError(explain(error, values, f"target {text}")) from None
     frame, own = _stated_frame(project, stated.frame)
     if frame is None:
         return project
@@ -167,11 +168,6 @@ def with_target(
         raise UsageError(f"target {text}: bounds {around} are empty; they are lowest u, lowest v, highest u, highest v")
     placed = PlacedTarget(**{**dict(stated), "space": frame, "bounds": around})
     return project.model_copy(update={"target": placed})
-
-
-def _told(error: Any) -> str:
-    """A fault of an entry: its name and what is wrong."""
-    return f"{error['loc'][0] if error['loc'] else 'entry'}: {error['msg'].removeprefix('Value error, ').lower()}"
 
 
 def _number_or_path(text: str) -> float | str:
